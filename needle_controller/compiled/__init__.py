@@ -1,13 +1,13 @@
 """
-Compiled functions of laws, closed loops and observer, one concept a file.
+Compiled functions of control laws, closed loops, observer and steering controller.
 
 ====================  ============================================================================
-`laws`                the control laws, and the force that gives a wanted velocity
+`laws`                control laws on one axis
 `quintic`             extreme values of polynomials of fifth order
-`loop`                one sampled law around the simulated needle
-`bending`             the bending at a frozen depth as the observer's state has it
-`kalman`              the steps of the Kalman filter
-`filter`              the observer's filter and its past
-`steering`            one look and one plan of the controller that steers the tip
+`loop`                closed loop of a sampled law and the simulated needle
+`bending`             bending at a frozen depth, in the coordinates of the observer
+`kalman`              steps of the Kalman filter
+`filter`              observer: filter and its history
+`steering`            steering controller: measurement update and plan
 ====================  ============================================================================
 """

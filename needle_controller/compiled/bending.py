@@ -1,8 +1,8 @@
 """
-The bending of the inserted part as the observer's filter has it.
+Bending of the inserted part in the coordinates of the observer.
 
-For each normal mode the filter holds c = omega a and b = a_dot, both in sqrt(J), so that without
-damping the modes turn: the transition over any time is a rotation.
+The filter state of each normal mode is c = omega a and b = a_dot, both in sqrt(J): without
+damping the transition over any time is a rotation.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ import numpy as np
 
 class Frozen(NamedTuple):
     """
-    The needle at a frozen depth.
+    Needle constants and modes at a frozen depth.
 
     Attributes
     ----------
     depth : float
-        Inserted length [m].
+        Insertion depth [m].
     growth : float
-        Factor by which the tissue has grown stiffer by swelling.
+        Stiffness factor of swelling.
     layer : int
-        Layer that holds the tip.
+        Index of the layer that contains the tip.
     stiffness : float
         Stiffness of the tissue at the tip [N/m^2].
     at : ModeIntegrals
@@ -51,26 +51,7 @@ class Frozen(NamedTuple):
 
 @inlined
 def freeze(needle: Needle, depth: float, growth: float, modes: NormalModes) -> Frozen:
-    """
-    Return the needle at a frozen depth.
-
-    Parameters
-    ----------
-    needle : Needle
-        The needle.
-    depth : float
-        Inserted length [m].
-    growth : float
-        Factor by which the tissue has grown stiffer by swelling.
-    modes : NormalModes
-        Overwritten; part of the result.
-
-    Returns
-    -------
-    Frozen
-        Modes and tissue at that depth.
-
-    """
+    """Return modes and tissue at an insertion depth [m]; ``modes`` is overwritten."""
     n = modes.squares.shape[0]
     grids, rows = np.empty((3, n, n)), np.empty((4, n))
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
@@ -87,22 +68,10 @@ def freeze(needle: Needle, depth: float, growth: float, modes: NormalModes) -> F
 @inlined
 def turn(rate: float, square: float, t: float) -> tuple[float, float, float, float]:
     """
-    Return the transition of c and b of one mode over a time.
+    Return the transition cc, cb, bc, bb of c and b of one mode over a time t [s].
 
-    Parameters
-    ----------
-    rate : float
-        Damping of the rates [1/s].
-    square : float
-        Square of the natural frequency omega [1/s^2].
-    t : float
-        Time [s].
-
-    Returns
-    -------
-    cc, cb, bc, bb : float
-        c after t is cc c + cb b, and b is bc c + bb b.
-
+    ``rate`` is the damping [1/s] and ``square`` the squared natural frequency [1/s^2]; c after t
+    is cc c + cb b, and b is bc c + bb b.
     """
     omega = sqrt(square)
     pp, pv, _, vv = swing(rate, square, t)
@@ -111,7 +80,7 @@ def turn(rate: float, square: float, t: float) -> tuple[float, float, float, flo
 
 @inlined
 def _means(rate: float, since: float, until: float) -> tuple[float, float]:
-    """Return the means of cos(rate t) and sin(rate t) over a time."""
+    """Return the means of cos(rate t) and sin(rate t) over a time interval."""
     middle, half = 0.5 * rate * (since + until), 0.5 * rate * (until - since)
     # The next term is below 1e-18.
     mean = sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
@@ -127,22 +96,14 @@ def change_basis(
     change: FloatArray,
 ) -> None:
     """
-    Write how c and b change from the normal modes of one depth to those of another.
+    Compute the change of c and b from the normal modes of one depth to the modes of another depth.
 
-    q and the momenta rho A G q_dot go on as they are. The depth changes evenly, not at once: what
-    one mode gives to another is the mean over the rotation in between. Slow modes do not turn and
-    take the change as it is. Of fast ones only the part remains that keeps the action
-    energy / omega.
+    q and the momenta rho A G q_dot are continuous. The depth changes at a constant rate from
+    ``since`` to ``until`` [s], relative to the time of the new modes: the coupling between modes
+    is the mean over the rotation in between. Slow modes do not rotate in this time and take the
+    full change; fast modes keep only the part that conserves the action energy / omega.
 
-    Parameters
-    ----------
-    old, new : NormalModes
-        Normal modes at both depths. The new ones take the signs of the old ones.
-    since, until : float
-        Time over which the depth changes, from that of the new modes [s].
-    change : ndarray, shape (2 n, 2 n)
-        Overwritten: c and b in the new modes from those in the old ones.
-
+    The new modes take the signs of the old modes. ``change``, shape (2 n, 2 n), is overwritten.
     """
     n = new.squares.shape[0]
     for i in range(n):
@@ -175,24 +136,11 @@ def change_basis(
 @inlined
 def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -> None:
     """
-    Write the impulse of the lateral force and of the moment at the base per change of c and b.
+    Compute the impulse of force and moment at the base per change of c and b, shape (2, 2 n).
 
     It follows from the balance of momentum over the inserted part, as in
-    `needle_dynamics.model.NeedleModel.base_reaction`: what the integral of the state over a time
-    is, the change of the state over that time says.
-
-    Parameters
-    ----------
-    needle : Needle
-        The needle.
-    f : Frozen
-        The needle at the mean depth.
-    velocity : float
-        Insertion velocity [m/s].
-    rows : ndarray, shape (2, 2 n)
-        Overwritten, for the force in the first row and for the moment about the base in the
-        second one.
-
+    `needle_dynamics.model.NeedleModel.base_reaction`: the integral of the state over a time
+    follows from the change of the state. ``velocity`` is the insertion velocity [m/s].
     """
     n = f.modes.squares.shape[0]
     rho, damping = needle.linear_density, needle.tissue_damping
@@ -201,7 +149,7 @@ def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -
     above = (needle.layers.area, needle.layers.moment)
     for channel in range(2):
         weight, extra = integrals[channel], above[channel]
-        # What enters brings the momentum of the tip, and the inserted part is slowed by it.
+        # Entering length has the momentum of the tip, which decreases the momentum of the rest.
         entering = rho * velocity * (1.0 if channel == 0 else f.depth)
         for k in range(n):
             area, tip = 0.0, 0.0
@@ -227,20 +175,10 @@ def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -
 @inlined
 def tip_response(needle: Needle, f: Frozen, rest: FloatArray, direct: FloatArray) -> None:
     """
-    Write what a constant lateral force of 1 N at the tip does.
+    Compute the response to a constant lateral force of 1 N at the tip.
 
-    Parameters
-    ----------
-    needle : Needle
-        The needle.
-    f : Frozen
-        The needle at the mean depth.
-    rest : ndarray, shape (n,)
-        Overwritten with c of each mode at rest under the force [sqrt(J)/N].
-    direct : ndarray, shape (2,)
-        Overwritten with the lateral force [1] and the moment about the base [m] beyond what
-        `base_impulse` says of the motion of c and b.
-
+    ``rest``, shape (n,), takes c of each mode at rest [sqrt(J)/N]; ``direct``, shape (2,), the
+    lateral force [1] and the moment about the base [m] that are not part of `base_impulse`.
     """
     n = f.modes.squares.shape[0]
     integrals, above = (f.at.area, f.at.moment), (needle.layers.area, needle.layers.moment)

@@ -1,8 +1,8 @@
 """
-The observer's filter: its past, one sample of it, and the estimate at the present depth.
+Filter of the observer: history, step of one sample, and estimate at the present depth.
 
-Over one sample the depth is frozen at its mean. The past of the filter is kept sample by sample,
-so that a measurement that comes late is taken in where it belongs.
+Over one sample the depth is frozen at its mean. The history of the filter is kept sample by
+sample, so that a late measurement is processed at its time.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from needle_dynamics.compiled.held import Held
 
-#: What is kept of each sample beside arrays: its time and length [s], mean inserted length [m],
-#: growth of the tissue by swelling, the readings of the wrench [N, N m], and the sum and the
-#: number of the squared normalized innovations.
+#: Scalars of each sample: its time and length [s], mean insertion depth [m], stiffness factor of
+#: swelling, readings of the wrench [N, N m], and sum and number of the squared normalized
+#: innovations.
 SAMPLE = np.dtype(
     [
         (name, float)
@@ -44,7 +44,7 @@ SAMPLE = np.dtype(
 
 class LowPass(NamedTuple):
     """
-    The low-pass of a channel of the wrench: f entries, its memory and its reading.
+    Low-pass of a channel of the wrench with f entries: its memory and its reading.
 
     Attributes
     ----------
@@ -53,11 +53,11 @@ class LowPass(NamedTuple):
     transition : ndarray, shape (f, f)
         Transition over a sample of the filter.
     noise : ndarray, shape (2, f, f)
-        Covariance of what noise adds over it, for the force and for the moment.
+        Covariance of the noise over a sample, for force and moment.
     response : ndarray, shape (ticks, f)
-        What an input of one leaves so many ticks later.
+        Response to a unit input after a number of ticks.
     steady : ndarray, shape (f,)
-        What a constant input of one leaves in the long run.
+        Steady response to a constant unit input.
 
     """
 
@@ -69,13 +69,13 @@ class LowPass(NamedTuple):
 
 
 #: Entries of the state after c and b of the modes: lateral force at the tip [N], and the offsets
-#: of lateral force [N] and moment [N m] as they are read. They change slowly and drive the rest.
+#: of the measured lateral force [N] and moment [N m]. They vary slowly and drive the rest.
 LOADS: Final = 3
 
 
 class Noise(NamedTuple):
     """
-    What is uncertain.
+    Noise model of the filter.
 
     Attributes
     ----------
@@ -88,9 +88,9 @@ class Noise(NamedTuple):
     reading : tuple of float
         Variances of the readings of lateral force [N^2] and moment [N^2 m^2], behind the low-pass.
     wrench : tuple of float
-        Variances of their white noise before it.
+        Variances of their white noise before the low-pass.
     loads, rates : tuple of float
-        Variances of the `LOADS`, and the rates at which they become others [1/s].
+        Variances of the `LOADS`, and their decorrelation rates [1/s].
 
     """
 
@@ -105,20 +105,20 @@ class Noise(NamedTuple):
 
 class Filter(NamedTuple):
     """
-    The filter and its past: arrays with one row for each of the samples that are kept.
+    Filter and its history: arrays with one row per stored sample.
 
     Attributes
     ----------
     needle : Needle
-        Needle and tissue as the observer believes them to be.
+        Nominal model of needle and tissue.
     noise : Noise
-        What is uncertain.
+        Noise model.
     low_pass : LowPass
-        The low-pass of the wrench.
+        Low-pass of the wrench.
     samples : ndarray of `SAMPLE`, shape (slots,)
-        What is kept of each sample.
+        Scalars of each sample.
     states : ndarray, shape (slots, N)
-        State after it, see `kalman`.
+        State after the sample, see `kalman`.
     covariances, transitions : ndarray, shape (slots, N, N)
         Its covariance, and the transition over the sample.
     shapes, inverses : ndarray, shape (slots, n, n)
@@ -126,7 +126,7 @@ class Filter(NamedTuple):
     squares, tips : ndarray, shape (slots, n)
         Squares of their frequencies, and their values at the tip.
     changes : ndarray, shape (slots, 2 n, 2 n)
-        Change of basis from the sample before.
+        Change of basis from the previous sample.
     exposures : ndarray, shape (m, 3)
         Samples of the tip deflection in order: start and end of the exposure [s], mean [m].
 
@@ -161,20 +161,10 @@ def _growth(needle: Needle, time: float) -> float:
 @kernel
 def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
     """
-    Write the state before any measurement into the first slot.
+    Write the prior state at a time [s] and insertion depth [m] into the first slot.
 
-    Every c and b has the same variance: the one that gives the tip its variance. What the memory
-    of the low-pass holds is a constant and a white wrench as large as such a needle exerts.
-
-    Parameters
-    ----------
-    held : Held of Filter
-        The filter; overwritten.
-    time, span : float
-        Time of the first sample and length of a sample [s].
-    depth : float
-        Inserted length [m].
-
+    All c and b have the same variance, such that the tip has its prior variance. The prior of the
+    low-pass memory is a constant and a white wrench of the size that such a needle exerts.
     """
     f = held.value
     needle, low_pass = f.needle, f.low_pass
@@ -210,7 +200,7 @@ def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
             for j in range(filters):
                 steady = low_pass.steady[i] * low_pass.steady[j]
                 covariance[first + i, first + j] += reaction * steady
-    # What the loads have left in the memory of the low-pass, and among its channels.
+    # Covariance of the loads with the memory of the low-pass, and between its channels.
     arms = (-1.0, -needle.length)
     for load in range(LOADS):
         covariance[2 * n + load, 2 * n + load] = f.noise.loads[load]
@@ -242,7 +232,7 @@ def _over(
 def _write_transition(  # noqa: C901
     f: Filter, frozen: Frozen, change: FloatArray, span: float, velocity: float, out: FloatArray
 ) -> None:
-    """Write the transition over a sample: change of basis, then modes that drive the low-pass."""
+    """Compute the transition over a sample: change of basis, then modes and low-pass."""
     needle, low_pass = f.needle, f.low_pass
     n, filters, ticks = f.squares.shape[1], low_pass.steady.shape[0], low_pass.ticks
     modal, tick, rate = 2 * n, span / ticks, needle.tissue_damping / needle.linear_density
@@ -259,7 +249,7 @@ def _write_transition(  # noqa: C901
         for j in range(modal):
             out[k, j] = cc * change[k, j] + cb * change[n + k, j]
             out[n + k, j] = bc * change[k, j] + bb * change[n + k, j]
-        # Under a force at the tip the mode turns about its rest.
+        # Under a force at the tip the mode rotates about its equilibrium.
         out[k, modal], out[n + k, modal] = (1.0 - cc) * rest[k], -bc * rest[k]
         cc, cb, bc, bb = turn(rate, square, tick)
         for channel in range(2):
@@ -299,7 +289,7 @@ def _expose(
     covariance: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add a part of the sample, times from its start, to the running mean of the tip."""
+    """Add a part of the sample, in times from its start [s], to the running mean of the tip."""
     n = f.squares.shape[1]
     change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n + 1]
     by_force = 0.0
@@ -325,7 +315,7 @@ def _expose(
 
 @compiled
 def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
-    """Fill the slot ``new`` from the slot ``old``, with what was measured in between."""
+    """Compute the slot ``new`` from the slot ``old`` with the measurements in between."""
     n, filters, size = f.squares.shape[1], f.low_pass.steady.shape[0], f.states.shape[1]
     modal, last = 2 * n, size - 1
     drivers = modal + LOADS
@@ -336,7 +326,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
         x[i] = f.states[old, i]
     sample = f.samples[new]
     t0, t1, span = f.samples[old]['time'], sample['time'], sample['span']
-    # White noise of the sample, half of it at either end: the trapezoidal rule.
+    # White noise of the sample, half at each end: trapezoidal rule.
     kick = 0.5 * span * f.noise.force / f.needle.linear_density
     for k in range(n, modal):
         covariance[k, k] += kick
@@ -370,7 +360,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
                 covariance[first + i, first + j] += f.low_pass.noise[channel, i, j]
     for channel in range(2):
         reading, variance = readings[channel], f.noise.reading[channel]
-        # A reading that is missing is NaN.
+        # A missing reading is NaN.
         if reading == reading:
             index = drivers + (channel + 1) * filters - 1
             nis += measure(x, covariance, index, reading, variance, used, work)
@@ -394,23 +384,10 @@ def observe(
     moment: float,
 ) -> None:
     """
-    Take in one sample.
+    Process one sample into the slot ``new``, after the slot ``old``.
 
-    Parameters
-    ----------
-    held : Held of Filter
-        The filter; overwritten.
-    count : int
-        Number of valid exposures.
-    old, new : int
-        Slots of the sample before and of this one.
-    time, span : float
-        Time of the sample, and its length [s].
-    depth, velocity : float
-        Means of the inserted length [m] and of the insertion velocity [m/s] over the sample.
-    lateral, moment : float
-        Readings of the wrench [N, N m], NaN where missing.
-
+    ``count`` is the number of valid exposures, ``depth`` [m] and ``velocity`` [m/s] are means over
+    the sample, ``lateral`` [N] and ``moment`` [N m] the readings of the wrench, NaN if missing.
     """
     f = held.value
     n = f.squares.shape[1]
@@ -422,7 +399,7 @@ def observe(
     frozen = freeze(f.needle, depth, growth, _modes(f, new))
     change_basis(_modes(f, old), frozen.modes, -0.5 * span, 0.5 * span, change)
     if depth == before['depth'] and growth == before['growth']:
-        # Rounding must not add up while the needle rests.
+        # No accumulation of rounding while the needle rests.
         for i in range(2 * n):
             for k in range(2 * n):
                 change[i, k] = 1.0 if i == k else 0.0
@@ -436,21 +413,7 @@ def observe(
 
 @kernel
 def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: float) -> None:
-    """
-    Fill the slots after the last one that is not later than a time once more.
-
-    Parameters
-    ----------
-    held : Held of Filter
-        The filter; overwritten.
-    count : int
-        Number of valid exposures.
-    oldest, newest : int
-        First and last slot.
-    since : float
-        Time from which on measurements have changed [s].
-
-    """
+    """Recompute the slots later than ``since`` [s], the time of changed measurements."""
     f = held.value
     slots, slot = f.samples.shape[0], newest
     while slot != oldest and f.samples[slot]['time'] > since:
@@ -471,31 +434,14 @@ def estimate(  # noqa: C901
     jacobian: Matrix,
 ) -> tuple[float, float, float]:
     """
-    Return to the coordinates of the model at the present depth, half a sample after the mean one.
+    Transform the newest slot to modal coordinates at the present depth, half a sample later.
 
-    Parameters
-    ----------
-    held : Held of Filter
-        The filter.
-    slot : int
-        The newest slot.
-    depth : float
-        Present inserted length [m].
-    span : float
-        Length of a sample [s].
-    modal : ndarray, shape (2 n,)
-        Overwritten with q [m^3/2] and q_dot [m^3/2 / s].
-    jacobian : ndarray, shape (2 n, 2 n)
-        Overwritten with their derivatives by c and b of the slot.
+    ``modal``, shape (2 n,), takes q [m^3/2] and q_dot [m^3/2 / s], ``jacobian``, shape (2 n, 2 n),
+    their derivatives by c and b of the slot.
 
-    Returns
-    -------
-    tip, spread : float
-        Tip deflection and its standard deviation [m].
-    load : float
-        Force of the bent needle against insertion [N] by the modes below half the sample rate: of
-        faster ones, samples cannot tell the rate, and the square of it would be that of noise.
-
+    Returns the tip deflection and its standard deviation [m], and the force of the bent needle
+    against insertion [N] by the modes below half the sample rate: the estimated rates of faster
+    modes are noise, which their square would add to the force.
     """
     f = held.value
     needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]

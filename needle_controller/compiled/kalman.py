@@ -1,10 +1,9 @@
 """
 Steps of a Kalman filter in which every measurement is a reading of one entry of the state.
 
-The state is, in this order: c and b of the modes (`bending`), and loads that change slowly, which
-together drive all the rest; of each channel of the wrench the
-memory of its low-pass and, last, its reading; the running mean of the tip deflection over the
-exposure that is going on.
+The state is, in this order: c and b of the modes (`bending`), and slowly varying loads, which
+together drive the rest; the memory of the low-pass and its reading, for each channel of the
+wrench; the running mean of the tip deflection over the current exposure.
 """
 
 from __future__ import annotations
@@ -24,28 +23,10 @@ def measure(
     work: FloatArray,
 ) -> float:
     """
-    Take in a reading of one entry of the state, in Joseph's form.
+    Update state (N,) and covariance (N, N) with a reading of one entry, in Joseph's form.
 
-    Parameters
-    ----------
-    x : ndarray, shape (N,)
-        State; overwritten.
-    covariance : ndarray, shape (N, N)
-        Its covariance; overwritten.
-    index : int
-        Entry that was read.
-    value, variance : float
-        Reading, and variance of its error.
-    size : int
-        Number of entries to correct; those after them are left alone.
-    work : ndarray, shape (2, N)
-        Scratch.
-
-    Returns
-    -------
-    float
-        The squared innovation over its variance; 0 if both variances are 0.
-
+    Corrects the first ``size`` entries; ``work``, shape (2, N), is scratch memory. Returns the
+    squared innovation over its variance, 0 if both variances are 0.
     """
     own: float = covariance[index, index]
     spread: float = own + variance
@@ -71,19 +52,9 @@ def add_to_mean(
     x: FloatArray, covariance: FloatArray, row: FloatArray, shared: FloatArray
 ) -> None:
     """
-    Add a linear form of the first entries of the state to its last entry.
+    Add a linear form of the first m entries of the state (N,) to its last entry.
 
-    Parameters
-    ----------
-    x : ndarray, shape (N,)
-        State; overwritten.
-    covariance : ndarray, shape (N, N)
-        Its covariance; overwritten.
-    row : ndarray, shape (m,)
-        The linear form, of the first m entries.
-    shared : ndarray, shape (N,)
-        Scratch.
-
+    ``row``, shape (m,), is the linear form, ``shared``, shape (N,), scratch memory.
     """
     last = x.shape[0] - 1
     for j in range(last + 1):
@@ -102,17 +73,7 @@ def add_to_mean(
 
 @compiled
 def clear_mean(x: FloatArray, covariance: FloatArray) -> None:
-    """
-    Set the last entry of the state to zero, exactly known.
-
-    Parameters
-    ----------
-    x : ndarray, shape (N,)
-        State; overwritten.
-    covariance : ndarray, shape (N, N)
-        Its covariance; overwritten.
-
-    """
+    """Set the last entry of the state (N,) to zero with zero variance."""
     last = x.shape[0] - 1
     x[last] = 0.0
     for j in range(last + 1):
@@ -123,8 +84,8 @@ def clear_mean(x: FloatArray, covariance: FloatArray) -> None:
 def _product(
     left: FloatArray, right: FloatArray, modal: int, low: int, high: int, out: FloatArray
 ) -> None:
-    """Write the row left[k] right[k], summed over the modes and over low to high."""
-    # Whole rows are added up: the processor does several entries at a time.
+    """Compute the row left[k] right[k], summed over the modes and over low to high."""
+    # Sums of whole rows can be vectorized.
     out[:] = 0.0
     for m in range(modal):
         part = left[m]
@@ -138,7 +99,7 @@ def _product(
 
 @compiled
 def _memory(i: int, modal: int, filters: int) -> tuple[int, int]:
-    """Return which entries, beside the modes, drive an entry: the memory of its low-pass."""
+    """Return the range of entries that drive an entry in addition to the modes: its low-pass."""
     if i < modal:
         return 0, 0
     low = modal + (i - modal) // filters * filters
@@ -156,26 +117,14 @@ def propagate(
     work: FloatArray,
 ) -> None:
     """
-    Take state and covariance through a transition, in place.
+    Propagate state (N,) and covariance (N, N) through a transition (N, N), in place.
 
-    Only what can differ from zero is multiplied: modes and loads drive everything, each low-pass
-    drives itself, and its reading is not remembered.
+    Only nonzero blocks are multiplied: modes and loads drive all entries, each low-pass drives
+    itself, and its reading has no memory. The last entry of the state stays.
 
-    Parameters
-    ----------
-    x : ndarray, shape (N,)
-        State; overwritten.
-    covariance : ndarray, shape (N, N)
-        Its covariance; overwritten.
-    transition : ndarray, shape (N, N)
-        Transition; the last entry of the state stays as it is.
-    modal, filters : int
-        Number of entries of modes and loads, and of each low-pass with its reading.
-    size : int
-        N, or N - 1 while the last entry is zero and exactly known.
-    work : ndarray, shape (N + 2, N)
-        Scratch.
-
+    ``modal`` and ``filters`` are the numbers of entries of modes and loads, and of each low-pass
+    with its reading; ``size`` is N, or N - 1 while the last entry is zero without variance;
+    ``work``, shape (N + 2, N), is scratch memory.
     """
     end = modal + 2 * filters
     fresh, row, turned = work[0], work[1, :size], work[2:]
@@ -188,7 +137,7 @@ def propagate(
             value += transition[i, m] * x[m]
         fresh[i] = value
         _product(transition[i], covariance, modal, low, high, row)
-        # Transposed, so that the second product adds up rows, too.
+        # Transposed, so that the second product sums rows, too.
         for k in range(size):
             turned[k, i] = row[k]
     for i in range(end):

@@ -1,9 +1,9 @@
 """
-The arithmetic of the sampled control laws on one axis.
+Sampled control laws on one axis.
 
-One set of functions serves the node, call by call, and the compiled loop over thousands of runs.
+The same functions serve the node, call by call, and the compiled loop over thousands of runs.
 They take `LawConstants` and `Instant` as plain tuples and name their fields inside: Numba
-recognizes a plain tuple several times faster than a named one.
+recognizes a plain tuple several times faster than a named tuple.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from needle_dynamics.compiled.friction import (
 INVERSE_DYNAMICS: Final = 0.0
 PID: Final = 1.0
 
-#: Entries of the memory of a law: integral of the error, filtered rate of the error, a force that
-#: fades after a switch of laws, and for inverse dynamics position and speed of the modeled motion,
-#: which count if the next entry is 1.
+#: Entries of the memory of a law: integral of the error, filtered rate of the error, force offset
+#: that fades after a switch of laws, and for inverse dynamics position and velocity of the modeled
+#: motion, valid if `FOLLOWS` is 1.
 INTEGRAL, RATE, OFFSET, POSITION, SPEED, FOLLOWS = 0, 1, 2, 3, 4, 5
 
-#: What is learned, for insertion and then for withdrawal, and before it the last measured position
-#: and speed, which count if the entry before them is 1.
+#: Learned friction, for insertion and then for withdrawal; before it a flag and the last measured
+#: position and velocity, valid if the flag is 1.
 SEEN: Final = 6
 LEARNED: Final = 9
 MEMORY: Final = LEARNED + 2 * BLOCK
 
-#: Slowest motion that is learned from [m/s].
+#: Least speed at which friction is learned [m/s].
 _SLIDES: Final = 5e-4
 
 
@@ -52,20 +52,20 @@ class LawConstants(NamedTuple):
     period : float
         Sample period h [s].
     pv, vv, pf, vf : float
-        Response of the axis over one period of insertion to its speed and to a constant force; see
-        `Response`.
+        Response of the axis over one period of insertion to its velocity and to a constant force;
+        see `Response`.
     back_pv, back_vv, back_pf, back_vf : float
-        The same for withdrawal.
+        Response on withdrawal.
     inertia : float
         Inertia of the axis [kg].
     friction_law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed : float
         Friction of the axis; see `FrictionConstants`.
     breakaway_speed : float
-        Speed from which on Coulomb friction is fully compensated [m/s].
+        Speed above which Coulomb friction is fully compensated [m/s].
     ahead : float
-        Time ahead of that speed [s].
+        Prediction time of the speed for this compensation [s].
     kp, ki, kd : float
-        Gains of the feedback: force by the error, its integral and its rate.
+        Feedback gains: force per error, integral and rate of the error.
     model_kp, model_kv : float
         Gains k_p [1/s^2] and k_v [1/s] of the modeled motion (inverse dynamics).
     filter_time : float
@@ -73,16 +73,16 @@ class LawConstants(NamedTuple):
     tolerance : float
         Error at rest below which the integral is frozen [m].
     tracking : float
-        Part of an excess force that back-calculation removes in one period; 0 for conditional
+        Fraction of an excess force that back-calculation removes in one period; 0 for conditional
         integration.
     feed_forward : float
         1 with feed-forward, 0 without.
     fade : float
         Factor by which the offset after a switch decreases in one period.
     bound : float
-        Largest learned part of the friction of the axis; 0 without learning.
+        Largest learned friction relative to the model; 0 without learning.
     noise : float
-        Standard deviation of the force that is learned from [N]; infinite while frozen.
+        Standard deviation of the force measurement for learning [N]; infinite while frozen.
 
     """
 
@@ -122,7 +122,7 @@ class LawConstants(NamedTuple):
 
 class Instant(NamedTuple):
     """
-    What a law responds to.
+    State and setpoint, the inputs of a law.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ class Instant(NamedTuple):
     target_acceleration: float
 
 
-#: The same as plain tuples: they reach compiled code faster than named ones.
+#: Plain tuples of the same fields: faster as arguments of compiled functions than named tuples.
 LawTuple: TypeAlias = Annotated[tuple[float, ...], len(LawConstants._fields)]
 InstantTuple: TypeAlias = Annotated[tuple[float, ...], len(Instant._fields)]
 
@@ -150,7 +150,7 @@ class _Implicit(NamedTuple):
     Feedback as an equation for its own force: force = forward + push / divisor.
 
     The filtered rate of the error at the end of the period is rate - slope times the feedback.
-    `end` and `reached` are position and speed to aim at for the end of the period.
+    `end` and `reached` are the goal position and velocity at the end of the period.
     """
 
     forward: float
@@ -177,7 +177,7 @@ def _friction(c: LawConstants) -> FrictionConstants:
 
 @compiled
 def _dry(c: LawConstants, speed: float, acceleration: float) -> float:
-    """Return the dry friction of a motion, by its speed shortly ahead."""
+    """Return the dry friction of a motion [N] at its predicted velocity."""
     if c.coulomb == 0.0:
         return 0.0
     soon = speed + c.ahead * acceleration
@@ -192,9 +192,9 @@ def _dry(c: LawConstants, speed: float, acceleration: float) -> float:
 @compiled
 def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
     """
-    Return the motion to follow: the reference, or the modeled one of inverse dynamics.
+    Return the motion to follow: the reference, or the modeled motion of inverse dynamics.
 
-    That one starts at the measurement and goes to the reference as k_p and k_v say.
+    The modeled motion starts at the measurement and converges to the reference with k_p and k_v.
     """
     if c.kind == PID:
         return at
@@ -211,7 +211,7 @@ def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
 
 @compiled
 def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
-    """Return the learned friction of the motion to follow, beyond the modeled one."""
+    """Return the learned additional friction of the motion to follow [N]."""
     if c.bound == 0.0:
         return 0.0
     soon = aim.target_speed + c.ahead * aim.target_acceleration
@@ -226,17 +226,10 @@ def law_learn(
     constants: LawTuple, memory: Vector, position: float, speed: float, force: float
 ) -> None:
     """
-    Learn from the period that has passed, if the law learns and the axis was sliding.
+    Update the learned friction with the last period, if the law learns and the axis was sliding.
 
-    Parameters
-    ----------
-    constants, memory
-        As for `law_force`.
-    position, speed : float
-        Measured state of the axis, now.
-    force : float
-        Force less known loads that has acted over the period [N].
-
+    ``constants`` and ``memory`` as in `law_force`; ``position`` and ``speed`` are measured now,
+    ``force`` is the force of the period less known loads [N].
     """
     c = LawConstants(*constants)
     if c.bound == 0.0:
@@ -246,7 +239,7 @@ def law_learn(
     if seen != 1.0 or c.noise == inf:
         return
     mean = (position - before) / c.period
-    # Both ends slide in the same direction, and no measurement is missing between them.
+    # Sliding in the same direction at both ends, and no missing measurement between them.
     slides = min(abs(mean), abs(speed), abs(rate)) > _SLIDES and speed * rate > 0.0
     if not slides or abs(mean - 0.5 * (speed + rate)) > 0.5 * abs(mean):
         return
@@ -285,7 +278,7 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
         rate += share * (reached - vv * aim.speed)
         push = stiffness * (end - aim.position - pv * aim.speed)
     else:
-        # The feed-forward takes the model to the end, so that only the deviation matters.
+        # The feed-forward moves the model to the end; feedback of the deviation only.
         end = aim.target + pv * aim.target_speed + pf * linear
         slower = aim.target_speed - aim.speed
         rate += share * vv * slower
@@ -303,7 +296,7 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
 
 @compiled
 def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: float) -> float:
-    """Return the force within its limit and update the memory."""
+    """Return the force within its limit [N] and update the memory."""
     aim = _aim(c, memory, at)
     form = _implicit(c, memory, aim)
     wanted = form.forward + form.push / form.divisor
@@ -322,7 +315,7 @@ def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: 
         elif excess * error <= 0.0:
             memory[INTEGRAL] += c.period * error
     memory[OFFSET] *= c.fade
-    # Without feedback, and where the force has no room, the modeled motion starts anew.
+    # Without feedback, and at the force limit, the modeled motion restarts at the measurement.
     memory[FOLLOWS] = 1.0 if c.kp > 0.0 and excess == 0.0 else 0.0
     memory[POSITION], memory[SPEED] = form.end, form.reached
     return force
@@ -331,24 +324,11 @@ def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: 
 @kernel
 def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: float) -> float:
     """
-    Return the force for the next period, before any limit.
+    Return the force for the next period before any limit [N]; see the classes of the laws.
 
-    Parameters
-    ----------
-    constants : tuple of float
-        Fields of `LawConstants`.
-    memory : ndarray, shape (MEMORY,)
-        Memory of the law.
-    instant : tuple of float
-        Fields of `Instant`.
-    load : float
-        Known force against the motion [N].
-
-    Returns
-    -------
-    float
-        Force [N]; the equations are those of the classes of the laws.
-
+    ``constants`` are the fields of `LawConstants`, ``memory`` the memory of the law, shape
+    (MEMORY,), ``instant`` the fields of `Instant`, and ``load`` a known force against the motion
+    [N].
     """
     return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 
@@ -361,17 +341,7 @@ def law_match(
     load: float,
     force: float,
 ) -> None:
-    """
-    Set the memory such that the force of the law equals a given one.
-
-    Parameters
-    ----------
-    constants, memory, instant, load
-        As for `law_force`.
-    force : float
-        Force that the law shall return [N].
-
-    """
+    """Set the memory such that the force of the law equals ``force`` [N]; else as `law_force`."""
     c, at = LawConstants(*constants), Instant(*instant)
     memory[:SEEN] = 0.0
     memory[RATE] = at.target_speed - at.speed
@@ -393,22 +363,7 @@ def law_step(
     load: float,
     limit: float,
 ) -> float:
-    """
-    Return the force within its limit and update the memory.
-
-    Parameters
-    ----------
-    constants, memory, instant, load
-        As for `law_force`.
-    limit : float
-        Largest force [N].
-
-    Returns
-    -------
-    float
-        Force for the next period [N].
-
-    """
+    """Return the force within its limit [N] and update the memory; else as `law_force`."""
     return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)
 
 
@@ -416,24 +371,7 @@ def law_step(
 def axis_step(
     constants: LawTuple, position: float, speed: float, force: float
 ) -> tuple[float, float]:
-    """
-    Move the axis of a law through one period under a constant force.
-
-    Parameters
-    ----------
-    constants : tuple of float
-        Fields of `LawConstants`.
-    position, speed : float
-        State of the axis.
-    force : float
-        Force less known loads [N].
-
-    Returns
-    -------
-    position, speed : float
-        State after the period.
-
-    """
+    """Return position and velocity of the axis after one period under a force less loads [N]."""
     c = LawConstants(*constants)
     speed, moved = friction_flow(_friction(c), c.inertia, speed, force, c.period)
     return position + moved, speed

@@ -1,11 +1,11 @@
 """
-Friction learned on the way: corrections of the modeled friction, by recursive least squares.
+Friction adaptation: corrections of the friction model by recursive least squares.
 
 In each direction of motion three corrections are estimated: of dry friction, of viscous friction,
-and of dry friction per inserted length. Before any motion they are zero, with a standard
-deviation of half their bound. A period in which the axis slides is one measurement: the force that
-acted, less that of the inertia and of the modeled friction at the mean speed. What a motion does
-not excite stays as it was. While it learns, the covariance grows slowly, up to its beginning.
+and of dry friction per insertion depth. Their prior is zero with a standard deviation of half
+their bound. Each period of sliding is a measurement: the force of the period, less inertia and
+modeled friction at the mean speed. Corrections without excitation do not change. While the law
+learns, the covariance grows slowly, up to the prior.
 """
 
 from __future__ import annotations
@@ -21,34 +21,19 @@ import numpy as np
 TERMS: Final = 3
 BLOCK: Final = TERMS + TERMS * TERMS
 
-#: Inserted length over which dry friction may change by its bound [m].
+#: Insertion depth over which dry friction may change by its bound [m].
 LENGTH: Final = 0.05
 
-#: Time in which the measurements of one noise are counted as one [s].
+#: Correlation time of the measurement noise [s].
 _CORRELATED: Final = 0.01
 
-#: Time in which the covariance of a correction grows to its beginning, without measurements [s].
+#: Time in which the covariance of a correction grows to its prior, without measurements [s].
 _MEMORY: Final = 60.0
 
 
 @compiled
 def bounds(share: float, coulomb: float, viscous: float) -> tuple[float, float, float]:
-    """
-    Return the largest modulus of each correction.
-
-    Parameters
-    ----------
-    share : float
-        Relative bound of the corrections.
-    coulomb, viscous : float
-        Modeled friction [N], [N s/m].
-
-    Returns
-    -------
-    tuple of float
-        Bounds [N], [N s/m], [N/m].
-
-    """
+    """Return the largest modulus of each correction [N], [N s/m], [N/m], relative to the model."""
     return share * coulomb, share * viscous, share * coulomb / LENGTH
 
 
@@ -57,24 +42,10 @@ def correction(
     block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
     """
-    Return the learned friction beyond the modeled one, for a motion in the direction of a block.
+    Return the learned additional friction [N] in the direction of a block, within bounds.
 
-    Parameters
-    ----------
-    block : ndarray, shape (BLOCK,)
-        Estimate of this direction.
-    limits : tuple of float
-        As from `bounds`.
-    depth : float
-        Position of the axis [m]; the depth counts from `LENGTH`.
-    speed : float
-        Modulus of its speed [m/s].
-
-    Returns
-    -------
-    float
-        Force [N]; no larger than the bounds of dry and viscous friction allow.
-
+    ``block`` has shape (BLOCK,), ``limits`` are from `bounds`, ``depth`` is the position of the
+    axis [m] and ``speed`` the modulus of its velocity [m/s].
     """
     dry, viscous, slope = limits
     held = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
@@ -92,23 +63,10 @@ def learn(
     period: float,
 ) -> None:
     """
-    Take in one period of sliding.
+    Update the estimate of one direction, shape (BLOCK,), with one period of sliding.
 
-    Parameters
-    ----------
-    block : ndarray, shape (BLOCK,)
-        Estimate of this direction; updated. Zeros begin.
-    limits : tuple of float
-        As from `bounds`.
-    depth, speed : float
-        Position [m] and modulus of the mean speed of the period [m/s].
-    missing : float
-        Friction beyond the modeled one in this period [N].
-    noise : float
-        Standard deviation of that force [N].
-    period : float
-        Period [s].
-
+    ``missing`` is the friction of the period beyond the model [N] and ``noise`` its standard
+    deviation. A block of zeros starts at the prior.
     """
     covariance = block[TERMS:].reshape((TERMS, TERMS))
     prior = (0.5 * limits[0], 0.5 * limits[1], 0.5 * limits[2])

@@ -1,4 +1,4 @@
-"""The closed loop of one sampled law and the simulated needle, for batches of runs."""
+"""Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
 from __future__ import annotations
 
@@ -36,49 +36,43 @@ def run_loop(  # noqa: C901
     errors: Vector,
 ) -> int:
     """
-    Run a sampled law of insertion around the simulated needle.
+    Run a sampled law of insertion with the simulated needle; return the completed periods.
+
+    Fewer than k periods are completed if the needle leaves its range.
 
     Parameters
     ----------
     c : Needle
-        The needle.
+        Needle.
     state : ndarray, shape (2 (2 + n),)
-        Initial state; overwritten with the state at the end.
+        Initial state; overwritten with the final state.
     law : tuple of float
         Fields of `LawConstants`.
     limit : float
         Largest force [N].
     setpoints : ndarray, shape (k, 3)
-        Position, speed and acceleration that each command aims at.
+        Position, velocity and acceleration of the setpoint for each command.
     goal : ndarray, shape (k + 1,)
         Position of the reference at the times of the measurements [m].
     pending : ndarray, shape (delay,)
-        Commands that have not yet taken effect [N]; overwritten.
+        Commands without effect so far [N]; overwritten.
     known : int
-        Periods of delay that the law knows: it sees that many of the newest pending commands.
+        Periods of delay that the law compensates, with the newest pending commands.
     noise : ndarray, shape (k, 3) or (0, 3)
-        What the law measures too much, position [m] and speed [m/s], and what acts beyond its
-        commands [N].
+        Errors of the measured position [m] and velocity [m/s], and additional force [N].
     added : ndarray, shape (m, 3)
-        Friction along the way: inserted length from which on [m] the needle has this much more
-        Coulomb friction [N] and viscous friction [N s/m], until the next row.
+        Additional friction by depth: insertion depth [m] above which Coulomb friction [N] and
+        viscous friction [N s/m] are added, until the next row.
     longest : float
         Longest step of the integrator [s].
     depths : ndarray, shape (k + 1,) or (0,)
-        Overwritten with the inserted lengths at the times of the measurements [m]; empty if they
-        are not needed.
+        Output: insertion depths at the times of the measurements [m]; unused if empty.
     states : ndarray, shape (k + 1, 2 (2 + n)) or (0, 2 (2 + n))
-        Overwritten with the states then; empty if they are not needed.
+        Output: states at these times; unused if empty.
     commands : ndarray, shape (k,) or (0,)
-        Overwritten with the command that answers each measurement [N]; empty likewise.
+        Output: command for each measurement [N]; unused if empty.
     errors : ndarray, shape (3,)
-        Overwritten with goal minus inserted length: last [m], largest in modulus [m] and mean
-        square [m^2].
-
-    Returns
-    -------
-    int
-        Number of periods completed: fewer than k if the needle left its range.
+        Output: goal minus insertion depth: last [m], largest in modulus [m] and mean square [m^2].
 
     """
     memory, none = np.zeros(MEMORY), np.empty((0, 3))
@@ -108,7 +102,7 @@ def run_loop(  # noqa: C901
         command = law_step(law, memory, instant, 0.0, limit)
         if commands.shape[0] > 0:
             commands[k] = command
-        # What acts in this period, as the law knows it.
+        # Force of this period according to the law.
         acts = pending[delay - known] if known > 0 else command
         force = command
         if delay > 0:
@@ -142,32 +136,11 @@ def ring(
     count: int,
 ) -> tuple[float, float, int]:
     """
-    Run a law from rest to zero on an axis of its own, and see whether it comes to rest.
+    Run a law from a position [m] to zero on a simulated axis, and measure its final oscillation.
 
-    Parameters
-    ----------
-    law : tuple of float
-        Fields of `LawConstants`.
-    friction : FrictionConstants
-        Friction of the true axis.
-    inertia : float
-        Inertia of the true axis [kg].
-    known : int
-        Periods of delay that the law knows: it sees that many of the newest pending commands.
-    pending : ndarray, shape (delay,)
-        Commands that have not yet taken effect [N]; overwritten.
-    start : float
-        Initial position [m].
-    count : int
-        Periods in a third of the run.
-
-    Returns
-    -------
-    before, after : float
-        Span of the position in the second and in the last third [m].
-    turns : int
-        Reversals in the last third.
-
+    ``friction`` and ``inertia`` are of the true axis; ``known`` and ``pending`` as in `run_loop`;
+    ``count`` is the number of periods in a third of the run. Returns the span of the position in
+    the second and in the last third [m], and the number of reversals in the last third.
     """
     memory = np.zeros(MEMORY)
     period, delay = LawConstants(*law).period, pending.shape[0]

@@ -9,7 +9,7 @@ import numpy as np
 
 @compiled
 def _value(c: FloatArray, x: float) -> float:
-    """Return the value of a polynomial at x; the constant coefficient comes first."""
+    """Evaluate a polynomial at x; constant coefficient first."""
     value = 0.0
     for j in range(len(c) - 1, -1, -1):
         value = value * x + c[j]
@@ -19,18 +19,9 @@ def _value(c: FloatArray, x: float) -> float:
 @kernel
 def quintic_extremes(c: Vector) -> FloatArray:  # noqa: C901
     """
-    Return the extreme values of a quintic and of its first two derivatives on [0, 1].
+    Return least and largest value of a quintic and of its first two derivatives on [0, 1].
 
-    Parameters
-    ----------
-    c : ndarray, shape (6,)
-        Coefficients, the constant one first.
-
-    Returns
-    -------
-    ndarray, shape (3, 2)
-        Least and largest value of each.
-
+    ``c``, shape (6,), has the constant coefficient first; the result has shape (3, 2).
     """
     derivatives, extremes = np.zeros((6, 6)), np.empty((3, 2))
     for j in range(6):
@@ -39,7 +30,7 @@ def quintic_extremes(c: Vector) -> FloatArray:  # noqa: C901
         for j in range(6 - k):
             derivatives[k, j] = (j + 1) * derivatives[k - 1, j + 1]
     # Between two turning points a polynomial has at most one root. The roots of each derivative,
-    # beginning with the linear one, are the turning points of the derivative before it.
+    # from the linear derivative on, are the turning points of the derivative of one order less.
     turns, found, values, count = np.zeros(6), np.zeros(6), np.empty(6), 2
     turns[1] = 1.0
     for k in range(4, -1, -1):

@@ -1,11 +1,11 @@
 r"""
-One look and one plan of the controller that steers the tip; `SteeringController` says what for.
+Measurement update and plan of the steering controller; see `SteeringController`.
 
 By hypothesis the tip at a depth is :math:`z = a \cdot b + x \cdot \theta` with the positions b of
-the guide, x + i z, and the unknown constants :math:`\theta`, of which mean and covariance P are
-known. So it has the mean :math:`a \cdot b + x \cdot \bar\theta`, and :math:`s = P \bar x` is its
-covariance with the constants: its variance is :math:`x \cdot s`, and a look at it is an update of
-rank one.
+the guide, x + i z, and unknown constants :math:`\theta` with mean :math:`\bar\theta` and
+covariance P. Its mean is :math:`a \cdot b + x \cdot \bar\theta`, its covariance with the constants
+:math:`s = P \bar x`, and its variance :math:`x \cdot s`; a tip measurement is an update of rank
+one.
 """
 
 from __future__ import annotations
@@ -32,58 +32,58 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.held import Held
 
-#: Part of the later positions that is counted on.
+#: Fraction of the later guide motion that the plan uses.
 _COUNTED: Final = 0.8
 
-#: Positions of the guide that are compared.
+#: Candidate positions of the guide, relative to its range.
 _TRIED: Final = np.linspace(-1.0, 1.0, 121)
 
-#: Directions in which the bevel may push, and positions of the guide with each that are compared.
+#: Number of candidate bevel directions, and candidate guide positions for each direction.
 _ROLLS: Final = 16
 _COARSE: Final = np.linspace(-1.0, 1.0, 13)
 
-#: Mean square of what is out of reach that a turn must be worth [m^2].
+#: Least decrease of the mean square distance from the reachable set by a turn [m^2].
 _TURN: Final = 1e-4**2
 
-#: Cost of a load on the guide beyond its limit [m^2/N^2]: more than any distance.
+#: Cost of a load on the guide above its limit [m^2/N^2]: dominates every distance.
 _OVERLOAD: Final = 1.0
 
-#: Standard deviation of the part of the bevel's load that a robot at rest takes away.
+#: Standard deviation of the relative loss of the bevel load at rest.
 _LET_GO: Final = 0.03
 
-#: Place of the load of the bevel among the constants.
+#: Index of the bevel load among the constants.
 BEVEL: Final = 3
 
-#: Abscissas and weights of a normal distribution.
+#: Abscissas and weights of the quadrature over a normal distribution.
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
 _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 
-#: Cost of being away from the plan for the mean, and of motion in that plan [shift of the tip per
-#: shift of the guide, squared].
+#: Cost of the distance from the plan for the mean, and of motion in that plan [shift of the tip
+#: per shift of the guide, squared].
 _AWAY, _MOTION = 1e-5, 1e-2
 
-#: A look at this squared distance from what is expected, in standard deviations, is no look at
-#: this needle: by chance one in 3 million has it. So many of them are a fault.
+#: Gate on the squared innovation over its variance (exceeded by noise once in 3 million tip
+#: measurements), and number of successive measurements outside the gate that is a fault.
 _IMPOSSIBLE, _MOST_IMPOSSIBLE = 30.0, 2
 
-#: Looks without a change while the needle goes on, from which on the sensor has frozen.
+#: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
 _FROZEN: Final = 2
 
-#: Looks that may be missing in a row.
+#: Largest number of successive missing tip measurements.
 _MOST_MISSING: Final = 6
 
-#: Reached is what is no farther from the target than this [m].
+#: Distance from the target that counts as a hit [m].
 _REACHED: Final = 1e-3
 
-#: Places in `Steering.counts`: looks so far, turns that are left, and looks in a row that were
-#: the same, impossible and missing.
+#: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
+#: implausible and missing measurements.
 STEP: Final = 0
 TURNS: Final = 1
 SAME: Final = 2
 STRANGE: Final = 3
 MISSING: Final = 4
 
-#: What a look may be.
+#: Result of the check of a tip measurement.
 FINE: Final = 0
 LOST: Final = 1
 FROZEN: Final = 2
@@ -92,16 +92,16 @@ FOREIGN: Final = 3
 
 class Responses(NamedTuple):
     """
-    What the tip does by each hypothesis: the arrays of `SteeringModel` of these names, and sums.
+    Responses of the tip by hypothesis: the arrays of `SteeringModel` with these names, and sums.
 
     Attributes
     ----------
     guide, causes, bevel, elastic, guide_load, causes_load, bevel_load, between : ndarray
-        As there.
+        As in `SteeringModel`.
     later_guide : ndarray, shape (h, n + 1)
         Sums of the absolute values of `guide` at the last depth, from each step on.
     later_bevel : ndarray, shape (h, n + 3)
-        The same of `bevel`, from the skin and from each step on.
+        Sums of the absolute values of `bevel` at the last depth, from the skin and each step on.
 
     """
 
@@ -119,20 +119,20 @@ class Responses(NamedTuple):
 
 class Steering(NamedTuple):
     """
-    What a steering controller knows and may do, with h hypotheses, n steps and m constants.
+    State and limits of a steering controller: h hypotheses, n steps and m constants.
 
     Attributes
     ----------
     responses : Responses
-        What the tip does.
+        Responses of the tip.
     limit : float
-        Farthest position of the guide along each axis [m].
+        Largest position of the guide along each axis [m].
     load_limit : float
-        Largest force of the guide that is planned [N].
+        Largest planned force of the guide [N].
     ways : ndarray, shape (n,)
-        How far the guide may have gone after so many steps, from 1 [m].
+        Range of the guide motion after a number of steps, from 1 [m].
     target : ndarray, shape (2,)
-        Where the tip shall be, x and z [m].
+        Target of the tip, x and z [m].
     mean : ndarray of complex, shape (h, m)
         Mean of the constants.
     covariance : ndarray of complex, shape (h, m, m)
@@ -140,15 +140,16 @@ class Steering(NamedTuple):
     logs : ndarray, shape (h,)
         Logarithm of the probability of each hypothesis, up to a constant.
     guide : ndarray of complex, shape (n,)
-        Position of the guide in each step [m]; 0 in those that are still to come.
+        Position of the guide in each step [m]; 0 in future steps.
     turned : ndarray of complex, shape (n + 1,)
-        Direction of the bevel over that at zero roll, on the skin and in each step.
+        Direction of the bevel relative to zero roll, on the skin and in each step.
     roll : ndarray, shape (1,)
         Roll of the needle [rad].
     last : ndarray, shape (2,)
-        The last look [m].
+        Last tip measurement [m].
     counts : ndarray of int, shape (5,)
-        Looks so far, turns that are left, looks in a row that were the same, impossible, missing.
+        Tip measurements so far, remaining turns, successive equal, implausible and missing
+        measurements.
 
     """
 
@@ -169,7 +170,7 @@ class Steering(NamedTuple):
 
 class Tip(NamedTuple):
     """
-    Where the tip is by each hypothesis.
+    Distribution of the tip at a depth by hypothesis.
 
     Attributes
     ----------
@@ -178,7 +179,7 @@ class Tip(NamedTuple):
     variances : ndarray, shape (h,)
         Variance along each axis [m^2].
     shared : ndarray of complex, shape (h, m)
-        Covariance with each of the constants.
+        Covariance with the constants.
 
     """
 
@@ -189,7 +190,7 @@ class Tip(NamedTuple):
 
 class Ends(NamedTuple):
     """
-    Where the tip ends by each hypothesis without further positions of the guide.
+    Final position of the tip by hypothesis, without further guide motion.
 
     Attributes
     ----------
@@ -198,7 +199,7 @@ class Ends(NamedTuple):
     errors : ndarray, shape (h,)
         Standard deviation along each axis [m].
     turned : ndarray, shape (h,)
-        How far later turns can push it along each axis [m].
+        Range of the tip along each axis by later turns [m].
 
     """
 
@@ -209,7 +210,7 @@ class Ends(NamedTuple):
 
 class Whole(NamedTuple):
     """
-    Where the tip is over all hypotheses.
+    Mean and covariance of the tip over all hypotheses.
 
     Attributes
     ----------
@@ -227,25 +228,12 @@ class Whole(NamedTuple):
     zz: float
 
 
-# What is known.
+# Estimation.
 
 
 @kernel
 def weights(logs: Vector) -> FloatArray:
-    """
-    Return probabilities.
-
-    Parameters
-    ----------
-    logs : ndarray, shape (h,)
-        Their logarithms, up to a constant.
-
-    Returns
-    -------
-    ndarray, shape (h,)
-        The probabilities.
-
-    """
+    """Return hypothesis weights, shape (h,), from their logarithms up to a constant."""
     largest, whole, found = -inf, 0.0, np.empty(len(logs))
     for value in logs:
         largest = max(largest, value)
@@ -259,7 +247,7 @@ def weights(logs: Vector) -> FloatArray:
 
 @inlined
 def _held(c: Steering) -> ComplexArray:
-    """Return where the guide was, and is if it rests from now on, shape (n,)."""
+    """Return the positions of the guide, shape (n,), with the guide at rest from now on."""
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
     if done > 0:
         for j in range(done, len(guide)):
@@ -269,7 +257,7 @@ def _held(c: Steering) -> ComplexArray:
 
 @compiled
 def _tip(c: Steering, at: int, guide: ComplexArray) -> Tip:
-    """Return where the tip is at a depth by each hypothesis."""
+    """Return the distribution of the tip at a depth by hypothesis."""
     r = c.responses
     h, m = c.mean.shape
     means, variances = np.zeros(h, np.complex128), np.zeros(h)
@@ -287,7 +275,7 @@ def _tip(c: Steering, at: int, guide: ComplexArray) -> Tip:
         of = shared[i]
         for j in range(m):
             means[i] += c.mean[i, j] * row[j]
-            # P is Hermitian: its rows are its columns, conjugated.
+            # P is Hermitian: its rows are its conjugated columns.
             for l in range(m):
                 of[l] += row[j] * c.covariance[i, j, l]
         for j in range(m):
@@ -299,7 +287,7 @@ def _tip(c: Steering, at: int, guide: ComplexArray) -> Tip:
 
 @compiled
 def _whole(w: FloatArray, tip: Tip) -> Whole:
-    """Return where the tip is over all hypotheses."""
+    """Return mean and covariance of the tip over all hypotheses."""
     x = z = xx = xz = zz = 0.0
     for i in range(len(w)):
         x += w[i] * tip.means[i].real
@@ -314,22 +302,7 @@ def _whole(w: FloatArray, tip: Tip) -> Whole:
 
 @kernel
 def expect(held: Held[Steering], at: int) -> Whole:
-    """
-    Return where the tip is expected; guide and roll stay as they were last sent.
-
-    Parameters
-    ----------
-    held : Held of Steering
-        What is known.
-    at : int
-        Number of the depth, from 0.
-
-    Returns
-    -------
-    Whole
-        Mean and covariance over all hypotheses.
-
-    """
+    """Predict the tip at depth number ``at`` with guide and roll as last commanded."""
     c = held.value
     return _whole(weights(c.logs), _tip(c, at, _held(c)))
 
@@ -339,26 +312,10 @@ def see(
     held: Held[Steering], at: int, x: float, z: float, variance: float
 ) -> tuple[int, float, float]:
     """
-    Take a look at the tip: each hypothesis learns from it, and becomes more probable, or less.
+    Update hypotheses and weights with a tip measurement (x, z) [m] at depth number ``at``.
 
-    Parameters
-    ----------
-    held : Held of Steering
-        What is known; updated.
-    at : int
-        Number of the depth, from 0.
-    x, z : float
-        The look [m]; nan if the tip was not seen.
-    variance : float
-        Its variance along each axis [m^2].
-
-    Returns
-    -------
-    kind : int
-        `FINE`, or why the needle must stop.
-    off_x, off_z : float
-        How far the tip is from where it was expected [m].
-
+    ``x`` and ``z`` are nan if the measurement is missing; ``variance`` is per axis [m^2]. Returns
+    `FINE` or the reason for a stop, and the innovation along both axes [m].
     """
     c = held.value
     tip, w = _tip(c, at, _held(c)), weights(c.logs)
@@ -375,7 +332,7 @@ def see(
 def _judge(
     c: Steering, x: float, z: float, off_x: float, off_z: float, there: Whole, variance: float
 ) -> tuple[int, bool]:
-    """Return what a look is, and whether it counts."""
+    """Check a tip measurement; return its kind and whether the update uses it."""
     counts = c.counts
     if not (isfinite(x) and isfinite(z)):
         counts[MISSING] += 1
@@ -388,7 +345,7 @@ def _judge(
         return (FROZEN if counts[SAME] >= _FROZEN else FINE), False
     xx, xz, zz = there.xx + variance, there.xz, there.zz + variance
     distance = zz * off_x**2 - 2.0 * xz * off_x * off_z + xx * off_z**2
-    # What is absurd is infinitely far, or nowhere.
+    # False for an infinite distance and for nan.
     if distance <= _IMPOSSIBLE * (xx * zz - xz**2):
         counts[STRANGE] = 0
         return FINE, True
@@ -398,7 +355,7 @@ def _judge(
 
 @inlined
 def _learn(c: Steering, i: int, off: complex, variance: float, shared: ComplexArray) -> None:
-    """Update a hypothesis, and its probability, by a look that is off what it expected."""
+    """Update a hypothesis and its weight with the innovation of a tip measurement [m]."""
     for j in range(len(shared)):
         gain = shared[j] / variance
         c.mean[i, j] += gain * off
@@ -408,14 +365,14 @@ def _learn(c: Steering, i: int, off: complex, variance: float, shared: ComplexAr
     c.logs[i] -= 0.5 * (off.real**2 + off.imag**2) / variance + log(variance)
 
 
-# Where the tip can be brought.
+# Reachable set.
 
 
 @compiled
 def _ends(c: Steering, turns: int, first: int) -> Ends:
-    """Return where the tip ends with so many turns from a step on, counted from 1."""
+    """Return the final position of the tip with ``turns`` turns from step ``first`` on."""
     r, last = c.responses, len(c.guide)
-    # What is still to come of the guide is 0.
+    # Future positions of the guide are 0.
     tip = _tip(c, last, c.guide)
     means, turned = tip.means, np.zeros(len(tip.means))
     if turns > 0:
@@ -432,14 +389,14 @@ def _ends(c: Steering, turns: int, first: int) -> Ends:
 
 @inlined
 def _there(c: Steering) -> complex:
-    """Return where the guide is [m]."""
+    """Return the present position of the guide [m]."""
     k = c.counts[STEP]
     return c.guide[k - 1] if 0 < k <= len(c.guide) else 0j
 
 
 @inlined
 def _room(c: Steering, begin: float, step: int) -> tuple[float, float]:
-    """Return middle and half width of where the guide can go in some steps more than one [m]."""
+    """Return middle and half width of the range of the guide ``step`` + 1 steps later [m]."""
     low, high = max(begin - c.ways[step], -c.limit), min(begin + c.ways[step], c.limit)
     return 0.5 * (low + high), 0.5 * (high - low)
 
@@ -463,42 +420,17 @@ def _reach(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
 @kernel
 def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """
-    Return where the tip can be brought from here, by each hypothesis.
+    Return the reachable set of the tip by hypothesis, shape (h,) each.
 
-    Parameters
-    ----------
-    held : Held of Steering
-        What is known.
-
-    Returns
-    -------
-    middles : ndarray of complex, shape (h,)
-        Where it goes without further motion, x + i z [m].
-    sizes : ndarray of complex, shape (h,)
-        How far it can be brought from there, along x + i along z [m].
-    errors : ndarray, shape (h,)
-        Standard deviation of the middles along each axis [m].
-
+    Its middle x + i z [m], its half widths along x + i along z [m], and the standard deviation of
+    the middle along each axis [m].
     """
     return _reach(held.value)
 
 
 @kernel
 def chance(held: Held[Steering]) -> float:
-    """
-    Return how probable it is that the tip can still come within a millimeter of the target.
-
-    Parameters
-    ----------
-    held : Held of Steering
-        What is known.
-
-    Returns
-    -------
-    float
-        The probability.
-
-    """
+    """Return the probability that the tip can reach the target within 1 mm."""
     c = held.value
     (middles, sizes, errors), w = _reach(c), weights(c.logs)
     along_x = along_z = 0.0
@@ -513,24 +445,15 @@ def chance(held: Held[Steering]) -> float:
     return along_x * along_z
 
 
-# What is done.
+# Plan.
 
 
 @kernel
 def choose(held: Held[Steering]) -> complex:
     """
-    Return the next position of the guide, and turn the needle if that is worth it.
+    Return the next position of the guide, x + i z [m], and turn the needle if worthwhile.
 
-    Parameters
-    ----------
-    held : Held of Steering
-        What is known; its roll and what follows from it are updated.
-
-    Returns
-    -------
-    complex
-        The position, x + i z [m].
-
+    Updates the roll and the bevel directions of the state.
     """
     c = held.value
     k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
@@ -539,7 +462,7 @@ def choose(held: Held[Steering]) -> complex:
     cost, guide = _best(c, w, ends, tried)
     if turns == 0 or cost < _TURN:
         return guide
-    # As it is, but for a turn now.
+    # The present plan with a turn now.
     base, few = _ends(c, turns - 1, k + 2), _tried(c, _COARSE)
     best, roll, chosen = inf, 0.0, base
     for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
@@ -568,13 +491,13 @@ def choose(held: Held[Steering]) -> complex:
 
 @inlined
 def _direction(roll: float) -> complex:
-    """Return the direction of the bevel over that at zero roll."""
+    """Return the direction of the bevel relative to zero roll."""
     return complex(cos(roll), -sin(roll))
 
 
 @inlined
 def _tried(c: Steering, parts: FloatArray) -> FloatArray:
-    """Return positions that the guide may have next, in x and in z [m]; shape (2, positions)."""
+    """Return candidate positions of the guide in x and z [m], shape (2, positions)."""
     if c.limit == 0.0:
         return np.zeros((2, 1))
     there, found = _there(c), np.empty((2, len(parts)))
@@ -587,7 +510,7 @@ def _tried(c: Steering, parts: FloatArray) -> FloatArray:
 
 @compiled
 def _best(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> tuple[float, complex]:
-    """Return what the best of positions along each axis leaves out of reach [m^2], and it."""
+    """Return mean square distance from the reachable set and position of the best candidate."""
     costs, whole, found = _costs(c, w, ends, tried), 0.0, np.empty(2)
     plan = _plan(c, w, ends)
     for plane in range(2):
@@ -603,9 +526,9 @@ def _best(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> tuple[fl
 
 @compiled
 def _costs(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> FloatArray:
-    """Return the mean square of what positions leave out of reach, in x and in z [m^2]."""
+    """Return the mean square distance from the reachable set by candidate, in x and z [m^2]."""
     r, k, last = c.responses, c.counts[STEP], len(c.guide)
-    # Later positions that depend on the next one; the others are anywhere within the limit.
+    # Later positions that depend on the next position; the others are only limited.
     near = 0
     while near < last - k - 1 and c.ways[near] < 2.0 * c.limit:
         near += 1
@@ -644,7 +567,7 @@ def _costs(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> FloatAr
 
 @compiled
 def _felt(c: Steering, w: FloatArray) -> tuple[complex, float]:
-    """Return the load on a guide that goes to zero [N], and what a shift adds [N/m]."""
+    """Return the load on a guide at zero [N], and its derivative by the position [N/m]."""
     r, k, force, stiffness = c.responses, c.counts[STEP], 0j, 0.0
     if c.load_limit == inf:
         return force, stiffness
@@ -664,7 +587,7 @@ def _felt(c: Steering, w: FloatArray) -> tuple[complex, float]:
 
 @compiled
 def _plan(c: Steering, w: FloatArray, ends: Ends) -> tuple[float, float]:
-    """Return the next position in a plan for the mean: least squares, with a price of motion."""
+    """Return the next position of a least-squares plan for the mean, with a cost of motion."""
     k, last = c.counts[STEP], len(c.guide)
     count = last - k
     normal, factor = np.zeros((count, count)), np.zeros((count, count))

@@ -1,8 +1,8 @@
 """
-The continuous closed loop, with dry friction as a set-valued law.
+Continuous closed loop, with dry friction as a set-valued law.
 
-The motion is solved piece by piece. In each piece the direction of sliding is fixed. A piece ends
-where the needle comes to rest, where it breaks away, or at the hub. Friction is not smoothed.
+The motion is solved in pieces with a fixed direction of sliding. A piece ends where the needle
+stops, breaks away, or reaches the hub. Friction is not smoothed.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Speed that stands for rest in a direction [m/s].
+#: Smallest velocity of either sign, for a start from rest [m/s].
 _AT_REST: Final = 1e-300
 
-#: Part by which a force has to exceed dry friction to overcome it. A motion that decays
-#: exponentially then ends only once.
+#: Relative excess of a force over dry friction at break-away, so that an exponentially decaying
+#: motion ends only once.
 _ROUNDING: Final = 1e-9
 
-#: Number of pieces from which a motion counts as chatter.
+#: Largest number of pieces of a motion; more are chatter.
 _MOST_PIECES: Final = 1000
 
 
@@ -45,20 +45,20 @@ def run_continuous(
     Parameters
     ----------
     law : ContinuousLaw
-        Law.
+        Control law.
     plant : NeedleModel
         The true needle.
     state : array_like, shape (2 (2 + n),)
-        Initial state; integrals of the error begin at zero.
+        Initial state; integrals of the error start at zero.
     goal : array_like, shape (3, 2 + n), or callable
         Desired q, q_dot and q_ddot, or a function of time [s] that returns them.
     times : array_like, shape (k,)
-        Times of the samples [s], increasing. The run begins at the first.
+        Times of the samples [s], increasing. The run starts at the first time.
     tolerance : float
         Relative tolerance of the solver.
     method : str
-        Solver of SciPy: ``Radau`` for loops of high gain, which are stiff; ``DOP853`` where the
-        law removes the stiffness, as `modal` inverse dynamics does.
+        Solver of SciPy: ``Radau`` for stiff loops with high gain; ``DOP853`` where the law removes
+        the stiffness, such as `modal` inverse dynamics.
 
     Returns
     -------
@@ -77,8 +77,8 @@ def run_continuous(
     Notes
     -----
     Modes that the law does not drive are solved at their own frequency of kilohertz: `physical`
-    actuation is for short times only. A motion that decays exponentially counts as chatter once
-    it is slower than the tolerance can tell from rest.
+    actuation is for short times only. An exponentially decaying motion is reported as chatter when
+    its speed falls below the resolution of the tolerance.
 
     """
     wanted = np.array(times, dtype=float)
@@ -111,7 +111,7 @@ def run_continuous(
 
 
 class _Pieces:
-    """Solves a closed loop from one change of friction to the next."""
+    """Solver of a closed loop between changes of the friction state."""
 
     def __init__(
         self,
@@ -133,7 +133,7 @@ class _Pieces:
         self.m = m
 
     def _clamped(self, y: FloatArray, way: int) -> FloatArray:
-        """Return the state with its depth in range and its speed in the direction of sliding."""
+        """Return the state with depth in range and velocity in the direction of sliding."""
         x = y[: 2 * self.m].copy()
         x[0] = min(max(x[0], self.low), self.high)
         if way == 0:
@@ -162,12 +162,12 @@ class _Pieces:
         """
         Return the derivative of `rate` by central differences of the size of the state.
 
-        SciPy's one-sided differences of the size of rounding are too rough where gains of 1e4
-        act on the modal mass of a short needle: Newton's method then fails at most steps.
+        SciPy's one-sided differences at rounding level are too inaccurate where gains of 1e4 act
+        on the modal mass of a short needle: Newton's method then fails at most steps.
         """
         steps = 1e-4 * self.scale
         if y[self.m] != 0.0:
-            # Not beyond rest: friction jumps there.
+            # Without crossing zero velocity, where friction jumps.
             steps[self.m] = 0.5 * abs(y[self.m])
         columns = []
         for i, step in enumerate(steps):
@@ -179,7 +179,7 @@ class _Pieces:
         return np.array(columns).T
 
     def _excess(self, time: float, y: FloatArray, side: int) -> float:
-        """Return by how much the drive exceeds dry friction on a side of rest [N]."""
+        """Return the excess of the drive over dry friction on a side of rest [N]."""
         x = self._clamped(y, 0)
         drive = self.forces(time, y, 0)[0] + self.plant.bias_forces(x, time)[0]
         bearable = self.plant.friction.force(0.0, side * inf)
@@ -235,7 +235,7 @@ class _Pieces:
         if run.status < 0:
             raise NeedleError(f'the closed loop cannot be solved beyond {run.t[-1]:g} s')
         samples = np.array(run.y).reshape(len(y), -1).T
-        # Held exactly, and never beyond the hub, whatever the solver's rounding.
+        # Exactly at rest, and within the hub, without rounding of the solver.
         samples[:, 0] = np.maximum(samples[:, 0], self.low)
         if way == 0:
             samples[:, 0], samples[:, m] = y[0], 0.0
@@ -258,6 +258,6 @@ class _Pieces:
             end[m] = 0.0
         else:
             end[0] = y[0]
-            # Friction is overcome: the least speed tells the direction.
+            # Break-away: the smallest velocity gives the direction.
             end[m] = -_AT_REST if what.endswith('inward') else _AT_REST
         return time, end, samples, what

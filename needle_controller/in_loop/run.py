@@ -1,4 +1,4 @@
-"""The result of one run of a closed loop."""
+"""Result of a run of a closed loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopRun:
     """
-    One run of a closed loop.
+    Result of a closed-loop run.
 
     Attributes
     ----------
@@ -22,10 +22,10 @@ class LoopRun:
     states : ndarray, shape (k, 2 (2 + n))
         States X = [d, theta, q1, ..., qn] and rates.
     forces : ndarray, shape (k, 2 + n)
-        f_y [N], tau [N m] and generalized forces. For a continuous law at the times, for a
-        sampled one over the periods that begin there.
+        f_y [N], tau [N m] and generalized forces: of a continuous law at the times, of a sampled
+        law over the periods that start there.
     events : tuple of (float, str)
-        When the needle came to rest, broke away or touched the hub [s]; continuous laws only.
+        Time [s] and kind of each stop, break-away and hub contact; continuous laws only.
 
     """
 
@@ -37,7 +37,7 @@ class LoopRun:
 
     @property
     def depth(self) -> FloatArray:
-        """Inserted length [m], shape (k,)."""
+        """Insertion depth [m], shape (k,)."""
         return np.asarray(self.model.parameters.length - self.states[:, 0])
 
     @property

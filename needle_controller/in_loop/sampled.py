@@ -1,4 +1,4 @@
-"""The controller around the simulated needle, once, and its laws around thousands of needles."""
+"""Sampled controllers with a simulated needle, and sampled laws with batches of needles."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from numpy.typing import ArrayLike
 
 class Commander(Protocol):
     """
-    What `run_controller` runs: a `Controller`, or any object of your own like it.
+    Interface of the controllers that `run_controller` accepts, such as `Controller`.
 
-    It is called from Python once in every period; nothing of it needs to be compiled.
+    It is called from Python once per period and needs no compiled code.
     """
 
     @property
@@ -40,14 +40,14 @@ class Commander(Protocol):
 
     def command(self, measured: Measurement, load: float = 0.0) -> Command:
         """
-        Return the command that answers a measurement.
+        Return the command for a measurement.
 
         Parameters
         ----------
         measured : Measurement
-            Readings of the encoders.
+            Encoder measurement.
         load : float
-            Force of the bent needle against insertion [N]; 0 if it is not known.
+            Force of the bent needle against insertion [N]; 0 if unknown.
 
         Returns
         -------
@@ -67,7 +67,7 @@ def run_controller(
     ground_truth: bool = False,
 ) -> LoopRun:
     """
-    Run a controller on a simulated needle: the object of the node, or one of your own.
+    Run a controller on a simulated needle: a `Controller` of the node, or a custom object.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def run_controller(
         A `Controller` with its target set, or an object with ``period``, ``delay`` and
         ``command`` as described by `Commander`.
     plant : NeedleParameters
-        The true needle.
+        True parameters of the needle.
     state : array_like, shape (2 (2 + n),)
         Initial state.
     duration : float
@@ -83,13 +83,13 @@ def run_controller(
     step : float
         Longest step of the integrator [s].
     ground_truth : bool
-        Tell the controller the load of the bent needle, as an observer without error would.
+        Pass the true load of the bent needle to the controller, as from an exact observer.
 
     Returns
     -------
     LoopRun
-        Samples at the times of the measurements and one more. Each force acts over the period
-        that begins there.
+        Samples at the times of the measurements and at the end. Each force acts over the period
+        that starts at its time.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def run_controller(
     >>> bool(abs(run.depth[-1] - 0.022) < 2e-5)
     True
 
-    A law of your own, here a proportional one:
+    A custom controller, here a proportional law:
 
     >>> class Proportional:
     ...     period, delay = 1e-3, 1
@@ -148,13 +148,12 @@ def run_controller(
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopBatch:
     """
-    Many runs of sampled laws.
+    Results of many runs of sampled laws.
 
     Attributes
     ----------
     final, largest, rms : ndarray, shape (runs,)
-        Goal minus inserted length [m]: at the end, the largest in modulus, and the root mean
-        square.
+        Goal minus insertion depth [m]: at the end, largest in modulus, and root mean square.
     states : ndarray, shape (runs, 2 (2 + n))
         States at the end.
     completed : ndarray, shape (runs,)
@@ -162,11 +161,11 @@ class LoopBatch:
     goal : ndarray, shape (k + 1,)
         Positions of the reference at the times of the measurements [m].
     depths : ndarray, shape (runs, k + 1) or (runs, 0)
-        Inserted lengths then [m], if they were kept.
+        Insertion depths at these times [m], with ``keep``.
     courses : ndarray, shape (runs, k + 1, 2 (2 + n)) or (runs, 0, 2 (2 + n))
-        States then, if they were recorded; NaN after a needle has left its range.
+        States at these times, with ``record``; NaN after a needle has left its range.
     commands : ndarray, shape (runs, k) or (runs, 0)
-        Command that answers each measurement [N], likewise.
+        Command for each measurement [N], with ``record``.
 
     """
 
@@ -200,17 +199,17 @@ def run_batch(
     progress: Callable[[], object] | None = None,
 ) -> LoopBatch:
     """
-    Run sampled laws of insertion on many needles, on all cores, as `run_controller` does.
+    Run sampled laws of insertion on many needles, on all cores; see `run_controller`.
 
-    The loop is compiled, so that the laws are those of this package: `InverseDynamics` and `Pid`.
-    Rotation is not coupled to insertion; here it rests. The laws do not know any load.
+    The loop is compiled and supports the laws of this package: `InverseDynamics` and `Pid`.
+    Rotation is not coupled to insertion and is at rest. The laws do not compensate the load.
 
     Parameters
     ----------
     laws : Law or sequence of Law
-        Law of insertion, for all runs or for each.
-    plants : NeedleParameters or sequence of them
-        The true needles.
+        Law of insertion, for all runs or for each run.
+    plants : NeedleParameters or sequence of NeedleParameters
+        True parameters of the needles.
     states : array_like, shape (runs, 2 (2 + n)) or (2 (2 + n),)
         Initial states.
     reference : Reference
@@ -222,29 +221,28 @@ def run_batch(
     duration : float
         Time to simulate [s].
     late : int
-        Periods of delay beyond those, of which the laws know nothing.
+        Additional periods of delay that the laws do not compensate.
     noise : array_like, shape (k, 3) or (0,)
-        In each period: what the laws measure too much, inserted length [m] and speed [m/s], and
-        what acts on the needles beyond the commands [N].
+        In each period: errors of the measured insertion depth [m] and velocity [m/s], and
+        additional force on the needles [N].
     added : array_like, shape (m, 3)
-        Friction along the way, for membranes and layers: inserted length from which on [m] the
-        needles have this much more Coulomb friction [N] and viscous friction [N s/m], until the
-        next row.
+        Additional friction by depth, for membranes and layers: insertion depth [m] above which
+        Coulomb friction [N] and viscous friction [N s/m] are added, until the next row.
     step : float
         Longest step of the integrator [s].
     keep : bool
-        Keep the inserted lengths of all periods.
+        Keep the insertion depths of all periods.
     record : bool
         Keep the states and the commands of all periods.
     workers : int, optional
-        Threads; one per core if not given.
+        Number of threads; one per core by default.
     progress : callable, optional
         Called after each run.
 
     Returns
     -------
     LoopBatch
-        Results; they do not depend on the number of threads.
+        Results, independent of the number of threads.
 
     Raises
     ------
@@ -273,7 +271,7 @@ def run_batch(
             f'{duration!r}, {step!r}, {delay!r} and {late!r}'
         )
     count, runs = round(duration / period), sizes.pop() if sizes else 1
-    # What a command aims at: the reference when it takes effect.
+    # Setpoint of a command: the reference at the time of its effect.
     course = _setpoints(reference, period, count + delay + 1)
     setpoints, goal = course[delay:-1], np.ascontiguousarray(course[: count + 1, 0])
     blurred = np.array(noise, dtype=np.float64).reshape(-1, 3)
@@ -322,13 +320,13 @@ def run_batch(
 
 
 def _setpoints(reference: Reference, period: float, count: int) -> FloatArray:
-    """Return position, speed and acceleration of a reference at multiples of a period."""
+    """Return position, velocity and acceleration of a reference at multiples of a period."""
     times = np.arange(count, dtype=np.float64) * period
-    # Beyond its end it rests.
+    # At rest after the end.
     moving = int(np.searchsorted(times, reference.duration))
     result = np.empty((count, 3))
     result[moving:] = reference.at(reference.duration + 1.0)
-    # Row by row, or by way of a list, it would take longer than the setpoints themselves.
+    # Assignment by rows or a list would take longer than the setpoints themselves.
     numbers = chain.from_iterable(map(reference.at, times[:moving].tolist()))
     result[:moving] = np.fromiter(numbers, np.float64, 3 * moving).reshape(-1, 3)
     return result

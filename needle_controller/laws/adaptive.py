@@ -1,4 +1,4 @@
-"""Inverse dynamics that learns friction on the way."""
+"""Inverse dynamics with friction adaptation."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from needle_ros.settings import check_constants, constant
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveGains(InverseDynamicsGains):
-    """Gains of inverse dynamics, and how friction is learned."""
+    """Gains of inverse dynamics with friction adaptation."""
 
     learn: bool = field(
-        default=True, metadata={'description': 'learn; false keeps what is learned as it is'}
+        default=True,
+        metadata={'description': 'adapt the friction; false freezes the learned friction'},
     )
     bound: float = constant(
         0.5, '1', 'largest learned change of dry and of viscous friction, relative to the model',
         high=10.0,
     )  # fmt: skip
     noise: float = constant(
-        0.05, 'N or N m', 'standard deviation of the force that friction does not explain',
+        0.05, 'N or N m', 'standard deviation of the force not explained by the friction model',
         open_low=True,
     )  # fmt: skip
 
@@ -35,12 +36,11 @@ class AdaptiveGains(InverseDynamicsGains):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Adaptive(InverseDynamics):
     """
-    `InverseDynamics` with friction learned on the way, see `needle_controller.compiled.learning`.
+    `InverseDynamics` with adaptation of friction, see `needle_controller.compiled.learning`.
 
-    In each direction it learns what dry friction, viscous friction and dry friction per inserted
-    length have beyond the model. The corrections count in the feed-forward of the modeled motion
-    only. They are within their bounds whatever is measured, so that they are a bounded force from
-    outside of the loop, which is that of inverse dynamics.
+    In each direction it estimates corrections of dry friction, viscous friction and dry friction
+    per insertion depth. They enter the feed-forward of the modeled motion only and are bounded for
+    every measurement: a bounded external force on the loop of inverse dynamics.
 
     Attributes
     ----------

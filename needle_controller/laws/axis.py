@@ -1,4 +1,4 @@
-"""One axis as a sampled law sees it: a mass with friction."""
+"""Model of one axis in a sampled law: a mass with friction."""
 
 from __future__ import annotations
 
@@ -13,20 +13,7 @@ from needle_ros.errors import ParameterError
 
 
 def require_complete(parameters: NeedleParameters) -> None:
-    """
-    Reject the formulation `as_printed`, which is for the model and the integrator only.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        The needle.
-
-    Raises
-    ------
-    ParameterError
-        If its formulation is not `complete`.
-
-    """
+    """Raise `ParameterError` unless the formulation is `complete`."""
     if parameters.formulation != 'complete':
         raise ParameterError(
             "formulation must be 'complete' for controller and observer, got "
@@ -38,14 +25,14 @@ class Response(NamedTuple):
     """
     Linear response of an axis over a time, under a constant force.
 
-    ``end position = position + pv speed + pf force`` and ``end speed = vv speed + vf force``.
+    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force.
 
     Attributes
     ----------
     pv, vv : float
-        Response to the speed [s], [1].
+        Response to the velocity [s], [1].
     pf, vf : float
-        Response to the force [m/N], [m/(N s)], or in angles and torques.
+        Response to the force [m/N], [m/(N s)]; for rotation, angles and torques.
 
     """
 
@@ -97,7 +84,7 @@ class Axis(Friction):
         Returns
         -------
         Axis
-            Its moving mass [kg] and friction.
+            Moving mass [kg] and friction.
 
         """
         friction = parameters.friction
@@ -117,7 +104,7 @@ class Axis(Friction):
         Returns
         -------
         Axis
-            Its rotary inertia [kg m^2].
+            Rotary inertia [kg m^2].
 
         """
         return cls(inertia=0.5 * parameters.rotary_inertia)
@@ -135,7 +122,7 @@ class Axis(Friction):
         Parameters
         ----------
         position, speed : float
-            State at the beginning.
+            Initial position and velocity.
         force : float
             Force [N].
         t : float
@@ -144,7 +131,7 @@ class Axis(Friction):
         Returns
         -------
         position, speed : float
-            State at the end.
+            Final position and velocity.
 
         """
         end, moved = friction_flow(self.constants, self.inertia, speed, force, t)
@@ -164,7 +151,7 @@ class Axis(Friction):
         Returns
         -------
         Response
-            The response to a speed and to a constant force.
+            Response to a velocity and to a constant force.
 
         """
         x = factor * self.viscous * t / self.inertia

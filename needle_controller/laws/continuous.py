@@ -1,4 +1,4 @@
-"""The control laws of section 3.2.7 as the paper has them, in continuous time, for analysis."""
+"""Continuous-time control laws of section 3.2.7 of the paper, for analysis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Driven coordinates: those of the base (f_y, tau), or every one, which no motor can do.
+#: Actuated coordinates: base only (f_y, tau), or all coordinates, which is not realizable.
 ACTUATIONS: Final = ('physical', 'modal')
 
 #: Coordinates of the base, d and theta.
@@ -23,7 +23,7 @@ _BASE: Final = 2
 def _gain_matrix(
     name: str, gains: ArrayLike, size: int, *, may_vanish: bool = False
 ) -> FloatArray:
-    """Return gains of ``size`` coordinates as a matrix; reject one that is not definite."""
+    """Return gains of ``size`` coordinates as a matrix; reject indefinite gains."""
     try:
         matrix = np.array(gains, dtype=float)
     except (TypeError, ValueError):
@@ -50,14 +50,14 @@ def _gain_matrix(
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousLaw(ABC):
     """
-    A control law in continuous time: a function of state, goal and integral of the error.
+    Control law in continuous time: a function of state, goal and integral of the error.
 
     Attributes
     ----------
     model : NeedleModel
-        Needle and tissue as the law believes them to be; the plant may differ.
+        Nominal model of needle and tissue; the plant may differ.
     actuation : str
-        ``physical``: f_y and tau alone. ``modal``: a generalized force on every coordinate, as
+        ``physical``: f_y and tau only. ``modal``: a generalized force on every coordinate, as
         in the gain matrices of the paper.
 
     """
@@ -67,7 +67,7 @@ class ContinuousLaw(ABC):
 
     @property
     def driven(self) -> int:
-        """Number of driven coordinates, the first ones of q."""
+        """Number of driven coordinates, from the start of q."""
         return _BASE if self.actuation == 'physical' else self.model.coordinates
 
     @property
@@ -148,16 +148,16 @@ class ContinuousInverseDynamics(ContinuousLaw):
     """
     F_c = M(q) (q_ddot_d + k_v e_dot + k_p e) + N', section 3.2.7.1.
 
-    N' are the bias forces with friction. At rest friction counts in the direction of the desired
-    acceleration, so that the law breaks away.
+    N' are the bias forces with friction. At rest, friction is compensated in the direction of the
+    desired acceleration, so that the law breaks away.
 
     Attributes
     ----------
     kp, kv : array_like, shape (driven,) or (driven, driven)
         Gains [1/s^2] and [1/s], positive definite.
     breakaway_speed : float
-        If positive, dry friction is compensated in proportion to the speed wanted
-        BREAKAWAY_TIME ahead, up to this speed [m/s]: the limit of the sampled law for short
+        If positive, dry friction is compensated in proportion to the desired velocity
+        BREAKAWAY_TIME later, up to this speed [m/s]: the limit of the sampled law for short
         periods. 0 is the law of the paper.
 
     """
@@ -207,11 +207,11 @@ class ContinuousInverseDynamics(ContinuousLaw):
         return forces
 
     def _friction(self, speed: float, acceleration: float) -> float:
-        """Return viscous friction, and the share of dry friction to compensate."""
+        """Return viscous friction plus the compensated share of dry friction [N]."""
         law = self.model.friction
         lean = (speed + BREAKAWAY_TIME * acceleration) / self.breakaway_speed
         lean = min(max(lean, -1.0), 1.0)
-        # Dry friction in the direction of the lean; from rest the one to overcome.
+        # Dry friction in the direction of the lean; at rest, break-away friction.
         sign, modulus = copysign(1.0, lean), abs(speed)
         ahead = 1.0 if lean > 0.0 else law.withdrawal
         dry = law.force(sign * modulus, sign * inf) - sign * ahead * law.viscous * modulus
@@ -229,7 +229,7 @@ class ContinuousPid(ContinuousLaw):
     kp, kd : array_like, shape (driven,) or (driven, driven)
         Gains, positive definite; the paper writes k_v for kd.
     ki : array_like, shape (driven,) or (driven, driven), optional
-        Gain of the integral, positive semidefinite; none if not given.
+        Integral gain, positive semidefinite; no integral by default.
 
     """
 
@@ -251,7 +251,7 @@ class ContinuousPid(ContinuousLaw):
 
     @property
     def integrals(self) -> int:
-        """One for each driven coordinate, none without a gain for it."""
+        """Number of integrals: the driven coordinates, or 0 without integral gain."""
         return 0 if self.ki is None else self.driven
 
     def forces(
@@ -292,27 +292,10 @@ def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
 ) -> FloatArray:
     """
-    Forward dynamics (16)-(17) with a generalized force on every coordinate.
+    Return q_ddot, shape (2 + n,): forward dynamics (16)-(17) with a force on each coordinate.
 
-    Parameters
-    ----------
-    model : NeedleModel
-        The model.
-    state, time
-        As for `NeedleModel.acceleration`.
-    forces : array_like, shape (2 + n,)
-        f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i.
-
-    Returns
-    -------
-    ndarray, shape (2 + n,)
-        q_ddot.
-
-    Raises
-    ------
-    ShapeError, InsertedLengthError
-        If the state or the forces are invalid.
-
+    ``forces`` are f_y [N], positive into the tissue, tau [N m], and the generalized force on each
+    q_i.
     """
     x, applied = model.checked_state(state), np.array(forces, dtype=float)
     if applied.shape != (model.coordinates,) or not np.isfinite(applied).all():

@@ -9,9 +9,9 @@ from needle_controller.compiled.laws import INVERSE_DYNAMICS
 from needle_controller.laws.law import Law, LawGains
 from needle_ros.settings import check_constants, constant
 
-#: The feedback at a bandwidth b: it adds this part of viscous friction to the damping, its
-#: integral has this part of the bandwidth, and b is reduced to b / (1 + 5 b h). With these values
-#: the loop is stable for friction and inertia 50 % off, see docs/control.md.
+#: Feedback at a bandwidth b: added damping as a fraction of viscous friction, bandwidth of the
+#: integral as a fraction of b, and the reduction of b to b / (1 + 5 b h). With these values the
+#: loop is stable for errors of 50 % of friction and inertia, see docs/control.md.
 _DAMPING: Final = 1.0 / 3.0
 _INTEGRAL: Final = 0.25
 _PERIODS: Final = 5.0
@@ -25,14 +25,14 @@ class InverseDynamicsGains(LawGains):
     """Gains of the motion e_ddot + kv e_dot + kp e = 0 on one axis, and of its feedback."""
 
     kp: float = constant(900.0, '1/s^2', 'position gain k_p')
-    kv: float = constant(60.0, '1/s', 'speed gain k_v')
+    kv: float = constant(60.0, '1/s', 'velocity gain k_v')
     breakaway_speed: float = constant(
         1e-4, '(m or rad)/s', 'commanded speed at which Coulomb friction is fully compensated',
         open_low=True,
     )  # fmt: skip
     bandwidth: float = constant(
         BANDWIDTH, '1/s', 'bandwidth of the feedback that corrects deviations from the modeled '
-        'motion; 0: without it, as in the paper',
+        'motion; 0: no feedback, as in the paper',
     )  # fmt: skip
     tolerance: float = constant(
         5e-6, 'm or rad', 'error at rest below which the integral is frozen (no hunting)'
@@ -47,26 +47,27 @@ class InverseDynamics(Law):
     r"""
     The law F_c = M (q_ddot_d + k_v e_dot + k_p e) + N' on one axis, for a sample period h.
 
-    With a = q_ddot_d + k_v e_dot + k_p e the axis shall have the speed u + h a after the
-    period. The force that does this exactly under viscous friction, held over the period, is
+    With a = q_ddot_d + k_v e_dot + k_p e the desired velocity after the period is u + h a. The
+    constant force over the period that achieves it exactly under viscous friction is
 
     .. math:: f = \mu_v \frac{u + h a - u e^{-x}}{1 - e^{-x}}, \quad x = \mu_v h / M
 
-    It tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v times the wanted speed if
-    friction is fast compared with the period. Dry friction is compensated in the direction of the
-    speed shortly ahead. At rest that is the direction of the wanted acceleration, so that the law
-    breaks away.
+    It tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v times the desired velocity
+    if friction is fast compared with the period. Dry friction is compensated in the direction of
+    the predicted velocity. At rest this is the direction of the desired acceleration, so that the
+    law breaks away.
 
-    In the paper u is measured. Then friction that is smaller than modeled is compensated too much,
-    which makes the loop unstable. Here u and e are those of the *modeled motion*: it starts at
-    the measurement and has exactly the force above. If the model is right, the needle does the
-    same, and the law is that of the paper. What differs is corrected by an implicit PID feedback
-    of the deviation (see `Pid`), whose gains follow from its bandwidth b:
+    In the paper u is measured. Friction smaller than modeled is then overcompensated, which makes
+    the loop unstable. Here u and e are states of a *modeled motion*, which starts at the
+    measurement and moves under exactly the force above. With an exact model the needle follows
+    the modeled motion, and the law equals the law of the paper. Deviations are corrected by an
+    implicit PID feedback (see `Pid`), whose gains follow from its bandwidth b:
 
     .. math:: k_d = \mu_v / 3 + 2 b M, \quad k_p' = b (\mu_v + k_d), \quad k_i = b k_p' / 4
 
     Friction compensation is then outside of the loop and cannot make it unstable. With
-    ``bandwidth=0`` the law is that of the paper: the modeled motion starts again in each period.
+    ``bandwidth=0`` the law equals the law of the paper: the modeled motion restarts in each
+    period.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Sampled control laws on one axis, and the loop around one: delay, limit, memory."""
+"""Sampled control laws on one axis, and their loop with delay, limit and memory."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Coulomb friction is compensated in the direction of the speed that is wanted this much later
-#: [s], or at the end of the period if that is longer: a law then breaks away at any rate.
+#: Coulomb friction is compensated in the direction of the desired velocity this much later [s], or
+#: at the end of the period if this is longer: a law then breaks away at any sample rate.
 BREAKAWAY_TIME: Final = 1e-3
 
 #: Time constant with which the force offset after a switch of laws fades [s].
 HANDOVER_TIME: Final = 0.1
 
 
-#: What is learned, with units, in the order of `needle_controller.compiled.learning`.
+#: Learned corrections with units, in the order of `needle_controller.compiled.learning`.
 _TERMS: Final = {
     'dry friction': 'N',
     'viscous friction': 'N s/m',
@@ -43,29 +43,16 @@ _TERMS: Final = {
 
 
 def no_memory() -> FloatArray:
-    """Return the memory of a law at the beginning: `MEMORY` zeros."""
+    """Return the initial memory of a law, `MEMORY` zeros."""
     return np.zeros(MEMORY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains:
-    """Gains of a law on one axis: kp, ki, kd, kv and bandwidth scale, others do not."""
+    """Gains of a law on one axis: `scaled` applies to kp, ki, kd, kv and bandwidth only."""
 
     def scaled(self, factor: float) -> LawGains:
-        """
-        Return all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            The factor, positive.
-
-        Returns
-        -------
-        LawGains
-            The gains, of the same class.
-
-        """
+        """Return a copy with kp, ki, kd, kv and bandwidth multiplied by a positive factor."""
         scales = ('kp', 'ki', 'kd', 'kv', 'bandwidth')
         gains = [item.name for item in fields(self) if item.name in scales]
         return replace(self, **{name: factor * getattr(self, name) for name in gains})
@@ -74,18 +61,18 @@ class LawGains:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Law:
     """
-    A sampled control law on one axis. Its memory is kept by its loop.
+    Sampled control law on one axis; its memory is stored by its loop.
 
     Attributes
     ----------
     axis : Axis
-        Axis as the law believes it to be.
+        Nominal model of the axis.
     gains : LawGains
         Gains.
     period : float
         Sample period h [s].
     constants : LawConstants
-        The law as compiled functions use it.
+        Constants of the law for compiled functions.
 
     """
 
@@ -93,11 +80,11 @@ class Law:
     gains: LawGains
     period: float
     constants: LawConstants = field(init=False, repr=False, compare=False)
-    #: The same as a plain tuple.
+    #: ``constants`` as a plain tuple.
     packed: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
-        """Make the constants of axis, period and gains."""
+        """Compute the constants from axis, period and gains."""
         unused = ('model_kp', 'model_kv', 'filter_time', 'tracking', 'feed_forward', 'bound')
         friction = self.axis.constants._asdict()
         back = self.axis.response(self.period, self.axis.withdrawal)._asdict()
@@ -134,9 +121,9 @@ class Law:
         Parameters
         ----------
         position, speed : float
-            State of the axis.
+            Position and velocity of the axis.
         setpoint : Setpoint
-            Reference.
+            Setpoint.
         memory : ndarray, shape (MEMORY,)
             As from `no_memory`.
         load : float
@@ -173,16 +160,16 @@ class Law:
 
 
 def _instant(position: float, speed: float, setpoint: Setpoint) -> tuple[float, ...]:
-    """Return what a law responds to, as compiled functions take it."""
+    """Return state and setpoint as the plain tuple of `Instant`."""
     return float(position), float(speed), *setpoint
 
 
 class SampledLoop:
     """
-    A law with a delay and a force limit.
+    Sampled law with delay compensation and a force limit.
 
-    A command computed from a measurement takes effect ``delay`` periods later. The law responds
-    to the state predicted for that time from the commands that have not yet taken effect.
+    A command computed from a measurement takes effect ``delay`` periods later. The law uses the
+    state predicted for this time from the pending commands.
 
     Parameters
     ----------
@@ -198,7 +185,7 @@ class SampledLoop:
     law, limit
         As given.
     pending : deque of float
-        Commands that have not yet taken effect [N].
+        Commands without effect so far [N].
     memory : ndarray, shape (MEMORY,)
         Memory of the law.
     last : float
@@ -212,7 +199,7 @@ class SampledLoop:
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
         self.last = 0.0
-        #: Force of the period that begins now [N].
+        #: Force of the period that starts now [N].
         self._acts = 0.0
         self._take_over = False
 
@@ -231,17 +218,17 @@ class SampledLoop:
 
     def switch(self, law: Law) -> None:
         """
-        Continue with another law of this period; its first force is the last one again.
+        Continue with another law of the same period; its first force equals the last force.
 
         Parameters
         ----------
         law : Law
-            The other law.
+            New law.
 
         Raises
         ------
         ParameterError
-            If its period is another one.
+            If its period differs.
 
         """
         if law.period != self.law.period:
@@ -249,7 +236,7 @@ class SampledLoop:
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
             )
         if law.axis != self.law.axis:
-            # What was learned is what the other axis had too little.
+            # The learned friction is relative to the previous axis model.
             self.memory[LEARNED:] = 0.0
         self.law = law
         self._take_over = True
@@ -268,7 +255,7 @@ class SampledLoop:
         }
 
     def unwind(self) -> None:
-        """Discard pending commands, what is integrated and the modeled motion; see `stop`."""
+        """Discard pending commands, integrals and the modeled motion; see `stop`."""
         self.stop()
         self.memory[:LEARNED] = 0.0
 
@@ -278,16 +265,16 @@ class SampledLoop:
         """
         Return the force to apply, within the limit [N]; see `Law.force`.
 
-        The state is measured now, the setpoint is for the time when the command takes effect.
+        The state is measured now; the setpoint is for the time of the effect of the command.
 
         Parameters
         ----------
         position, speed : float
-            Measured position and speed of the axis [m, m/s] or [rad, rad/s].
+            Measured position and velocity of the axis [m, m/s] or [rad, rad/s].
         setpoint : Setpoint
-            Setpoint for the time when the command takes effect.
+            Setpoint at the time of the effect of the command.
         load : float
-            Force against the motion that the law has to add [N] or [N m].
+            Known force against the motion, added by the law [N] or [N m].
 
         Returns
         -------

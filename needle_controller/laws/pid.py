@@ -1,4 +1,4 @@
-"""PID control, section 3.2.7.2 of the paper, in the implicit sampled form."""
+"""PID control, section 3.2.7.2 of the paper, in implicit sampled form."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PidGains(LawGains):
     tracking_time: float = constant(0.2, 's', 'time constant of back_calculation', open_low=True)
     feed_forward: bool = field(
         default=False,
-        metadata={'description': 'add the force that the reference needs on the modeled axis'},
+        metadata={'description': 'add the force of the reference motion on the modeled axis'},
     )
     breakaway_speed: float = constant(
         1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward fully includes '
@@ -53,7 +53,7 @@ class PidGains(LawGains):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pid(Law):
     """
-    PID evaluated at the end of the period that its own force brings about.
+    PID evaluated at the predicted end of the period.
 
     The textbook sampled form uses the error at the start of the period. It is unstable if kd
     exceeds about mass / period + friction. Here error and error rate are predicted for the end
@@ -63,8 +63,8 @@ class Pid(Law):
 
     Back-calculation removes the force beyond the limit from the integral,
     ki int e dt -> ... - excess / tracking_time. `conditional` stops the integral while it would
-    drive further into the limit. Coulomb friction is left to the integral, or to the feed-forward:
-    the force that gives the modeled axis exactly the motion of the reference.
+    increase the excess. Coulomb friction is compensated by the integral, or by the feed-forward:
+    the force that moves the modeled axis exactly along the reference.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Pid(Law):
             kd=gains.kd,
             tolerance=gains.tolerance,
             filter_time=gains.filter_time,
-            # Implicit: no tracking time is too short.
+            # Implicit: stable for every tracking time.
             tracking=h / (gains.tracking_time + h) if tracks else 0.0,
             feed_forward=gains.feed_forward,
         )

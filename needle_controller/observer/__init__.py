@@ -1,1 +1,1 @@
-"""The estimate of the deflection from what is measured."""
+"""Observer: Kalman filter of the needle deflection."""

@@ -1,4 +1,4 @@
-"""Whether errors of an estimate are as large as it says."""
+"""Chi-squared consistency test of estimation errors."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from scipy.special import chdtri
 
 @lru_cache(maxsize=64)
 def _far(degrees: int) -> float:
-    """Return the ratio that chance exceeds once in a million cases."""
+    """Return the ratio that is exceeded by chance with a probability of 1e-6."""
     return float(chdtri(degrees, 1e-6)) / degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
     """
-    Whether errors are as large as the filter says: squares of errors over their variances.
+    Consistency of errors with their variances: mean normalized squared error.
 
     Attributes
     ----------
     ratio : float
-        Their mean over all degrees of freedom; 1 in a filter that is consistent.
+        Mean squared error over variance per degree of freedom; 1 for a consistent filter.
     low, high : float
-        Band of chi^2 that holds it with 95 %.
+        95 % band of chi^2 for the ratio.
     degrees : int
-        Degrees of freedom; without any the ratio is not a number.
+        Degrees of freedom; with 0 the ratio is nan.
 
     """
 
@@ -39,7 +39,7 @@ class Consistency:
     @classmethod
     def of(cls, total: float, degrees: int) -> Consistency:
         """
-        Judge a sum of NIS or NEES.
+        Compute the ratio and band of a sum of NIS or NEES.
 
         Parameters
         ----------
@@ -51,7 +51,7 @@ class Consistency:
         Returns
         -------
         Consistency
-            The sum over its degrees of freedom, with the band.
+            Ratio and band.
 
         """
         if degrees == 0:
@@ -61,10 +61,10 @@ class Consistency:
 
     @property
     def doubtful(self) -> bool:
-        """Whether errors are far larger than said: by chance once in a million cases."""
+        """Whether the ratio is too large, by chance with a probability of 1e-6."""
         return self.degrees > 0 and self.ratio > _far(self.degrees)
 
     @property
     def holds(self) -> bool:
-        """Whether the ratio is within the band; with no measurements it is."""
+        """Whether the ratio is within the band; true without measurements."""
         return self.degrees == 0 or self.low <= self.ratio <= self.high

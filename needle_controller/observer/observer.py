@@ -1,16 +1,17 @@
 """
-Kalman filter of the bending from what a robot measures: encoders, tip deflection, base wrench.
+Kalman filter of the bending with the measurements of a robot: encoders, tip deflection, wrench.
 
-The modal rows of (16) are linear once depth and speed are known, and encoders tell these exactly
-enough. Over one sample the depth is frozen at its mean and the modal flow is the exact one, so
-that modes far above the sample rate are no trouble; means over the sample, which is what sensors
-report, are then linear in the state at its start. The low-pass of the force sensor belongs to the
-state: its noise enters before it and is not white behind it.
+The modal rows of (16) are linear for given depth and velocity, which the encoders measure
+accurately enough. Over one sample the depth is frozen at its mean and the modal flow is exact, so
+that modes far above the sample rate are admissible; sensor readings, means over the sample, are
+then linear in the state at its start. The low-pass of the force sensor is part of the state: its
+noise enters before the low-pass and is not white behind it.
 
-A constant force at the tip, such as that of a bevel, and offsets of the sensor are estimated, too.
+A constant force at the tip, such as the load of a bevel, and offsets of the sensor are estimated
+too.
 
-A tip sample that comes late is taken in where it belongs: the filter keeps its past for a while
-and runs it once more from there. The result is that of a filter to which nothing came late.
+A late tip sample is processed at its time: the filter keeps a history and repeats the steps from
+there. The result equals the result of a filter without late samples.
 """
 
 from __future__ import annotations
@@ -37,30 +38,30 @@ from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Encoder samples are taken to be even if their stamps are to this part of the period.
+#: Relative deviation of encoder stamps from the period that is ignored.
 _EVEN: Final = 0.01
 
-#: The rate of the sensor's filter is a whole multiple of the sample rate, to this part of it.
+#: Relative tolerance of the ratio of the sensor's filter rate to the sample rate.
 _NEAR: Final = 0.1
 
-#: A wrench belongs to an encoder sample if their stamps differ by less than this part of a period.
+#: Largest stamp difference of a wrench and its encoder sample, in periods.
 _SAME: Final = 0.1
 
-#: Most wrenches that wait for their encoder sample.
+#: Largest number of wrenches that wait for their encoder sample.
 _WAITING: Final = 16
 
-#: Exposures of the tip may overlap by this part; more is the same sample twice.
+#: Largest relative overlap of exposures of the tip; above it a sample is a duplicate.
 _OVERLAP: Final = 0.1
 
 
 class Observer:
     """
-    Estimates q1 to qn and their rates while the needle moves.
+    Estimator of q1 to qn and their rates during the motion.
 
     Parameters
     ----------
     parameters : NeedleParameters
-        Needle and tissue as the observer believes them to be.
+        Nominal parameters of needle and tissue.
     settings : ObserverSettings
         Noise and sensors.
     period : float
@@ -69,13 +70,13 @@ class Observer:
     Attributes
     ----------
     refused : int
-        Samples that were not taken in: late or repeated encoder samples; tip samples and
-        wrenches that are not finite, repeated, older than the history, far ahead of the
-        encoders, or (a wrench) between encoder samples.
+        Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
+        that are not finite, repeated, older than the history, far ahead of the encoders, or
+        (a wrench) between encoder samples.
     restarts : int
-        How often the observer started anew by itself.
+        Number of automatic restarts.
     warning : str or None
-        Why it last did; None if it did not since it was made or `reset`.
+        Reason of the last restart; None without a restart since construction or `reset`.
 
     Raises
     ------
@@ -127,7 +128,7 @@ class Observer:
         self._held = Held(self._filter)
         self._slots = slots
         self._modal, self._jacobian = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
-        #: Tip deflection, its standard deviation, and load at the present depth, once asked for.
+        #: Tip deflection, its standard deviation, and load at the present depth, once computed.
         self._estimate: tuple[float, float, float] | None = None
         self._origin: float | None = None
         self._time = self._depth = self._velocity = 0.0
@@ -136,14 +137,14 @@ class Observer:
         self._warm_up()
 
     def reset(self) -> None:
-        """Forget all measurements; the next encoder sample starts anew."""
+        """Discard all measurements; the next encoder sample restarts the observer."""
         self.refused = self.restarts = 0
         self.warning: str | None = None
         self._begun = False
         self._waiting: list[tuple[float, float, float]] = []
 
     def _warm_up(self) -> None:
-        """Compile, or load what was compiled, before time counts."""
+        """Compile or load the kernels before time is critical."""
         depth = self.model.parameters.length
         self.update(0.0, depth, 0.0)
         self.update(self.period, depth, 0.0)
@@ -162,29 +163,29 @@ class Observer:
         wrench: tuple[float, float] | None = None,
     ) -> None:
         """
-        Take in a sample of the encoders, and of the base wrench if there is one.
+        Process a sample of the encoders, and optionally of the base wrench.
 
-        The first sample is where the observer starts from; its wrench does not count. A gap is
-        bridged as if the depth had gone evenly. A gap longer than the history, a clock set back
-        by more than it, or a jump of depth starts the observer anew with a `warning`.
+        The observer starts at the first sample, without its wrench. A gap is bridged at constant
+        velocity. A gap longer than the history, a clock set back by more than the history, or a
+        jump of depth restarts the observer with a `warning`.
 
         Parameters
         ----------
         time : float
-            When it was taken [s]. Steps within 1 % of the period count as one period.
+            Time of the sample [s]. Steps within 1 % of the period count as one period.
         depth, speed : float
-            Inserted length [m] and insertion speed [m/s], positive into the tissue.
+            Insertion depth [m] and velocity [m/s], positive into the tissue.
         wrench : tuple of float, optional
             Lateral force along z [N] and moment about x at the base [N m], less any torque that
-            turns the base; each not a number where it is missing.
+            turns the base; nan for a missing component.
 
         Raises
         ------
         ParameterError
-            If time, depth or speed is not finite, or the speed is absurd; the estimate stays as it
-            is.
+            If time, depth or speed is not finite, or the speed is implausible; the estimate does
+            not change.
         InsertedLengthError
-            If the depth is outside its range; the estimate stays as it is.
+            If the depth is outside its range; the estimate does not change.
 
         """
         needle = self._filter.needle
@@ -201,7 +202,7 @@ class Observer:
                 f'inserted length {depth:.6g} m is outside [{low:g}, {needle.maximum_depth:g}] m '
                 '(minimum_depth to the hub); the estimate is held'
             )
-        # An integer would have the filter compiled anew for it.
+        # An integer would trigger a compilation for its type.
         time, depth, speed = float(time), min(float(depth), needle.maximum_depth), float(speed)
         if self._origin is None:
             self._origin = time
@@ -231,15 +232,15 @@ class Observer:
 
     def add_wrench(self, stamp: float, lateral: float, moment: float) -> None:
         """
-        Take in a base wrench that comes apart from the encoder sample of the same time.
+        Process a base wrench that arrives separately from the encoder sample of the same time.
 
         Parameters
         ----------
         stamp : float
-            When it was taken [s], on the clock of `update`: the time of an encoder sample, which
-            may be still to come.
+            Time of the wrench [s], on the clock of `update`: the time of an encoder sample, which
+            may arrive later.
         lateral, moment : float
-            As for `update`; not a number where missing.
+            As for `update`; nan if missing.
 
         """
         if not (self._begun and isfinite(stamp) and (isfinite(lateral) or isfinite(moment))):
@@ -263,14 +264,13 @@ class Observer:
 
     def add_tip(self, stamp: float, deflection: float) -> None:
         """
-        Take in a sample of the tip deflection, however late within the history.
+        Process a sample of the tip deflection, with any delay within the history.
 
         Parameters
         ----------
         stamp : float
-            When it was taken, the end of its exposure [s], or ``tip_latency`` later, on the clock
-            of `update`. It may be ahead of the last encoder sample, and earlier than tip samples
-            that came before.
+            End of the exposure [s], plus ``tip_latency``, on the clock of `update`. It may be
+            later than the last encoder sample, and earlier than previous tip samples.
         deflection : float
             Mean deflection over the exposure [m].
 
@@ -312,7 +312,7 @@ class Observer:
         self._estimate = None
 
     def _restart(self, reason: str) -> None:
-        self.warning = f'{reason}; the observer started anew'
+        self.warning = f'{reason}; the observer restarted'
         self._waiting.clear()
         self.restarts += 1
         self._begun = False
@@ -325,7 +325,7 @@ class Observer:
     def _go_on(
         self, time: float, depth: float, speed: float, lateral: float, moment: float
     ) -> None:
-        """Go to the next sample, or over a gap in samples of which only the last is measured."""
+        """Step to the next sample, or over a gap in steps without measurements but the last."""
         start, elapsed, period = self._time, time - self._time, self.period
         before, advance = self._depth, depth - self._depth
         count = max(1, round(elapsed / period))
@@ -336,7 +336,7 @@ class Observer:
             middle = before + advance * (k - 0.5) / count
             self._step(start + elapsed * k / count, span, middle, advance / elapsed, nan, nan)
         if count == 1:
-            # Mean of the cubic through both ends; a noisy speed does not take it beyond them.
+            # Mean of the cubic through both ends, limited to their range.
             mean = before + 0.5 * advance + span * (self._velocity - speed) / 12.0
             mean = min(max(mean, min(before, depth)), max(before, depth))
             pace = 0.5 * (self._velocity + speed)
@@ -357,7 +357,7 @@ class Observer:
     # Estimates.
 
     def _look(self) -> tuple[float, float, float]:
-        """Return tip deflection, its standard deviation and load now, computed once a sample."""
+        """Return present tip deflection, its standard deviation and load, cached per sample."""
         if not self._begun:
             raise NeedleError('the observer has no estimate before the first encoder sample')
         if self._estimate is None:
@@ -368,7 +368,7 @@ class Observer:
 
     @property
     def ready(self) -> bool:
-        """Whether there is an estimate; what follows raises `NeedleError` before."""
+        """Whether there is an estimate; without it the properties below raise `NeedleError`."""
         return self._begun
 
     @property
@@ -387,18 +387,18 @@ class Observer:
 
     @property
     def tip_deflection(self) -> tuple[float, float]:
-        """Estimate of the tip deflection now, and its standard deviation [m]."""
+        """Estimate of the present tip deflection, and its standard deviation [m]."""
         deflection, spread, _ = self._look()
         return deflection, spread
 
     @property
     def load(self) -> float:
         """
-        Force of the bent needle against insertion [N].
+        Force of the bent needle against insertion [N], to be added by inverse dynamics.
 
-        It is row d of the bias forces (13) with its sign turned: what inverse dynamics has to
-        add to the insertion force. Modes that are not below half the sample rate do not count:
-        the estimates of their rates are noise, and the load goes with the square of it.
+        It is row d of the bias forces (13) with reversed sign. Modes above half the sample rate
+        are left out: the estimates of their rates are noise, and the load depends on the square of
+        the rates.
         """
         return self._look()[2]
 
@@ -416,8 +416,7 @@ class Observer:
         """
         Consistency of the measurements over the history: normalized innovations squared.
 
-        Each innovation is that of the measurement where it belongs in time, given all earlier
-        ones, also those that came later.
+        Each innovation is relative to all measurements of earlier times, including late arrivals.
         """
         if not self._begun:
             return Consistency.of(0.0, 0)
@@ -428,7 +427,7 @@ class Observer:
 
     def nees(self, modal: ArrayLike, rates: ArrayLike) -> float:
         """
-        Return the normalized estimation error squared (NEES) against the truth, for studies.
+        Return the normalized estimation error squared (NEES) against the ground truth.
 
         Parameters
         ----------
@@ -454,7 +453,7 @@ class Observer:
             )
         self._look()
         error = truth - self._modal
-        # In normal coordinates, where nothing is close to singular.
+        # In normal coordinates, where the covariance is well conditioned.
         normal = np.linalg.solve(self._jacobian, error)
         return float(normal @ np.linalg.solve(self._normal_covariance(), normal))
 

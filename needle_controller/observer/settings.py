@@ -1,4 +1,4 @@
-"""What the observer takes sensors and tissue to be."""
+"""Settings of the observer: assumed sensor noise and model uncertainty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from needle_ros.settings import check_constants, constant
 import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
 
-#: What the plant feels with as it is by default, and hence what the observer believes in.
+#: Default force sensor of the plant, assumed by default.
 _SENSOR: Final = ForceSensorParameters()
 
 
@@ -27,7 +27,8 @@ def _low_pass(
     """
     Return the low-pass as transition, input and steady state of memory and reading, and its gain.
 
-    The memory is scaled so that white noise of one before the filter makes it white, of one.
+    The memory is scaled such that white noise of unit variance at the input gives white noise of
+    unit variance in the memory.
     """
     a: FloatArray = np.zeros((0, 0))
     b: FloatArray = np.zeros(0)
@@ -35,7 +36,7 @@ def _low_pass(
     d = 1.0
     for cutoff in cutoffs:
         over, under = low_pass(cutoff, rate).reshape(2, 3)
-        # Transposed direct form II behind what there is.
+        # Transposed direct form II in series with the previous sections.
         own = np.array([[-under[1], 1.0], [-under[2], 0.0]])
         drive = over[1:] - under[1:] * over[0]
         order = len(b)
@@ -54,12 +55,12 @@ def _low_pass(
 
 
 def _of_sensor(name: str, channel: int) -> float:
-    """Return a constant of the plant's force sensor as it is by default."""
+    """Return a constant of the default force sensor of the plant."""
     return float(_SENSOR.per_axis(name)[channel])
 
 
 def _read_noise(channel: int, digits: int) -> float:
-    """Return the noise with which that sensor is read, behind its filters."""
+    """Return the noise of the readings of this sensor, behind its filters."""
     gain = _low_pass(_SENSOR.cutoffs, _SENSOR.rate)[3]
     return round(_of_sensor('noise', channel) * gain, digits)
 
@@ -67,71 +68,67 @@ def _read_noise(channel: int, digits: int) -> float:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverSettings:
     """
-    What the observer believes of sensors and tissue beside `NeedleParameters`.
+    Assumptions of the observer on sensors and tissue in addition to `NeedleParameters`.
 
-    The defaults are those of the plant's sensors as they are by default.
+    The defaults match the default sensors of the plant.
     """
 
     irregularity: float = constant(
         1e-3, 'N s^(1/2) m^(-1/2)',
         'root of the spectral density of a distributed lateral force, white in time and depth, '
-        'by which the tissue differs from the model (the default covers a stiffness 30 % off '
+        'for the model error of the tissue (the default covers a stiffness error of 30 % '
         'down to half the needle)',
     )  # fmt: skip
     initial_deflection: float = constant(
         1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
     )
     tip_force: float = constant(
-        0.5, 'N', 'standard deviation of a lateral force at the tip, such as that of a bevel'
+        0.5, 'N', 'standard deviation of a lateral force at the tip, such as a bevel load'
     )
-    tip_force_time: float = constant(
-        1000.0, 's', 'time in which that force becomes another one', open_low=True
-    )
+    tip_force_time: float = constant(1000.0, 's', 'correlation time of this force', open_low=True)
     tip_noise: float = constant(
         TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
         open_low=True,
     )  # fmt: skip
     tip_exposure: float = constant(
-        1e-3, 's', 'time before its stamp over which a tip sample is the mean', open_low=True
+        1e-3, 's', 'exposure before the stamp over which a tip sample is the mean', open_low=True
     )
     tip_latency: float = constant(
         0.0, 's', 'time from the end of the exposure to the stamp of a tip sample', high=1.0
     )
     force_noise: float = constant(
-        _read_noise(2, 6), 'N', 'standard deviation of the lateral force as it is read',
+        _read_noise(2, 6), 'N', 'standard deviation of the measured lateral force',
         open_low=True,
     )  # fmt: skip
     torque_noise: float = constant(
-        _read_noise(3, 8), 'N m', 'standard deviation of the moment as it is read', open_low=True
+        _read_noise(3, 8), 'N m', 'standard deviation of the measured moment', open_low=True
     )
     force_offset: float = constant(
-        0.01, 'N', 'standard deviation of the offset of the lateral force as it is read'
+        0.01, 'N', 'standard deviation of the offset of the measured lateral force'
     )
     torque_offset: float = constant(
-        1e-3, 'N m', 'standard deviation of the offset of the moment as it is read'
+        1e-3, 'N m', 'standard deviation of the offset of the measured moment'
     )
-    offset_time: float = constant(
-        1000.0, 's', 'time in which these offsets become others', open_low=True
-    )
+    offset_time: float = constant(1000.0, 's', 'correlation time of these offsets', open_low=True)
     force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
     torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
     cutoffs: tuple[float, ...] = field(
         default=_SENSOR.cutoffs,
         metadata={
-            'description': 'low-pass filters of the wrench one after the other '
+            'description': 'low-pass filters of the wrench in series '
             '(Butterworth, second order) [Hz]'
         },
     )
     filter_rate: float = constant(
-        _SENSOR.rate, 'Hz', 'rate at which these filters run, each on means over its samples',
+        _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input',
         open_low=True,
     )  # fmt: skip
     history: float = constant(
-        0.3, 's', 'how far back a late tip sample may begin; longer gaps start anew',
+        0.3, 's', 'largest age of a late tip sample; longer gaps restart the observer',
         open_low=True, high=10.0,
     )  # fmt: skip
     jump: float = constant(
-        5e-3, 'm', 'change of depth from one sample to the next that starts anew', open_low=True
+        5e-3, 'm', 'change of depth between samples that restarts the observer', open_low=True
     )
 
     def __post_init__(self) -> None:
@@ -148,7 +145,7 @@ class ObserverSettings:
         object.__setattr__(self, 'cutoffs', cutoffs)
 
     def noise(self) -> Noise:
-        """Return the variances that the filter starts from."""
+        """Return the variances of the filter."""
         gain = _low_pass(self.cutoffs, self.filter_rate)[3]
         # A count of the reading is uniform rounding.
         counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
@@ -166,7 +163,7 @@ class ObserverSettings:
 
     def low_pass(self, ticks: int) -> LowPass:
         """
-        Return the low-pass of the wrench.
+        Return the low-pass of the wrench over a sample.
 
         Parameters
         ----------
@@ -176,7 +173,7 @@ class ObserverSettings:
         Returns
         -------
         LowPass
-            Its transition, noise and responses over that many samples.
+            Transition, noise and responses over this number of samples.
 
         """
         transition, drive, steady, _ = _low_pass(self.cutoffs, self.filter_rate)

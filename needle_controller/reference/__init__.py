@@ -1,1 +1,1 @@
-"""References: where the needle should be over time, within limits of speed and acceleration."""
+"""Reference generator: setpoints over time within limits of speed and acceleration."""

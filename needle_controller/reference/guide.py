@@ -1,4 +1,4 @@
-"""The reference of a controller over time: a target or a path, with pauses."""
+"""Reference generator of a controller: a target or a path, with pauses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_controller.reference.setpoint import Reference, ReferenceLimits, Set
 from needle_controller.reference.trapezoid import Step, Trapezoid
 from needle_ros.errors import ParameterError
 
-#: References to a target by name.
+#: Point-to-point references by name.
 REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
     'trapezoid': Trapezoid,
     'minimum_jerk': MinimumJerk,
@@ -20,10 +20,10 @@ REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
 
 class Guide:
     """
-    The reference of a controller: it goes to a target or along a path, and may be paused.
+    Reference generator: moves to a target or along a path, and can be paused.
 
-    Every change begins at the present setpoint, with the next call of `at`: the reference does
-    not jump.
+    Every change starts at the present setpoint, with the next call of `at`: the reference is
+    continuous.
 
     Parameters
     ----------
@@ -32,21 +32,16 @@ class Guide:
     limits : ReferenceLimits
         Limits.
     depths : tuple of float
-        Least and largest inserted length [m].
+        Least and largest insertion depth [m].
 
     Attributes
     ----------
     paused : bool
-        Whether it is paused.
+        Whether the reference is paused.
     waits : bool
-        Whether it waits for a plant that does not follow.
+        Whether the reference waits for a plant that does not follow.
     target : float or None
-        Inserted length where the motion ends [m]; None without a target or path.
-
-    Raises
-    ------
-    ParameterError
-        If the kind is unknown.
+        Insertion depth at the end of the motion [m]; None without a target or path.
 
     """
 
@@ -58,48 +53,34 @@ class Guide:
         self._motion: Reference | None = None
         self._motion_path: Path | None = None
         self._start = self._now = 0.0
-        #: Time of the path that has passed at the last change [s].
+        #: Elapsed time of the path at the last change [s].
         self._passed = 0.0
         self.forget()
 
     def forget(self) -> None:
-        """Forget target, path and pause."""
+        """Discard target, path and pause."""
         self.target: float | None = None
         self._path: Path | None = None
         self.paused = self.waits = False
         self.release()
 
     def release(self) -> None:
-        """Forget the motion: the next one starts at the needle, to the same target."""
+        """Discard the motion: the next motion starts at the needle, to the same target."""
         self._mark()
         self._motion = self._motion_path = None
         self._change: Callable[[Setpoint], Reference] | None = self._plan
 
     def _mark(self) -> None:
-        """Remember how much of the path has passed."""
+        """Store the elapsed time of the path."""
         if isinstance(self._motion, Joined) and self._motion_path is self._path:
             self._passed = max(self._now - self._start - self._motion.offset, self._passed)
 
     @property
     def moves(self) -> bool:
-        """Whether a motion has been planned."""
         return self._motion is not None
 
     def aim(self, depth: float) -> None:
-        """
-        Go to an inserted length.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length [m].
-
-        Raises
-        ------
-        ParameterError
-            If it is not finite or out of range.
-
-        """
+        """Move to an insertion depth [m]; `ParameterError` if not finite or out of range."""
         low, high = self._depths
         if not low <= depth <= high:
             raise ParameterError(f'target depth must be in [{low:g}, {high:g}] m, got {depth!r}')
@@ -112,42 +93,21 @@ class Guide:
         positions: Sequence[float],
         speeds: Sequence[float] | None = None,
     ) -> None:
-        """
-        Follow a path from now on.
-
-        Parameters
-        ----------
-        times, positions, speeds
-            As for `Path`; times count from now [s].
-
-        Raises
-        ------
-        ParameterError
-            If the path is invalid.
-
-        """
+        """Follow a path from now on, with times relative to now [s]; see `Path`."""
         path = Path(times, positions, speeds, self._limits, self._depths)
         self.target, self._path, self._passed = path.last, path, 0.0
         self._replan()
 
     def pause(self) -> None:
-        """Brake to rest within the limits and stay there."""
+        """Brake to rest within the limits and hold the position."""
         self._still(True, self.waits)
 
     def resume(self) -> None:
-        """Continue to the target, or along the path from where it was left."""
+        """Continue to the target, or along the path from the position of the pause."""
         self._still(False, self.waits)
 
     def wait(self, waits: bool) -> None:
-        """
-        Brake and hold while the plant does not follow, or continue.
-
-        Parameters
-        ----------
-        waits : bool
-            Whether the plant does not follow.
-
-        """
+        """Brake and hold while the plant does not follow (``waits``), or continue."""
         self._still(self.paused, waits)
 
     def _still(self, paused: bool, waits: bool) -> None:
@@ -162,25 +122,10 @@ class Guide:
             self._change = self._plan
 
     def at(self, time: float, depth: float) -> Setpoint:
-        """
-        Return the setpoint now; plan a change that is due.
-
-        Parameters
-        ----------
-        time : float
-            Time now [s].
-        depth : float
-            Inserted length of the needle now [m], where a new motion starts.
-
-        Returns
-        -------
-        Setpoint
-            Setpoint now.
-
-        """
+        """Return the setpoint at a time [s]; a new motion starts at the needle's depth [m]."""
         self._now = time
         if self._change is not None:
-            # A step has no position on the way.
+            # A step has no intermediate position.
             anew = self._motion is None or isinstance(self._motion, Step)
             now = Setpoint(depth) if anew else self.ahead(time)
             self._mark()
@@ -189,20 +134,7 @@ class Guide:
         return self.ahead(time)
 
     def ahead(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a later time [s] if nothing changes.
-
-        Parameters
-        ----------
-        time : float
-            Time [s].
-
-        Returns
-        -------
-        Setpoint
-            The setpoint; zero without a motion.
-
-        """
+        """Return the setpoint at a later time [s] without changes; zero without a motion."""
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
 
     def _plan(self, now: Setpoint) -> Reference:
@@ -218,10 +150,10 @@ class Guide:
         return self._kind(now, target, self._limits)
 
     def _brake(self, now: Setpoint) -> Reference:
-        """Stop within the limit of acceleration, without passing the end of the motion."""
+        """Stop within the acceleration limit, without passing the end of the motion."""
         stop = halt if self._kind is MinimumJerk else brake
         motion: Reference = stop(now, self._limits, self._depths)
         if self._path is not None:
-            # Half of the braking counts: the time that the path takes to the same position.
+            # Half of the braking time: the time of the path to the same position.
             self._passed += 0.5 * motion.duration
         return motion

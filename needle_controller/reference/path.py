@@ -1,4 +1,4 @@
-"""A motion given by points, and the motion that joins it from anywhere."""
+"""Path through given points, and a motion that joins it from any setpoint."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ import numpy as np
 
 class Path:
     """
-    A motion given by points: straight lines between positions, or cubics where speeds are given.
+    Path through given points: straight lines between positions, or cubics if speeds are given.
 
-    Corners between lines are rounded by parabolas with the limit of acceleration. The points
-    define the duration of the path. It ends at rest.
+    Corners between lines are rounded by parabolas at the acceleration limit. The points define the
+    duration of the path. It ends at rest.
 
     Parameters
     ----------
     times : sequence of float
         Times of the points [s], not negative, increasing.
     positions : sequence of float
-        Inserted lengths [m].
+        Insertion depths [m].
     speeds : sequence of float, optional
-        Insertion speeds [m/s], zero at the end.
+        Insertion velocities [m/s], zero at the end.
     limits : ReferenceLimits
         Limits.
     depths : tuple of float
-        Least and largest inserted length [m].
+        Least and largest insertion depth [m].
 
     Attributes
     ----------
     begin, end : float
         Times of the first point and of the end [s].
     last : float
-        Inserted length at the end [m].
+        Insertion depth at the end [m].
     depths : tuple of float
         As given [m].
 
@@ -80,10 +80,10 @@ class Path:
     def _join_lines(
         self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
     ) -> None:
-        """Join lines by parabolas."""
+        """Build the pieces from lines joined by parabolas."""
         ramp = limits.acceleration
         speed, free = 0.0, times[0]
-        # At the first point it already has the speed of the first line.
+        # At the first point the velocity equals the slope of the first line.
         if len(times) > 1:
             speed = (positions[1] - positions[0]) / (times[1] - times[0])
             self._pieces.append((times[0], positions[0], speed, 0.0, 0.0))
@@ -121,7 +121,7 @@ class Path:
         speeds: Sequence[float],
         limits: ReferenceLimits,
     ) -> None:
-        """Join cubics."""
+        """Build the pieces from cubics."""
         if speeds[-1] != 0.0:
             raise ParameterError(f'speed at the end must be 0, got {speeds[-1]:g} m/s')
         for k in range(len(times) - 1):
@@ -159,20 +159,7 @@ class Path:
                     )
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; before the first point, that point.
-
-        Parameters
-        ----------
-        time : float
-            Time since the path began [s].
-
-        Returns
-        -------
-        Setpoint
-            Position [m], speed [m/s] and acceleration [m/s^2].
-
-        """
+        """Return the setpoint at a time since the start [s], at least of the first point."""
         k = max(int(np.searchsorted(self._starts, time, side='right')) - 1, 0)
         start, p, v, a, jerk = self._pieces[k]
         t = max(time - start, 0.0)
@@ -211,10 +198,10 @@ def _check(
 
 class Joined:
     """
-    A path joined from elsewhere without a jump in position, speed or acceleration.
+    Motion that joins a path without a jump in position, velocity or acceleration.
 
-    If limits and range of depths allow it, the motion meets the path at its first point in time.
-    Otherwise it meets the path later, and is then late by half of the additional time.
+    If limits and range of depths allow it, the motion reaches the path at its first point in time.
+    Otherwise it reaches the path later, with a delay of half of the additional time.
 
     Parameters
     ----------
@@ -225,7 +212,7 @@ class Joined:
     since : float
         Present time on the path [s].
     limits : ReferenceLimits
-        Limits of the motion that joins it.
+        Limits of the joining motion.
 
     Attributes
     ----------
@@ -241,7 +228,7 @@ class Joined:
         self._halt: Reference | None = None
         depths = around(path.depths, start)
         if start.acceleration:
-            # A quintic with an acceleration at its start is only short: come to rest first.
+            # A quintic with an initial acceleration is only possible for a short time: stop first.
             stopped = halt(start, limits, depths)
             self._halt, start = stopped, stopped.end
         found = _join(start, path, since, limits, depths)
@@ -249,7 +236,7 @@ class Joined:
             self._halt = brake(start, limits, depths)
             start = self._halt.at(self._halt.duration)
             found = _join(start, path, since, limits, depths)
-        # If no quintic joins the path, go from rest to rest to its end.
+        # If no quintic joins the path, move from rest to rest to its end.
         joining, entry = found or (MinimumJerk(start, path.last, limits), path.end)
         self._joining = joining
         self._halting = self._halt.duration if self._halt else 0.0
@@ -258,20 +245,7 @@ class Joined:
         self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; see `Reference.at`.
-
-        Parameters
-        ----------
-        time : float
-            As for `Reference.at`.
-
-        Returns
-        -------
-        Setpoint
-            As from `Reference.at`.
-
-        """
+        """Return the setpoint at a time [s]; see `Reference.at`."""
         if time >= self.duration:
             return Setpoint(self._path.last)
         if self._halt is not None and time < self._halting:
@@ -285,16 +259,7 @@ def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float])
     """
     Return the shortest motion to rest, without a limit of jerk.
 
-    Parameters
-    ----------
-    start, limits, depths
-        As for `halt`.
-
-    Returns
-    -------
-    Reference
-        The motion; it brakes harder than the limit only where the range of depths ends before.
-
+    It exceeds the acceleration limit only where the range of depths ends before.
     """
     low, high = depths
     stop = start.position + 0.5 * start.speed * abs(start.speed) / limits.acceleration
@@ -312,7 +277,7 @@ def _join(
     depths: tuple[float, float],
 ) -> tuple[Reference | None, float] | None:
     """
-    Return the quintic to a path, and the time on the path where it meets it.
+    Return the quintic to a path, and the time on the path at its end [s].
 
     The quintic is None if the start is on the path; the result is None if there is no quintic.
     """
@@ -321,7 +286,7 @@ def _join(
     if least == 0.0 and start == path.at(first):
         return None, first
     duration = max(least, SHORTEST)
-    # A time that suffices to reach the end of the path from anywhere within the limits.
+    # Time that is sufficient to reach the end of the path within the limits.
     braking = abs(start.speed) / limits.acceleration
     distance = abs(path.last - start.position)
     enough = distance / limits.speed + braking + sqrt(distance / limits.acceleration)

@@ -18,17 +18,7 @@ import numpy as np
 
 
 class Quintic:
-    """
-    The motion of least integrated squared jerk between two setpoints in a given time.
-
-    Parameters
-    ----------
-    start, end : Setpoint
-        Both ends, with their speeds and accelerations.
-    duration : float
-        Time between them [s].
-
-    """
+    """Motion of least integrated squared jerk between two setpoints in a given duration [s]."""
 
     def __init__(self, start: Setpoint, end: Setpoint, duration: float) -> None:
         t = duration
@@ -44,20 +34,7 @@ class Quintic:
         self._c = start.position, v0, 0.5 * a0, c3, c4, c5
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; outside the motion that of the nearer end.
-
-        Parameters
-        ----------
-        time : float
-            Time since the motion began [s].
-
-        Returns
-        -------
-        Setpoint
-            Position [m], speed [m/s] and acceleration [m/s^2].
-
-        """
+        """Return the setpoint at a time since the start [s]; outside the motion its nearer end."""
         if time >= self.duration:
             return self.end
         if time <= 0.0:
@@ -72,20 +49,7 @@ class Quintic:
         )
 
     def within(self, limits: ReferenceLimits) -> bool:
-        """
-        Return whether it is within limits, or within the values of its ends beyond them.
-
-        Parameters
-        ----------
-        limits : ReferenceLimits
-            Largest speed [m/s] and acceleration [m/s^2].
-
-        Returns
-        -------
-        bool
-            Whether it is.
-
-        """
+        """Return whether the motion is within limits, or within larger values of its ends."""
         ends = self.start, self.end
         top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
@@ -94,20 +58,7 @@ class Quintic:
         return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
 
     def stays(self, depths: tuple[float, float]) -> bool:
-        """
-        Return whether all positions are in a range [m], up to rounding.
-
-        Parameters
-        ----------
-        depths : tuple of float
-            Least and largest position [m].
-
-        Returns
-        -------
-        bool
-            Whether they are.
-
-        """
+        """Return whether all positions are in a range [m], up to rounding."""
         low, high = depths
         least, largest = self.extremes[0]
         slack = ROUNDING * (high - low) if high - low < inf else 0.0
@@ -121,22 +72,7 @@ class Quintic:
 
 
 def shortest(distance: float, limits: ReferenceLimits) -> float:
-    """
-    Return the duration [s] of the fastest quintic from rest to rest over a distance [m].
-
-    Parameters
-    ----------
-    distance : float
-        Distance [m], not negative.
-    limits : ReferenceLimits
-        Largest speed [m/s] and acceleration [m/s^2].
-
-    Returns
-    -------
-    float
-        Duration [s].
-
-    """
+    """Return the duration [s] of the fastest quintic from rest to rest over a distance [m]."""
     # The peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
     return max(
         1.875 * distance / limits.speed,
@@ -147,18 +83,18 @@ def shortest(distance: float, limits: ReferenceLimits) -> float:
 
 class MinimumJerk:
     """
-    The quintic to a target, as short as the limits allow.
+    Fastest quintic motion to a target within the limits.
 
     Parameters
     ----------
     start : Setpoint
-        Start of the motion, with its speed and acceleration.
+        Start of the motion, with velocity and acceleration.
     target : float
         Position of the end, at rest [m].
     limits : ReferenceLimits
-        Limits. What the start already exceeds is allowed.
+        Limits; values that the start already exceeds are allowed.
     depths : tuple of float
-        Least and largest position on the way [m]; the start is always allowed.
+        Least and largest position of the motion [m]; the start is always allowed.
 
     Attributes
     ----------
@@ -191,7 +127,7 @@ class MinimumJerk:
         self._halt: Quintic | None = None
         self._motion = motion
         if not fits():
-            # No single quintic is within the limits: come to rest first.
+            # No single quintic is within the limits: stop first.
             self._halt = halt(start, limits, depths)
             distance = abs(target - self._halt.end.position)
             self._motion = Quintic(self._halt.end, end, shortest(distance, limits))
@@ -223,26 +159,11 @@ def halt(
     start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float] = (-inf, inf)
 ) -> Quintic:
     """
-    Return the motion to rest that does not reverse, within the limit of acceleration.
+    Return the motion to rest without reversal, within the acceleration limit.
 
-    If it would leave the range of depths it ends at the end of the range. It then brakes as much
-    harder as necessary.
-
-    Parameters
-    ----------
-    start : Setpoint
-        Start of the motion. Its acceleration fades, so that the speed may first increase by up
-        to 4/27 of acceleration times duration.
-    limits : ReferenceLimits
-        Limits.
-    depths : tuple of float
-        Least and largest position on the way [m]; the start is always allowed.
-
-    Returns
-    -------
-    Quintic
-        The motion.
-
+    If it would leave the range of depths [m], which is extended to the start, it ends at the end
+    of the range, with the deceleration that this requires. The initial acceleration fades, so that
+    the velocity may first increase by up to 4/27 of acceleration times duration.
     """
     depths = around(depths, start)
     v, a = start.speed, start.acceleration
@@ -252,7 +173,7 @@ def halt(
         end = Setpoint(start.position + time * (0.5 * v + time * a / 12.0))
         return Quintic(start, end, time)
 
-    # Its speed is a cubic: with more time its acceleration tends to that of the start.
+    # The velocity is a cubic: for long durations its acceleration tends to the initial value.
     for _ in range(40):
         peak = np.abs(motion().extremes[2]).max()
         if peak <= max(limits.acceleration, abs(a)) * (1.0 + ROUNDING):

@@ -1,4 +1,4 @@
-"""What every reference is made of: setpoints over time, and limits."""
+"""Setpoints over time and their limits: the interface of all references."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ LONGER: Final = 1.1
 
 class Setpoint(NamedTuple):
     """
-    Desired position, speed and acceleration of an axis.
+    Desired position, velocity and acceleration of an axis.
 
     Attributes
     ----------
     position : float
-        Inserted length [m] or angle [rad].
+        Insertion depth [m] or angle [rad].
     speed, acceleration : float
-        Its first and second derivative in time.
+        First and second derivative in time.
 
     """
 
@@ -49,7 +49,7 @@ class ReferenceLimits:
 
 
 class Reference(Protocol):
-    """A motion that ends at rest. Times count from its start [s]."""
+    """Motion that ends at rest, with times from its start [s]."""
 
     @property
     def duration(self) -> float:
@@ -67,26 +67,11 @@ class Reference(Protocol):
         Returns
         -------
         Setpoint
-            Desired position, speed and acceleration.
+            Desired position, velocity and acceleration.
 
         """
 
 
 def around(depths: tuple[float, float], start: Setpoint) -> tuple[float, float]:
-    """
-    Widen a range of depths to include the start: a needle outside has to come back.
-
-    Parameters
-    ----------
-    depths : tuple of float
-        Least and largest inserted length [m].
-    start : Setpoint
-        Where the motion starts.
-
-    Returns
-    -------
-    tuple of float
-        The wider range [m].
-
-    """
+    """Extend a range of depths [m] to the start of a motion, so that the needle can return."""
     return min(depths[0], start.position), max(depths[1], start.position)

@@ -1,4 +1,4 @@
-"""The fastest motion within the limits, and the target as a step."""
+"""Fastest motion within the limits, and the target as a step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 
 
 class Step:
-    """The target [m] at once, as the paper regulates; start and limits do not matter."""
+    """Step to the target [m], as in the paper; start and limits are ignored."""
 
     duration: Final = 0.0
 
@@ -18,32 +18,19 @@ class Step:
         self._target = target
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; see `Reference.at`.
-
-        Parameters
-        ----------
-        time : float
-            As for `Reference.at`.
-
-        Returns
-        -------
-        Setpoint
-            As from `Reference.at`.
-
-        """
+        """Return the setpoint at a time [s]; see `Reference.at`."""
         del time
         return Setpoint(self._target)
 
 
 class Trapezoid:
     """
-    The fastest motion within the limits: accelerate, keep the speed, brake.
+    Fastest motion within the limits: accelerate, constant speed, brake.
 
     Parameters
     ----------
     start : Setpoint
-        Start of the motion; its acceleration is not used.
+        Start of the motion; its acceleration is ignored.
     target : float
         Position of the end, at rest [m].
     limits : ReferenceLimits

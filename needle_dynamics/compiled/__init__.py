@@ -1,21 +1,21 @@
 """
-Compiled functions, one concept a file.
+Functions compiled by Numba, grouped by topic.
 
 ====================  ============================================================================
-`cache`               the decorator of every compiled function; its machine code on disk
-`held`                arguments that are converted once, not at each call
+`cache`               decorators of compiled functions; loading and compiling of kernels
+`held`                arguments converted once instead of at each call
 `matrices`            Cholesky factor, triangular solutions, eigenvalues of small matrices
-`integrals`           the shape modes at the tip and their integrals over the inserted part
-`tissue`              layers of tissue
-`normal_modes`        modal stiffness, normal modes at a frozen depth, and the row of d
-`oscillator`          the damped oscillator and the first-order lag
-`friction`            the friction laws, and the motion of the insertion axis under them
-`modal_flow`          the deflections through one step
-`step`                steps of the integrator, and runs of them
-`force_sensor`        samples of the force sensor
-`beam`                the needle as a beam about the path that it cut
-`cut`                 how it cuts that path, and follows it
-`superposition`       the same needle in one plane, for many causes at once
-`axis`                motion along the axis: friction per length, cutting, membranes
+`integrals`           shape modes at the tip and their integrals over the inserted part
+`tissue`              tissue layers
+`normal_modes`        modal stiffness, normal modes at a frozen depth, and axial coupling force
+`oscillator`          damped oscillator and first-order lag
+`friction`            friction laws and the motion of the insertion axis under them
+`modal_flow`          exact flow of exact flow of the deflections through one step
+`step`                integrator steps and sequences of intervals
+`force_sensor`        force sensor samples
+`beam`                beam on an elastic foundation about the cut path
+`cut`                 insertion of a bevel-tip needle along its cut path
+`superposition`       planar insertion for many load cases at once
+`axis`                axial motion: friction per length, cutting force, membranes
 ====================  ============================================================================
 """

@@ -1,4 +1,4 @@
-"""Motion along the insertion axis: friction of the inserted length, cutting, and membranes."""
+"""Motion along the insertion axis: friction per length, cutting force, and membranes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from needle_dynamics.arrays import BoolArray, BoolVector, FloatArray, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.friction import slide
 
-#: Places in the state of the axis.
+#: Indices of the axis state.
 DEPTH: Final = 0
 SPEED: Final = 1
 DEEPEST: Final = 2
 
-#: Halvings of the time of an event: to the last digit of a step.
+#: Bisections of an event time: to the last digit of a step.
 _HALVINGS: Final = 60
 
 
@@ -35,12 +35,11 @@ class Axis(NamedTuple):
     starts : ndarray, shape (layers,)
         Depths at which the layers begin [m].
     coulomb_per_length, viscous_per_length : ndarray, shape (layers,)
-        Friction per inserted length in each layer [N/m] and [N s/m^2].
+        Friction per length in each layer [N/m] and [N s/m^2].
     cutting : ndarray, shape (layers,)
-        Force on the tip that cuts, in each layer [N].
+        Cutting force in each layer [N].
     membranes, strengths, stiffness : ndarray, shape (membranes,)
-        Depth of each membrane [m], the force that punctures it [N], and the stiffness with which
-        it resists until then [N/m].
+        Depth [m], puncture force [N] and stiffness [N/m] of each membrane.
 
     """
 
@@ -60,7 +59,7 @@ class Axis(NamedTuple):
 
 class Resistance(NamedTuple):
     """
-    What resists the motion at a depth.
+    Forces that resist the motion at a depth.
 
     Attributes
     ----------
@@ -69,9 +68,9 @@ class Resistance(NamedTuple):
     viscous : float
         Viscous friction on insertion [N s/m].
     cutting : float
-        Force that resists insertion only [N].
+        Cutting force, on insertion only [N].
     elastic : float
-        Force that pushes the needle out [N].
+        Force of membranes, out of the tissue [N].
 
     """
 
@@ -83,26 +82,7 @@ class Resistance(NamedTuple):
 
 @compiled
 def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Resistance:
-    """
-    Return what resists at a depth.
-
-    Parameters
-    ----------
-    a : Axis
-        Constants.
-    depth : float
-        Depth of the tip [m].
-    touches : bool
-        Whether the tip touches uncut tissue.
-    punctured : ndarray of bool, shape (membranes,)
-        Which membranes are punctured.
-
-    Returns
-    -------
-    Resistance
-        Forces.
-
-    """
+    """Return the resistance at a depth [m]; ``touches``: the tip touches uncut tissue."""
     dry, viscous, cutting, elastic = a.coulomb, a.viscous, 0.0, 0.0
     for i in range(len(a.starts)):
         end = a.starts[i + 1] if i + 1 < len(a.starts) else inf
@@ -114,7 +94,7 @@ def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Re
         cutting = a.cutting[i]
     for i in range(len(a.membranes)):
         if not punctured[i] and depth >= a.membranes[i]:
-            # The tip pushes the membrane ahead of it, and cuts nothing.
+            # The tip deforms the membrane and does not cut.
             elastic += a.stiffness[i] * (depth - a.membranes[i])
             touches = False
     return Resistance(dry, viscous, cutting if touches else 0.0, elastic)
@@ -122,7 +102,7 @@ def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Re
 
 @compiled
 def _events(a: Axis, state: FloatArray, punctured: BoolArray) -> tuple[float, float]:
-    """Return the depths above and below between which nothing changes."""
+    """Return the range of depths [m] around the tip without any change of the resistance."""
     depth = state[DEPTH]
     low, high = 0.0, a.reach
     for start in a.starts:
@@ -146,21 +126,21 @@ def _events(a: Axis, state: FloatArray, punctured: BoolArray) -> tuple[float, fl
 
 @inlined
 def _arrive(a: Axis, state: FloatArray, punctured: BoolArray) -> None:
-    """Do what happens at the depth where the tip has arrived."""
+    """Update greatest depth, punctures and hub contact at the new depth."""
     depth = state[DEPTH]
     state[DEEPEST] = max(state[DEEPEST], depth)
     for i in range(len(a.membranes)):
         if depth >= a.membranes[i] + a.strengths[i] / a.stiffness[i]:
             punctured[i] = True
     if depth >= a.reach and state[SPEED] > 0.0:
-        # The hub stops on the guide.
+        # Contact of the hub with the guide.
         state[SPEED] = 0.0
 
 
 @inlined
 def _glide(a: Axis, r: Resistance, speed: float, force: float, t: float) -> tuple[float, float]:
-    """Move under a constant resistance; cutting resists insertion only."""
-    # Friction of both directions about its middle, as `slide` takes it.
+    """Return velocity [m/s] and displacement [m] under a constant resistance."""
+    # Cutting as friction with the ratio of `slide`, plus a constant force.
     share = r.cutting / (1.0 + a.withdrawal)
     drive = force - r.elastic - a.withdrawal * share
     return slide(speed, drive, a.mass, r.dry + share, r.viscous, t, a.withdrawal)
@@ -171,28 +151,10 @@ def push(
     a: Axis, state: Vector, punctured: BoolVector, force: float, duration: float, step: float
 ) -> float:
     """
-    Advance under a constant force.
+    Advance under a constant force [N], positive into the tissue, for ``duration`` [s], in place.
 
-    Parameters
-    ----------
-    a : Axis
-        Constants.
-    state : ndarray, shape (3,)
-        Depth [m], velocity [m/s] and greatest depth [m], overwritten.
-    punctured : ndarray of bool, shape (membranes,)
-        Which membranes are punctured, overwritten.
-    force : float
-        Force [N], positive into the tissue.
-    duration : float
-        Time [s].
-    step : float
-        Longest step [s].
-
-    Returns
-    -------
-    float
-        Time that is left when the needle has left the tissue [s]; 0 otherwise.
-
+    ``state`` is depth [m], velocity [m/s] and greatest depth [m]; ``step`` is the longest step
+    [s]. Returns the time left when the needle leaves the tissue [s], otherwise 0.
     """
     left = duration
     while left > 0.0:
@@ -200,11 +162,11 @@ def push(
         depth, speed = state[DEPTH], state[SPEED]
         low, high = _events(a, state, punctured)
         if depth >= a.reach and speed >= 0.0 and force > 0.0:
-            # On the hub. What pushes it there can only push it on.
+            # At rest on the hub, pushed against it.
             state[SPEED] = 0.0
             return 0.0
         touches = depth >= state[DEEPEST]
-        # Of second order: the resistance in the middle of the way.
+        # Second order: resistance at the middle of the displacement.
         r = resistance(a, depth, touches, punctured)
         _, half = _glide(a, r, speed, force, 0.5 * t)
         middle = min(max(depth + half, low), high)
@@ -246,30 +208,11 @@ def carry_on(
     felt: Vector,
 ) -> float:
     """
-    Advance with the needle brought evenly to a velocity, whatever force that takes.
+    Advance with a velocity ramp to ``speed`` [m/s] over ``duration`` [s], at any force, in place.
 
-    Parameters
-    ----------
-    a : Axis
-        Constants.
-    state : ndarray, shape (3,)
-        Depth [m], velocity [m/s] and greatest depth [m], overwritten.
-    punctured : ndarray of bool, shape (membranes,)
-        Which membranes are punctured, overwritten.
-    speed : float
-        Velocity at the end [m/s].
-    duration : float
-        Time [s].
-    step : float
-        Longest step [s].
-    felt : ndarray, shape (parts,)
-        Overwritten with the mean force over each of the equal parts of the time [N].
-
-    Returns
-    -------
-    float
-        Time that is left when the needle has left the tissue [s]; 0 otherwise.
-
+    ``state`` and ``step`` as in `push`; ``felt``, shape (parts,), takes the mean force in equal
+    parts of the duration [N]. Returns the time left when the needle leaves the tissue [s],
+    otherwise 0.
     """
     rate = (speed - state[SPEED]) / duration
     left = duration
@@ -284,7 +227,7 @@ def carry_on(
             if not low < depth + way < high and way != 0.0:
                 at = high if way > 0.0 else low
                 way = at - depth
-                # The root that does not cancel; rounding may take the square below zero.
+                # Root without cancellation; rounding can make the square negative.
                 root = sqrt(max(0.0, before * before + 2.0 * rate * way))
                 t = min(t, 2.0 * way / (before + copysign(root, way)))
                 state[DEPTH] = at
@@ -306,7 +249,7 @@ def carry_on(
 
 @inlined
 def _held(a: Axis, r: Resistance, speed: float) -> float:
-    """Return friction and cutting at a velocity; at rest what asks for the least force."""
+    """Return friction and cutting force [N]; at rest the static friction of least force."""
     if speed > 0.0:
         return r.dry + r.cutting + r.viscous * speed
     if speed < 0.0:

@@ -1,18 +1,18 @@
 r"""
-The needle as a beam on an elastic foundation about the path that its tip cut.
+Needle as a beam on an elastic foundation about the path cut by its tip.
 
 Between two nodes the needle obeys
 
 .. math:: E I w'''' + k (w - p) = 0
 
-with a path p that is a polynomial of degree two, and this is solved exactly. All of the needle
-between the guide and a node acts on the rest of it as a spring: what the needle does there depends
-on the force and the moment ``f = (V, M)`` that its deeper part exerts on it,
+with a path p that is a polynomial of degree two; this is solved exactly. The needle between the
+guide and a node acts on the deeper part as a spring: its deflection and slope at the node depend
+on the force and the moment ``f = (V, M)`` of the deeper part,
 
 .. math:: x = C f + x_0 , \quad x = (w, w') .
 
-The spring of a node follows from that of the node before it alone. So a needle that grows by an
-element costs one element, whatever its length. C is the same in both planes. In the language of
+The spring at a node follows from the spring at the previous node only. The cost of an additional
+element does therefore not depend on the length. C is the same in both planes. In terms of
 estimation, C and x_0 are the covariance and the mean of a Kalman filter, and the shape of the
 needle is its smoother.
 """
@@ -27,7 +27,7 @@ from needle_dynamics.compiled.cache import compiled, inlined
 
 class Springs(NamedTuple):
     """
-    What the needle up to each node is to the rest of it; row i is the node i.
+    Equivalent spring of the needle up to each node; row i is node i.
 
     Attributes
     ----------
@@ -83,14 +83,14 @@ class Element(NamedTuple):
 
 class Crossing(NamedTuple):
     """
-    How the spring at the end of an element follows from that at its start.
+    Transfer of the spring from the start to the end of an element.
 
     Attributes
     ----------
     c00, c01, c11 : float
         Compliance at the end.
     t00, t01, t10, t11 : float
-        What deflection and slope of the unloaded end at the start become at the end.
+        Transfer of deflection and slope of the unloaded end from the start to the end.
     value, slope, bend : tuple of float
         Deflection and slope at the end per value, slope and second derivative of the path.
 
@@ -111,22 +111,9 @@ class Crossing(NamedTuple):
 @inlined
 def element(ei: float, k: float, h: float) -> Element:
     """
-    Return the transfer over an element.
+    Return the transfer over an element of length h [m], at most (4 E I / k)^(1/4).
 
-    Parameters
-    ----------
-    ei : float
-        Bending stiffness [N m^2].
-    k : float
-        Stiffness of the tissue [N/m^2].
-    h : float
-        Length [m], at most (4 E I / k)^(1/4): then the series have ended.
-
-    Returns
-    -------
-    Element
-        The transfer.
-
+    Up to this length the truncated series are exact to rounding.
     """
     z = -k / ei * h**4
     # Coefficients of z^m: j! / (4m + j)!, by ratios of neighbors.
@@ -152,30 +139,15 @@ def element(ei: float, k: float, h: float) -> Element:
 
 @inlined
 def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
-    """
-    Carry the spring at the start of an element to its end.
-
-    Parameters
-    ----------
-    e : Element
-        The transfer over it.
-    c00, c01, c11 : float
-        Compliance at its start.
-
-    Returns
-    -------
-    Crossing
-        The compliance at its end, and what becomes of deflections and path.
-
-    """
+    """Return the transfer over an element; c00, c01 and c11 are the compliance at its start."""
     a = e.k / e.ei
-    # W = Phi_fx C + Phi_ff takes the loads at the start to those at the end.
+    # W = Phi_fx C + Phi_ff maps the loads at the start to the loads at the end.
     w00 = e.k * (e.p1 * c00 + e.p2 * c01) + e.p0
     w01 = e.k * (e.p1 * c01 + e.p2 * c11) + a * e.p3
     w10 = -e.k * (e.p2 * c00 + e.p3 * c01) - e.p1
     w11 = -e.k * (e.p2 * c01 + e.p3 * c11) + e.p0
     inverse = 1.0 / (w00 * w11 - w01 * w10)
-    # The transfer is symplectic: deflections go over with the transpose of the inverse of W.
+    # The transfer is symplectic: deflections transform with the transpose of the inverse of W.
     t00, t01, t10, t11 = w11 * inverse, -w10 * inverse, -w01 * inverse, w00 * inverse
     # Phi_xx C + Phi_xf, times the inverse of W.
     v00 = e.p0 * c00 + e.p1 * c01 - e.p3 / e.ei
@@ -195,9 +167,9 @@ def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
 def _loaded(
     e: Element, n00: float, n01: float, n11: float, q1: float, q2: float, q3: float, q4: float
 ) -> tuple[float, float]:
-    """Return deflection and slope at the end for a unit of the path; q1 to q4 its integrals."""
+    """Return deflection and slope at the end per unit of the path, with its integrals q1 to q4."""
     a = e.k / e.ei
-    # The load of the path on a needle that starts at zero: w, w', V and M at the end.
+    # Load of the path on a needle with zero start values: w, w', V and M at the end.
     shear, moment = -e.k * q1, e.k * q2
     return (
         a * q4 - n00 * shear - n01 * moment,
@@ -208,21 +180,10 @@ def _loaded(
 @compiled
 def begin(s: Springs, ei: float, free: float, skin: float, entry: FloatArray) -> None:
     """
-    Fill the first row: from the guide over the free length to the entry point, and the skin.
+    Fill the first row: from the guide over the free length [m] to the entry point, and the skin.
 
-    Parameters
-    ----------
-    s : Springs
-        Rows.
-    ei : float
-        Bending stiffness [N m^2].
-    free : float
-        Free length between guide and entry point [m].
-    skin : float
-        Stiffness of the skin [N/m].
-    entry : ndarray, shape (2,)
-        Where the skin was pierced, by plane [m].
-
+    ``skin`` is the stiffness of the skin [N/m], ``entry`` the entry point by plane [m], shape
+    (2,).
     """
     c00, c01, c11 = free**3 / (3.0 * ei), free**2 / (2.0 * ei), free / ei
     held = skin / (1.0 + skin * c00)
@@ -241,19 +202,7 @@ def begin(s: Springs, ei: float, free: float, skin: float, entry: FloatArray) ->
 
 @inlined
 def carry(s: Springs, i: int, c: Crossing) -> None:
-    """
-    Fill the row of the end of an element, all but what its path does.
-
-    Parameters
-    ----------
-    s : Springs
-        Rows.
-    i : int
-        Row of the start of the element.
-    c : Crossing
-        The element.
-
-    """
+    """Fill row i + 1, at the end of the element from row i, without the load of the path."""
     j = i + 1
     s.compliance[j, 0], s.compliance[j, 1], s.compliance[j, 2] = c.c00, c.c01, c.c11
     for k in range(2):
@@ -267,21 +216,7 @@ def carry(s: Springs, i: int, c: Crossing) -> None:
 
 @inlined
 def follow(s: Springs, i: int, plane: int, c: Crossing) -> None:
-    """
-    Add what the path of an element does to the row of its end.
-
-    Parameters
-    ----------
-    s : Springs
-        Rows.
-    i : int
-        Row of the start of the element.
-    plane : int
-        0 for x, 1 for z.
-    c : Crossing
-        The element.
-
-    """
+    """Add the load of the path of an element to row i + 1, in plane 0 (x) or 1 (z)."""
     p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
     for k in range(2):
         s.rest[i + 1, plane, k] += p * c.value[k] + d * c.slope[k] + b * c.bend[k]
@@ -300,7 +235,7 @@ def shape(
     felt: FloatArray,
 ) -> None:
     """
-    Find deflection and slope of the needle at its nodes, and what the guide feels.
+    Compute deflection and slope of the needle at its nodes, and the load on the guide.
 
     Parameters
     ----------
@@ -319,9 +254,9 @@ def shape(
     load : ndarray, shape (2,)
         Lateral load on the tip, by plane [N].
     found : ndarray, shape (2, last + 1, 2)
-        For deflections [m] and slopes, by plane and node.
+        Output: deflections [m] and slopes, by plane and node.
     felt : ndarray, shape (2, 2)
-        For force [N] and moment [N m] of the needle on the guide, by plane.
+        Output: force [N] and moment [N m] of the needle on the guide, by plane.
 
     """
     for plane in range(2):
@@ -332,7 +267,7 @@ def shape(
             c00, c01, c11 = s.compliance[i, 0], s.compliance[i, 1], s.compliance[i, 2]
             w0 = s.rest[i, plane, 0] + s.response[i, 0, 0] * b + s.response[i, 0, 1] * tilt
             t0 = s.rest[i, plane, 1] + s.response[i, 1, 0] * b + s.response[i, 1, 1] * tilt
-            # Loads at the start of the element, from those at its end.
+            # Loads at the start of the element, from the loads at its end.
             k = s.stiffness[i]
             e = element(ei, k, end - s.depths[i])
             p, d, c = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
@@ -349,7 +284,7 @@ def shape(
             end = s.depths[i]
         felt[plane, 0], felt[plane, 1] = v, m
         if free > 0.0:
-            # The force jumps over the skin; the free length is bent by its ends alone.
+            # The force jumps at the skin; the free length is loaded at its ends only.
             away = found[plane, 0, 0] - b - tilt * free
             turn = found[plane, 0, 1] - tilt
             shear = 6.0 * ei / free**3 * (2.0 * away - free * turn)

@@ -1,11 +1,11 @@
 """
-The decorators of compiled functions, and their preparation before they are called.
+Decorators of compiled functions, and their preparation before the first call.
 
-Three decorators: a `kernel` is called from Python, and is compiled for the types of its
-annotations; `compiled` is for functions that only compiled functions call, and `inlined` for
-parts of a hot loop. `prepare` loads or compiles kernels, so that nothing is compiled later.
+A `kernel` is called from Python and compiled for the types of its annotations; `compiled` is for
+functions that only compiled functions call, and `inlined` for parts of a hot loop. `prepare`
+loads or compiles kernels in advance.
 
-A compiled function must call, and take constants from, files of its own folder and of this one
+A compiled function must call, and take constants from, files of its own folder and of this folder
 only: the machine code on disk is valid for their sources (`store`).
 
 Numba is imported when the first function is prepared or called, not before.
@@ -36,7 +36,7 @@ _KERNELS: Final[dict[str, dict[str, _Compiled]]] = {}
 
 
 class _Compiled:
-    """A function that Numba compiles at its first call; other compiled functions may call it."""
+    """A function compiled by Numba at its first call and callable from compiled functions."""
 
     def __init__(self, function: Callable[..., object], **options: bool) -> None:
         #: The Python source, as Numba's own dispatchers call it.
@@ -56,7 +56,7 @@ class _Compiled:
 
     @cached_property
     def _called(self) -> Any:
-        """The function that Python calls: one without a wrapper for Python gets a caller."""
+        """The function that Python calls; without a Python wrapper, a compiled caller of it."""
         import numba
 
         if 'no_cpython_wrapper' not in self._options:
@@ -70,7 +70,6 @@ class _Compiled:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """Numba's dispatcher of the function."""
         import numba
 
         made = numba.njit(**self._options)(self.py_func)
@@ -79,14 +78,14 @@ class _Compiled:
 
     @property
     def _numba_type_(self) -> Any:
-        """The type that Numba sees when another compiled function calls this one."""
+        """Numba's type of this function as a callee of compiled functions."""
         from numba import types
 
         return types.Dispatcher(self.dispatcher)
 
     @property
     def is_kept(self) -> bool:
-        """Whether the machine code for the types of its annotations is on disk."""
+        """Whether the machine code for the annotated types is on disk."""
         from needle_dynamics.compiled.signatures import argument_types
         from numba.core.registry import cpu_target
 
@@ -94,7 +93,7 @@ class _Compiled:
         return bool(self.dispatcher._cache.has(argument_types(self.py_func), target))
 
     def prepare(self) -> None:
-        """Load or compile the function for the types of its annotations."""
+        """Load or compile the function for the annotated types."""
         from needle_dynamics.compiled.held import prepare_hold
         from needle_dynamics.compiled.signatures import argument_types
 
@@ -108,37 +107,15 @@ def kernel(function: _Function) -> _Function:
     """
     Compile a function that is called from Python.
 
-    Parameters
-    ----------
-    function : callable
-        Function in the subset of Python that Numba compiles. It may call compiled functions of
-        its own folder and of `needle_dynamics.compiled`. Its annotations determine the types for
-        which `prepare` compiles it; for others it is compiled at the first call.
-
-    Returns
-    -------
-    callable
-        The compiled function; its Python source is the attribute ``py_func``.
-
+    It may call compiled functions of its own folder and of `needle_dynamics.compiled`. `prepare`
+    compiles it for the types of its annotations; for other types it is compiled at the first call.
+    Its Python source is the attribute ``py_func``.
     """
     return _kernel(function)
 
 
 def inlined_kernel(function: _Function) -> _Function:
-    """
-    Do the same as `kernel` for a function that is also a part of a hot loop, as `inlined`.
-
-    Parameters
-    ----------
-    function : callable
-        As for `kernel`.
-
-    Returns
-    -------
-    callable
-        The compiled function.
-
-    """
+    """Compile a `kernel` that is also part of a hot loop, as `inlined`."""
     return _kernel(function, forceinline=True)
 
 
@@ -149,39 +126,15 @@ def _kernel(function: _Function, **options: bool) -> _Function:
 
 
 def compiled(function: _Function) -> _Function:
-    """
-    Compile a function that compiled functions call.
-
-    Parameters
-    ----------
-    function : callable
-        As for `kernel`; any types.
-
-    Returns
-    -------
-    callable
-        The compiled function; its Python source is the attribute ``py_func``.
-
-    """
+    """Compile a function that only compiled functions call, for any argument types."""
     return cast(_Function, _Compiled(function, no_cpython_wrapper=True))
 
 
 def inlined(function: _Function) -> _Function:
     """
-    Do the same as `compiled` for a part of a hot loop: its code becomes part of its callers'.
+    Compile a part of a hot loop: its code is inlined into its callers.
 
-    A call that is not inlined passes every number of its arguments, an array being seven.
-
-    Parameters
-    ----------
-    function : callable
-        As for `compiled`.
-
-    Returns
-    -------
-    callable
-        The compiled function.
-
+    A call that is not inlined passes every number of its arguments; an array is seven numbers.
     """
     return cast(_Function, _Compiled(function, forceinline=True, no_cpython_wrapper=True))
 
@@ -190,20 +143,7 @@ def inlined(function: _Function) -> _Function:
 
 
 def kernels(names: Iterable[str]) -> list[str]:
-    """
-    List kernels.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Modules, which are imported, for all of their kernels, or kernels as ``module:kernel``.
-
-    Returns
-    -------
-    list of str
-        Kernels as ``module:kernel``, each once.
-
-    """
+    """List the kernels, as ``module:kernel``, of modules (which are imported) or given by name."""
     found = []
     for name in names:
         module, _, own = name.partition(':')
@@ -213,20 +153,7 @@ def kernels(names: Iterable[str]) -> list[str]:
 
 
 def is_kept(name: str) -> bool:
-    """
-    Return whether the machine code of a kernel is on disk.
-
-    Parameters
-    ----------
-    name : str
-        One of `kernels`.
-
-    Returns
-    -------
-    bool
-        Whether `prepare` would load it.
-
-    """
+    """Return whether the machine code of a kernel (``module:kernel``) is on disk."""
     module, _, own = name.partition(':')
     return _KERNELS[module][own].is_kept
 
@@ -235,18 +162,8 @@ def prepare(names: Iterable[str]) -> Iterator[tuple[int, int, str]]:
     """
     Load or compile kernels, one at each step of the iterator.
 
-    Parameters
-    ----------
-    names : iterable of str
-        As for `kernels`.
-
-    Yields
-    ------
-    done, count : int
-        Kernels that are ready, and all of them.
-    name : str
-        Name of the next one; '' after the last.
-
+    Yields the number of kernels that are ready, the number of all kernels, and the name of the
+    next kernel, '' after the last kernel.
     """
     found = kernels(names)
     for done, name in enumerate(found):
@@ -258,15 +175,7 @@ def prepare(names: Iterable[str]) -> Iterator[tuple[int, int, str]]:
 
 
 def where_kept() -> str:
-    """
-    Return the folder of machine code, for people.
-
-    Returns
-    -------
-    str
-        The folder; if none is writable, a sentence with those that were tried.
-
-    """
+    """Return the folder of machine code as text, or a message with the unwritable folders."""
     folder = writable_folder()
     if folder is not None:
         return str(folder)
@@ -277,7 +186,7 @@ def where_kept() -> str:
     )
 
 
-# What the process does.
+# Compilation reports.
 
 
 @contextmanager
@@ -285,13 +194,9 @@ def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
     """
     Report each function that this process compiles or loads.
 
-    Parameters
-    ----------
-    listener : callable
-        Called with the name of the function, whether it is loaded from disk, and whether
-        `prepare` does it; by the thread that does it, before it is compiled or after it is
-        loaded.
-
+    The listener takes the name of the function, whether it is loaded from disk, and whether
+    `prepare` requested it. It is called by the compiling thread, before compilation or after
+    loading.
     """
     LISTENERS.append(listener)
     try:
@@ -304,7 +209,7 @@ def announce_compilation() -> None:
     """
     Write one line to standard error when this process first compiles a function.
 
-    Commands call this at their start; libraries and tests stay silent.
+    Called by commands at their start; libraries and tests are silent.
     """
 
     def report(_name: str, loaded: bool, _prepared: bool) -> None:

@@ -1,4 +1,4 @@
-"""The needle that cuts its path: the tip goes in, and holds still, out, and in again along it."""
+"""Insertion of a bevel-tip needle: cutting, rest, withdrawal, reinsertion along the cut path."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.held import Held
 
-#: Places in `Cut.pose`.
+#: Indices of `Cut.pose`.
 DEPTH: Final = 0
 ROLL: Final = 1
 TIP_ROLL: Final = 2
 FREE: Final = 3
 DEEPEST: Final = 4
 
-#: Places in `Cut.counts`: row of the last node, and whether the path begins anew there.
+#: Indices of `Cut.counts`: row of the last node, and whether the path restarts there.
 LAST: Final = 0
 ANEW: Final = 1
 
-#: Way back over which uncut tissue lets go of the tip [m]: a third of the length of a bevel of 25
-#: degrees at 18 gauge. A robot that rests to some micrometers does not make the tip jump.
+#: Withdrawal over which the lateral load of the tip fades [m]: a third of the length of a bevel of
+#: 25 degrees at 18 gauge, so that position noise of some micrometers does not make the tip jump.
 _RELEASE: Final = 1e-3
 
-#: Shift of the tip at rest that begins a new path [m]: more than rounding, less than matters.
+#: Shift of the tip at rest that restarts the path [m]: above rounding, negligible in size.
 SHIFT: Final = 1e-9
 
-#: A path begins anew within an element only if that is then at least this part of its length.
+#: Least fraction of an element that is cut before the path may restart within it.
 _PART: Final = 0.5
 
-#: Where `insert` shall not say what the guide feels.
+#: Placeholder for the output ``felt`` of `insert`: guide forces are not computed.
 NOT_FELT: Final = np.empty((0, 0, 2))
 
-#: Shorter pieces of path than this are none [m].
+#: Length below which a piece of path is ignored [m].
 _NOTHING: Final = 1e-12
 
 
@@ -65,7 +65,7 @@ class Steered(NamedTuple):
     twist : float
         Torsional compliance of the needle per length [rad/(N m^2)].
     turning : float
-        Friction torque per inserted length [N m/m].
+        Friction torque per length [N m/m].
     length : float
         Length of the needle [m].
     starts : ndarray, shape (layers,)
@@ -77,8 +77,8 @@ class Steered(NamedTuple):
     cell : float
         Distance between the loads of `wander` [m].
     wander : ndarray, shape (cells, 2)
-        Lateral loads on the tip by depth, in planes x and z [N]: what is not uniform in tissue;
-        straight lines between them.
+        Lateral loads on the tip by depth, in planes x and z [N], for non-uniform tissue; linear
+        interpolation.
 
     """
 
@@ -102,19 +102,19 @@ class Cut(NamedTuple):
     Attributes
     ----------
     springs : Springs
-        Rows of the nodes; the row after the last node is the tip's.
+        Rows of the nodes; the row after the last node is the tip.
     guide : ndarray, shape (2, 2)
         By plane (x, z): position [m] and tilt of the guide.
     pose : ndarray, shape (5,)
         Depth of the tip [m], roll of base and tip [rad], free length, greatest depth [m].
     entry : ndarray, shape (2,)
-        Where the skin was pierced, by plane [m].
+        Entry point in the skin, by plane [m].
     tip : ndarray, shape (2, 2)
         By plane: deflection [m] and slope of the tip.
     load : ndarray, shape (2,)
         Lateral load on the tip, by plane [N].
     counts : ndarray of int, shape (2,)
-        Row of the last node, and whether the path begins anew there.
+        Row of the last node, and whether the path restarts there.
 
     """
 
@@ -128,17 +128,7 @@ class Cut(NamedTuple):
 
 
 class Needle(NamedTuple):
-    """
-    A needle that cuts its path.
-
-    Attributes
-    ----------
-    constants : Steered
-        Its constants.
-    state : Cut
-        Its state.
-
-    """
+    """Constants and state of a needle that cuts its path."""
 
     constants: Steered
     state: Cut
@@ -146,7 +136,7 @@ class Needle(NamedTuple):
 
 class Pose(NamedTuple):
     """
-    Where the needle is to be brought.
+    Commanded pose of the needle.
 
     Attributes
     ----------
@@ -169,27 +159,13 @@ class Pose(NamedTuple):
 
 @kernel
 def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
-    """
-    Set the tip on the skin.
-
-    Parameters
-    ----------
-    n : Steered
-        Constants.
-    c : Cut
-        State, overwritten.
-    to : Pose
-        Pose; its depth does not count.
-    free : float
-        Free length between guide and skin [m].
-
-    """
+    """Place the tip on the skin with a free length from the guide [m]; ignores ``to.depth``."""
     c.pose[DEPTH] = c.pose[DEEPEST] = 0.0
     c.pose[ROLL] = c.pose[TIP_ROLL] = to.roll
     c.pose[FREE] = free
     c.guide[0, 0], c.guide[0, 1], c.guide[1, 0], c.guide[1, 1] = to.x, to.tilt_x, to.z, to.tilt_z
     c.counts[LAST], c.counts[ANEW] = 0, 1
-    # The bevel bends the needle before the skin holds it.
+    # The bevel bends the needle before the skin supports it.
     _load(n, c, 0)
     for plane in range(2):
         c.entry[plane] = c.guide[plane, 0] + free * c.guide[plane, 1]
@@ -203,17 +179,9 @@ def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
 @inlined
 def move(n: Steered, c: Cut, to: Pose) -> None:
     """
-    Bring the needle to a pose; guide and roll change evenly with the depth.
+    Move the needle to a pose, in place; guide and roll change in proportion to the depth.
 
-    Parameters
-    ----------
-    n : Steered
-        Constants.
-    c : Cut
-        State, overwritten.
-    to : Pose
-        The pose. Its depth must be at least 0 and within what the rows can hold.
-
+    The depth of the pose must be at least 0 and within the capacity of the rows.
     """
     begun, deepest = c.pose[DEPTH], c.pose[DEEPEST]
     x, tilt_x, z, tilt_z = c.guide[0, 0], c.guide[0, 1], c.guide[1, 0], c.guide[1, 1]
@@ -234,7 +202,7 @@ def move(n: Steered, c: Cut, to: Pose) -> None:
             if depth == end:
                 _keep(c)
                 if n.bevel[_layer(n, end)] != n.bevel[_layer(n, c.springs.depths[last])]:
-                    # Another load in the next layer: the tip springs over.
+                    # Different bevel load in the next layer: the tip jumps.
                     place(n, c)
                     _resume(n, c)
             if depth == to.depth:
@@ -257,14 +225,14 @@ def _set(
     part: float,
     depth: float,
 ) -> None:
-    """Set depth, guide and roll to a part of the way."""
+    """Set depth [m], and guide and roll at a fraction of the motion to the pose."""
     c.pose[DEPTH] = depth
     c.guide[0, 0] = x + part * (to.x - x)
     c.guide[0, 1] = tilt_x + part * (to.tilt_x - tilt_x)
     c.guide[1, 0] = z + part * (to.z - z)
     c.guide[1, 1] = tilt_z + part * (to.tilt_z - tilt_z)
     c.pose[ROLL] = roll + part * (to.roll - roll)
-    # Friction holds the tip while the base takes up the windup; exact for the tip at one depth.
+    # Friction torque holds the tip within the windup; exact at constant depth.
     torque = n.turning * depth
     windup = torque * n.twist * max(0.0, n.length - 0.5 * depth)
     low, high = c.pose[ROLL] - windup, c.pose[ROLL] + windup
@@ -273,7 +241,7 @@ def _set(
 
 @inlined
 def _layer(n: Steered, depth: float) -> int:
-    """Return the layer below a depth."""
+    """Return the index of the layer that starts at or above a depth [m]."""
     layer = 0
     while layer + 1 < len(n.starts) and n.starts[layer + 1] <= depth:
         layer += 1
@@ -282,10 +250,10 @@ def _layer(n: Steered, depth: float) -> int:
 
 @inlined
 def _next_node(n: Steered, depth: float) -> float:
-    """Return where the element that starts at a depth ends: it stays within its layer."""
+    """Return the end of the element that starts at a depth [m]; it stays within its layer."""
     layer = _layer(n, depth)
     border = n.starts[layer + 1] if layer + 1 < len(n.starts) else inf
-    # Whole multiples of the element, so that the nodes do not depend on the steps taken.
+    # Equal elements in a layer, so that the nodes do not depend on the steps.
     left = border - depth
     if left > 1e6 * n.element:
         return depth + n.element
@@ -295,7 +263,7 @@ def _next_node(n: Steered, depth: float) -> float:
 
 @inlined
 def _load(n: Steered, c: Cut, layer: int) -> None:
-    """Set the lateral load on the tip in a layer: none if it does not touch uncut tissue."""
+    """Set the lateral load on the tip [N]; zero without contact to uncut tissue."""
     c.load[0] = c.load[1] = 0.0
     touch = 1.0 - (c.pose[DEEPEST] - c.pose[DEPTH]) / _RELEASE
     if touch <= 0.0:
@@ -315,14 +283,14 @@ def _load(n: Steered, c: Cut, layer: int) -> None:
 
 @inlined
 def _path_end(s: Springs, i: int, plane: int, h: float) -> float:
-    """Return the value of the path of an element at a distance from its start."""
+    """Return the path of an element at a distance from its start [m]."""
     p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
     return float(p + h * (d + 0.5 * h * b))
 
 
 @inlined
 def _unloaded(c: Cut, row: int, plane: int, k: int) -> float:
-    """Return deflection or slope of the unloaded end of a row."""
+    """Return deflection (k = 0) or slope (k = 1) of the unloaded end of a row."""
     s = c.springs
     b, tilt = c.guide[plane, 0], c.guide[plane, 1]
     return float(s.rest[row, plane, k] + s.response[row, k, 0] * b + s.response[row, k, 1] * tilt)
@@ -330,7 +298,7 @@ def _unloaded(c: Cut, row: int, plane: int, k: int) -> float:
 
 @inlined
 def _resume(n: Steered, c: Cut) -> None:
-    """Begin to cut: where the tip now stands, if it was shifted since it last cut."""
+    """Restart the path at the tip if the tip was shifted since the last cut."""
     s, last = c.springs, c.counts[LAST]
     part = c.pose[DEPTH] - s.depths[last]
     shift = 0.0
@@ -343,7 +311,7 @@ def _resume(n: Steered, c: Cut) -> None:
         return
     if part > _NOTHING:
         if part < _PART * (_next_node(n, s.depths[last]) - s.depths[last]):
-            # Path this short is cut anew.
+            # A path this short is cut again.
             return
         _keep(c)
     last = c.counts[LAST]
@@ -354,7 +322,7 @@ def _resume(n: Steered, c: Cut) -> None:
 
 @inlined
 def _cut(n: Steered, c: Cut) -> None:
-    """Bring the tip to its depth by cutting on from the last node: find the path up to it."""
+    """Cut from the last node to the depth of the tip: compute the path of this element."""
     s, last = c.springs, c.counts[LAST]
     h = c.pose[DEPTH] - s.depths[last]
     c.pose[DEEPEST] = c.pose[DEPTH]
@@ -366,8 +334,8 @@ def _cut(n: Steered, c: Cut) -> None:
     anew = c.counts[ANEW] == 1
     before = 0.0 if anew else s.depths[last] - s.depths[last - 1]
     for plane in range(2):
-        # A parabola through the node before, this one and the tip; or a straight line. The tip
-        # stands on the path: what it leaves the line by follows from what that does to it.
+        # A parabola through the previous node, this node and the tip; or a straight line. The tip
+        # lies on the path: linear equation for its offset from the line.
         value, lean = s.path[last, plane, 0], 0.0
         slope, bend = 1.0 / h, 0.0
         if not anew:
@@ -393,7 +361,7 @@ def _cut(n: Steered, c: Cut) -> None:
 
 @inlined
 def _keep(c: Cut) -> None:
-    """Make the tip a node: the path up to it is cut for good."""
+    """Make the tip a node: the path up to it is final."""
     s, last = c.springs, c.counts[LAST]
     h = s.depths[last + 1] - s.depths[last]
     for plane in range(2):
@@ -404,24 +372,7 @@ def _keep(c: Cut) -> None:
 
 @compiled
 def node_before(s: Springs, last: int, depth: float) -> int:
-    """
-    Return the row of the node before a depth.
-
-    Parameters
-    ----------
-    s : Springs
-        Rows.
-    last : int
-        Row of the last node.
-    depth : float
-        Depth [m].
-
-    Returns
-    -------
-    int
-        The row.
-
-    """
+    """Return the row of the last node at or above a depth [m], by bisection."""
     low, high = 0, last
     while low < high:
         middle = (low + high + 1) // 2
@@ -434,7 +385,7 @@ def node_before(s: Springs, last: int, depth: float) -> int:
 
 @inlined
 def _over(n: Steered, s: Springs, i: int, h: float) -> Crossing:
-    """Return the crossing of an element, or of its first part."""
+    """Return the crossing of an element or of its first part of length h [m]."""
     return cross(
         element(n.ei, s.stiffness[i], h),
         s.compliance[i, 0],
@@ -446,20 +397,9 @@ def _over(n: Steered, s: Springs, i: int, h: float) -> Crossing:
 @kernel
 def place(n: Steered, c: Cut) -> tuple[float, float, float]:
     """
-    Find the tip: its load, its deflection and slope, and its compliance.
+    Compute load, deflection and slope of the tip at the present depth.
 
-    Parameters
-    ----------
-    n : Steered
-        Constants.
-    c : Cut
-        State; `tip` and `load` are overwritten.
-
-    Returns
-    -------
-    c00, c01, c11 : float
-        Compliance of the tip [m/N, 1/N, rad/(N m)].
-
+    Returns the compliance c00, c01, c11 of the tip [m/N, 1/N, rad/(N m)].
     """
     s, depth = c.springs, c.pose[DEPTH]
     i = node_before(s, c.counts[LAST], depth)
@@ -478,19 +418,7 @@ def place(n: Steered, c: Cut) -> tuple[float, float, float]:
 
 @kernel
 def respond(n: Steered, c: Cut, found: Matrix) -> None:
-    """
-    Find what the tip does per change of the guide, at rest.
-
-    Parameters
-    ----------
-    n : Steered
-        Constants.
-    c : Cut
-        State.
-    found : ndarray, shape (2, 2)
-        For deflection and slope of the tip, per position and tilt of the guide.
-
-    """
+    """Compute deflection and slope of the tip per position and tilt of the guide, shape (2, 2)."""
     s, depth = c.springs, c.pose[DEPTH]
     i = node_before(s, c.counts[LAST], depth)
     e = _over(n, s, i, depth - s.depths[i])
@@ -502,7 +430,7 @@ def respond(n: Steered, c: Cut, found: Matrix) -> None:
 
 @inlined
 def _bend(n: Steered, c: Cut, found: FloatArray, felt: FloatArray) -> int:
-    """Find the needle at its nodes, and what the guide feels; return the last node."""
+    """Compute the shape of the needle and the load on the guide; return the last node."""
     depth = c.pose[DEPTH]
     last = node_before(c.springs, c.counts[LAST], depth)
     shape(c.springs, last, depth, n.ei, c.pose[FREE], c.guide, c.load, found, felt)
@@ -511,56 +439,24 @@ def _bend(n: Steered, c: Cut, found: FloatArray, felt: FloatArray) -> int:
 
 @kernel
 def bring(held: Held[Needle], to: Pose) -> None:
-    """
-    Do what `move` does with a needle that is held.
-
-    Parameters
-    ----------
-    held : Held of Needle
-        The needle, overwritten.
-    to : Pose
-        As for `move`.
-
-    """
+    """Apply `move` to a held needle."""
     move(held.value.constants, held.value.state, to)
 
 
 @kernel
 def bend(held: Held[Needle], found: Array3, felt: Matrix) -> int:
     """
-    Find the needle from the guide to the node before the tip, and what the guide feels.
+    Compute the shape of a held needle and the load on the guide; return the node before the tip.
 
-    Parameters
-    ----------
-    held : Held of Needle
-        The needle.
-    found : ndarray, shape (2, rows, 2)
-        For deflections [m] and slopes, by plane and node.
-    felt : ndarray, shape (2, 2)
-        For force [N] and moment [N m] of the needle on the guide, by plane.
-
-    Returns
-    -------
-    int
-        Row of the node before the tip.
-
+    ``found``, shape (2, rows, 2), takes deflections [m] and slopes by plane and node; ``felt``,
+    shape (2, 2), force [N] and moment [N m] of the needle on the guide by plane.
     """
     return _bend(held.value.constants, held.value.state, found, felt)
 
 
 @kernel
 def remember(draws: Matrix, part: float) -> None:
-    """
-    Add to each draw a part of the one before it.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (k, 2)
-        Independent draws; overwritten.
-    part : float
-        The part.
-
-    """
+    """Correlate draws, shape (k, 2), in place: add a fraction of the previous draw to each."""
     for i in range(1, len(draws)):
         for plane in range(2):
             draws[i, plane] += part * draws[i - 1, plane]
@@ -568,19 +464,7 @@ def remember(draws: Matrix, part: float) -> None:
 
 @kernel
 def set_free(n: Steered, c: Cut, free: float) -> None:
-    """
-    Change the free length: the skin came towards the guide, or went away from it.
-
-    Parameters
-    ----------
-    n : Steered
-        Constants.
-    c : Cut
-        State, overwritten.
-    free : float
-        Free length between guide and skin [m].
-
-    """
+    """Change the free length between guide and skin [m], in place."""
     s = c.springs
     c.pose[FREE] = free
     begin(s, n.ei, free, n.skin, c.entry)
@@ -605,28 +489,28 @@ def insert(
     felt: Array3,
 ) -> None:
     """
-    Bring needles from the skin through poses. Of arrays with one row that row is for all runs.
+    Insert needles from the skin through sequences of poses; arrays with one row apply to all runs.
 
     Parameters
     ----------
     constants : ndarray, shape (runs or 1, 7)
-        The numbers of `Steered`, to `length`, and the free length.
+        The fields of `Steered` up to ``length``, and the free length.
     layers : ndarray, shape (runs or 1, 3, layers)
-        Start, stiffness and load of the bevel of each layer; a start of inf is of no layer.
+        Start, stiffness and bevel load of each layer; a start of inf marks an unused layer.
     cell : float
         Distance between the loads of `wander` [m].
     wander : ndarray, shape (runs or 1, cells, 2)
         As in `Steered`.
     poses : ndarray, shape (runs or 1, k, 6)
-        The numbers of `Pose`; the first one sets the tip on the skin.
+        The fields of `Pose`; the first pose places the tip on the skin.
     runs : ndarray of int, shape (m,)
-        Which of the runs to do.
+        Indices of the runs to compute.
     c : Cut
-        Room for the state of one needle.
+        Work memory: the state of one needle.
     tips : ndarray, shape (runs, k, 2)
-        For the deflections of the tip in x and z [m].
+        Output: deflections of the tip in x and z [m].
     felt : ndarray, shape (runs, k, 2)
-        For the forces of the needle on the guide in x and z [N]; not wanted if it is empty.
+        Output: forces of the needle on the guide in x and z [N]; not computed if empty.
 
     """
     nodes, of_guide = np.empty((2, len(c.springs.depths), 2)), np.empty((2, 2))

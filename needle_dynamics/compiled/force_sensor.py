@@ -1,4 +1,4 @@
-"""Samples of the force sensor: offset, noise, saturation, filters, counts."""
+"""Force sensor samples: offset, noise, saturation, filters, quantization."""
 
 from __future__ import annotations
 
@@ -9,20 +9,10 @@ import numpy as np
 
 @kernel
 def straight(before: Vector, now: Vector, felt: Matrix) -> None:
-    """
-    Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``.
-
-    Parameters
-    ----------
-    before, now : ndarray, shape (6,)
-        The wrench at both ends [N, N m].
-    felt : ndarray, shape (k, 6)
-        Overwritten.
-
-    """
+    """Fill ``felt``, shape (k, 6), with a linear interpolation that ends at ``now``."""
     samples = felt.shape[0]
     for j in range(samples):
-        # The last sample is the wrench now, to the bit.
+        # The last sample equals ``now`` to the bit.
         back = (samples - 1.0 - j) / samples
         for i in range(6):
             felt[j, i] = now[i] + back * (before[i] - now[i])
@@ -40,26 +30,26 @@ def sense(
     reading: Vector,
 ) -> None:
     """
-    Take the samples of a force sensor since its last reading; read the last of them.
+    Simulate the k samples of a force sensor since its last reading, and return the last sample.
 
     Parameters
     ----------
     felt : ndarray, shape (k, 6)
-        True wrench of each of the k samples.
+        True wrench at each sample [N, N m].
     drawn : ndarray, shape (k + 1, 6)
         Standard normal numbers: noise of each sample, then the step of the offset.
     constants : ndarray, shape (4, 6)
         Standard deviations of noise and step, range, and resolution (0 for none) of each axis.
     sections : ndarray, shape (filters, 6)
-        Second-order sections of the cascade, as SciPy has them.
+        Second-order sections of the cascade, in the format of SciPy.
     memory : ndarray, shape (filters, 2, 6)
-        Their memory in transposed direct form II; renewed.
+        Their state in transposed direct form II; updated.
     offset : ndarray, shape (6,)
-        Offset of the sensor; renewed.
+        Offset of the sensor; updated.
     zero : ndarray, shape (6,)
-        What the reading is zeroed on.
+        Tare, subtracted from the reading.
     reading : ndarray, shape (6,)
-        Overwritten with the reading.
+        Output: the reading.
 
     """
     samples = felt.shape[0]
@@ -76,5 +66,5 @@ def sense(
                 memory[k, 0, i] = sections[k, 1] * x - sections[k, 4] * value + memory[k, 1, i]
                 memory[k, 1, i] = sections[k, 2] * x - sections[k, 5] * value
         value -= zero[i]
-        # Counts know no negative zero.
+        # + 0.0 removes a negative zero.
         reading[i] = np.rint(value / count) * count + 0.0 if count > 0.0 else value

@@ -1,9 +1,9 @@
 """
-Friction along the insertion axis: the laws, and the motion of the axis under them.
+Friction along the insertion axis: friction laws, and the motion of the axis under them.
 
-A law is one branch of `dry_friction`. To add one, add its name to `FRICTION_LAWS` and its branch
-there; simulation, linearization and inverse dynamics follow from it. A constant that it needs is a
-field of `FrictionConstants`, of `needle_dynamics.friction.Friction` and of `NeedleParameters`.
+Each law is a branch of `dry_friction`. To add a law, add its name to `FRICTION_LAWS` and its
+branch there; simulation, linearization and inverse dynamics use it. A new constant is a field of
+`FrictionConstants`, of `needle_dynamics.friction.Friction` and of `NeedleParameters`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.compiled.cache import compiled, inlined_kernel, kernel
 from needle_dynamics.compiled.oscillator import glide
 
-#: Laws by name; a law's number is its place here.
+#: Names of the laws; the index is the number of the law.
 FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
 
 COULOMB: Final = 0
@@ -29,15 +29,15 @@ class FrictionConstants(NamedTuple):
     Attributes
     ----------
     law : int
-        Number of the law, its place in `FRICTION_LAWS`.
+        Index of the law in `FRICTION_LAWS`.
     coulomb, viscous : float
         Coulomb friction mu_s [N] and viscous friction mu_v [N s/m].
     withdrawal : float
-        Friction on withdrawal over that on insertion.
+        Ratio of friction on withdrawal to friction on insertion.
     breakaway : float
-        Friction at rest over mu_s (``stribeck``).
+        Ratio of static friction to mu_s (``stribeck``).
     stribeck_speed, smoothing_speed : float
-        Speeds over which friction falls (``stribeck``) and turns (``tanh``) [m/s].
+        Speed scales of the decay (``stribeck``) and of the sign change (``tanh``) [m/s].
 
     """
 
@@ -53,27 +53,11 @@ class FrictionConstants(NamedTuple):
 @kernel
 def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[float, float]:
     """
-    Return dry friction at a speed: the definition of every law.
+    Return dry friction at a speed [N] and its derivative by the speed [N s/m], for every law.
 
-    The value at rest is what friction can hold. Where it is zero, the law is smooth: the needle
-    never sticks, and creeps.
-
-    Parameters
-    ----------
-    f : FrictionConstants
-        Constants.
-    coulomb : float
-        Coulomb friction in the direction of the motion [N].
-    speed : float
-        Modulus of the insertion velocity [m/s].
-
-    Returns
-    -------
-    level : float
-        Dry friction [N].
-    slope : float
-        Its derivative by the speed [N s/m].
-
+    ``coulomb`` is the Coulomb friction in the direction of motion [N]. The value at rest is the
+    static friction limit. Where it is zero, the law is smooth: the needle never sticks, and
+    creeps.
     """
     if f.law == STRIBECK:
         ratio = speed / f.stribeck_speed
@@ -88,22 +72,11 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
 @kernel
 def friction_force(f: FrictionConstants, velocity: float, drive: float) -> float:
     """
-    Return the friction force on the needle, equation (15) with the dry part of the law.
+    Return the friction force on the needle [N], positive against insertion.
 
-    Parameters
-    ----------
-    f : FrictionConstants
-        Constants.
-    velocity : float
-        Insertion velocity s_dot [m/s], positive into the tissue.
-    drive : float
-        Sum of the other forces [N], positive into the tissue; it decides at rest.
-
-    Returns
-    -------
-    float
-        Force [N], positive against insertion.
-
+    Equation (15) with the dry part of the law; ``velocity`` is s_dot [m/s]. At rest the force
+    balances ``drive``, the sum of the other forces [N], positive into the tissue, up to static
+    friction.
     """
     dry, _ = dry_friction(f, f.coulomb, abs(velocity))
     if velocity == 0.0:
@@ -125,30 +98,11 @@ def slide(
     breakaway: float = 1.0,
 ) -> tuple[float, float]:
     """
-    Exact flow of the insertion axis under a constant force and friction (15).
+    Exact flow of the insertion axis under a constant force [N] and friction (15) for a time t [s].
 
-    Parameters
-    ----------
-    u : float
-        Insertion velocity [m/s].
-    drive : float
-        Constant force [N], positive into the tissue.
-    mass, coulomb, viscous : float
-        Moving mass [kg], Coulomb friction [N], viscous friction [N s/m].
-    t : float
-        Duration [s].
-    withdrawal : float
-        Friction on withdrawal over that on insertion.
-    breakaway : float
-        Friction that rest can bear over Coulomb friction.
-
-    Returns
-    -------
-    velocity : float
-        Velocity after ``t`` [m/s]; exactly zero while stuck.
-    displacement : float
-        Distance moved [m].
-
+    ``withdrawal`` is the ratio of friction on withdrawal to friction on insertion, ``breakaway``
+    the ratio of static friction to Coulomb friction. Returns velocity [m/s], exactly zero while
+    stuck, and displacement [m].
     """
     distance = 0.0
     if u != 0.0:
@@ -160,7 +114,7 @@ def slide(
         if braking > 0.0:
             stop = abs(u) / braking
             if b * stop > 1e-16:
-                # Below, it is the same to rounding, and b may be too small to divide by.
+                # Below, equal to rounding, and b may be too small for the division.
                 stop = log1p(b * stop) / b
         if stop > t:
             return glide(u, -sign * braking, b, t)
@@ -180,33 +134,12 @@ def friction_flow(
     f: FrictionConstants, mass: float, u: float, drive: float, h: float
 ) -> tuple[float, float]:
     """
-    Move the insertion axis through a step under a constant force and any of the laws.
+    Return velocity [m/s] and displacement [m] of the insertion axis after a step, for every law.
 
-    Coulomb friction is exact. Other laws that hold at rest take the level of dry friction in the
+    Coulomb friction is exact. Other laws with static friction use the level of dry friction in the
     middle of the step, which is of second order. Smooth laws are stiff: they take two implicit
-    stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977), or one of
-    first order where those would give energy back or pass the steady velocity.
-
-    Parameters
-    ----------
-    f : FrictionConstants
-        Constants.
-    mass : float
-        Moving mass [kg].
-    u : float
-        Insertion velocity [m/s].
-    drive : float
-        Constant force [N], positive into the tissue.
-    h : float
-        Length of the step [s].
-
-    Returns
-    -------
-    velocity : float
-        Velocity after the step [m/s].
-    displacement : float
-        Distance moved [m].
-
+    stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977), or one stage of
+    first order where the two stages would add energy or overshoot the steady velocity.
     """
     if f.law == COULOMB:
         return slide(u, drive, mass, f.coulomb, f.viscous, h, f.withdrawal)
@@ -231,7 +164,7 @@ def friction_flow(
 @compiled
 def _implicit_stage(f: FrictionConstants, mass: float, u: float, drive: float, h: float) -> float:
     """Solve mass (w - u) = h (drive - friction(w)) for w under a smooth law."""
-    # The residual grows with w: Newton, kept inside a bracket that always holds the root.
+    # The residual grows with w: Newton iteration with a bracket around the root.
     inertia = mass / h
     reach = (abs(drive) + f.coulomb * max(1.0, f.withdrawal)) / inertia + abs(u)
     low, high = -reach, reach

@@ -1,7 +1,7 @@
 """
-Arguments that are kept as machine code has them.
+Arguments in the representation of machine code.
 
-At each call Numba converts every number and array of a named tuple: 6 us for fifty. What is held
+At each call Numba converts every number and array of a named tuple: 6 us for fifty. A held value
 is converted once. This file imports Numba: import it where it is first needed.
 """
 
@@ -21,25 +21,18 @@ class _HeldType(types.StructRef):  # type: ignore[misc, name-defined]
     """Numba's type of `Held`."""
 
     def preprocess_fields(self, fields: Any) -> Any:
-        """Take the general type of each field."""
+        """Return the fields with non-literal types."""
         return tuple((name, types.unliteral(kind)) for name, kind in fields)  # type: ignore[attr-defined]
 
 
 class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     """
-    A value that compiled functions take without converting it.
-
-    Its arrays are those of the value, not copies.
-
-    Parameters
-    ----------
-    value : tuple
-        Named tuple of numbers, arrays and named tuples.
+    A value that compiled functions take without conversion; its arrays are not copied.
 
     Attributes
     ----------
     value : tuple
-        The value; for compiled functions only.
+        Named tuple of numbers, arrays and named tuples; for compiled functions only.
 
     """
 
@@ -47,13 +40,12 @@ class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     _kept: _Value
 
     def __new__(cls, value: _Value) -> Held[_Value]:
-        """Convert the value."""
         held = _hold(value)
         held._kept = value
         return held
 
     def __reduce__(self) -> tuple[type[Held[_Value]], tuple[_Value]]:
-        """Let a copy, or one from a pickle, hold a copy of the value."""
+        """Pickle the value, which is converted again in the copy."""
         return Held, (self._kept,)
 
 
@@ -61,33 +53,12 @@ structref.define_proxy(Held, _HeldType, ['value'])
 
 
 def held_type(value: Any) -> Any:
-    """
-    Return Numba's type of a `Held` value.
-
-    Parameters
-    ----------
-    value : object
-        Numba's type of the value.
-
-    Returns
-    -------
-    object
-        The type.
-
-    """
+    """Return Numba's type of `Held` for Numba's type of the value."""
     return _HeldType([('value', value)])
 
 
 def prepare_hold(kind: Any) -> None:
-    """
-    Load or compile the conversion of a value to `Held`.
-
-    Parameters
-    ----------
-    kind : object
-        Numba's type; one that is not of a `Held` value needs no conversion.
-
-    """
+    """Load or compile the conversion to a `Held` type; other types need no conversion."""
     if isinstance(kind, _HeldType):
         _hold.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
 

@@ -1,9 +1,9 @@
 """
-The shape modes at the tip and their integrals over the inserted part.
+Shape modes at the tip and their integrals over the inserted part.
 
-Where the arguments k_i s are small, the closed forms of the integrals lose all their digits by
-cancellation; power series in s, held side by side in `ModeTables.series`, do not. The arguments of
-two modes are small enough at any s, so that one Horner pass gives all of them.
+Where the arguments k_i s are small, the closed forms of the integrals lose all digits by
+cancellation; power series in s, stored side by side in `ModeTables.series`, do not. The arguments
+of two modes are small enough at any s, so that a single Horner pass evaluates all series.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
 SERIES_END: Final = 2.0
 
-#: Resolution of `ModeTables.terms` in the relative inserted length.
+#: Resolution of `ModeTables.terms` in the relative insertion depth.
 TERMS_PER_LENGTH: Final = 32
 
 
 class ModeTables(NamedTuple):
     """
-    What the evaluation of n modes needs; made by `needle_dynamics.modes.ModeShapes.tables`.
+    Tables for the evaluation of n modes, from `needle_dynamics.modes.ModeShapes.tables`.
 
     Attributes
     ----------
@@ -32,10 +32,10 @@ class ModeTables(NamedTuple):
         Needle length l [m].
     series : ndarray, shape (terms, columns)
         Coefficients in powers of (s/l)^4. Columns: G and H of each pair i <= j (three powers of
-        s/l each), then phi, phi'', the integral of phi and that of y phi of each mode (two powers
+        s/l each), then phi, phi'' and the integrals of phi and y phi of each mode (two powers
         each).
     terms : ndarray, shape (l / s steps,)
-        Number of terms that two modes need, by relative inserted length in steps of
+        Number of series terms for two modes, by relative insertion depth in steps of
         1 / `TERMS_PER_LENGTH`.
     modes : ndarray, shape (4, n)
         Rows k_i l, mu_i, (mu_i - 1) exp(k_i l) and c_i of (11).
@@ -78,23 +78,11 @@ def mode_derivatives(
     x: float, ratio: float, rest: float, end: float
 ) -> tuple[float, float, float, float]:
     """
-    Return phi and its first three derivatives, over c_i k_i^order.
+    Return phi and its first three derivatives at x = k_i y, divided by c_i k_i^order.
 
-    The growing exponentials of (11) nearly cancel; ``rest`` is what is left of them at the tip of
-    a fully inserted needle, so that no mode is too high.
-
-    Parameters
-    ----------
-    x : float
-        Argument k_i y.
-    ratio, rest, end : float
-        mu_i, (mu_i - 1) exp(k_i l) and k_i l.
-
-    Returns
-    -------
-    tuple of float
-        Orders 0 to 3.
-
+    ``ratio``, ``rest`` and ``end`` are mu_i, (mu_i - 1) exp(k_i l) and k_i l. The growing
+    exponentials of (11) nearly cancel; ``rest`` is the remainder at the tip of a fully inserted
+    needle, so that high modes are accurate.
     """
     sine, cosine = sin(x), cos(x)
     grow = 0.5 * rest * exp(x - end)
@@ -109,21 +97,7 @@ def mode_derivatives(
 
 @inlined
 def two_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
-    """
-    Evaluate the series of two modes; parameters as in `mode_integrals`.
-
-    Parameters
-    ----------
-    tables : ModeTables
-        Tables of two modes.
-    depth : float
-        Inserted length s [m].
-    work : ndarray, shape (34,) or longer
-        Scratch.
-    out : ModeIntegrals
-        Overwritten.
-
-    """
+    """Evaluate the series of two modes; see `mode_integrals`."""
     table = tables.series
     xi = depth / tables.length
     square = xi * xi
@@ -154,23 +128,11 @@ def two_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInteg
 @compiled
 def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
     """
-    Evaluate any number of modes.
+    Evaluate any number of modes; see `mode_integrals`.
 
-    Pairs of modes with small arguments come from the series, which does not cancel there, the
-    others from the boundary values of the antiderivatives: the fourth derivative of a mode is
-    k^4 times the mode.
-
-    Parameters
-    ----------
-    tables : ModeTables
-        Tables of n modes.
-    depth : float
-        Inserted length s [m].
-    work : ndarray, shape (columns + 4 n,) or longer
-        Scratch.
-    out : ModeIntegrals
-        Overwritten.
-
+    Pairs of modes with small arguments use the series, which does not cancel there, other pairs
+    the boundary values of the antiderivatives: the fourth derivative of a mode is k^4 times the
+    mode.
     """
     length, modes, table = tables.length, tables.modes, tables.series
     n = modes.shape[1]
@@ -236,19 +198,9 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
 @inlined_kernel
 def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeIntegrals) -> None:
     """
-    Evaluate the modes and their integrals at an inserted length.
+    Evaluate the modes and their integrals at an insertion depth s [m] in the range of the tables.
 
-    Parameters
-    ----------
-    tables : ModeTables
-        Tables of n modes.
-    depth : float
-        Inserted length s [m], in the range of the tables.
-    work : ndarray, shape (columns + 4 n,)
-        Scratch.
-    out : ModeIntegrals
-        Overwritten.
-
+    ``work``, shape (columns + 4 n,), is scratch memory; ``out`` is overwritten.
     """
     if tables.modes.shape[1] == 2:
         two_modes(tables, depth, work, out)
@@ -259,20 +211,10 @@ def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeInte
 @kernel
 def tip_deflections(tables: ModeTables, states: Matrix) -> FloatArray:
     """
-    Return the deflection of the tip w(s) = phi(s) q for many states.
+    Return the deflections of the tip w(s) = phi(s) q [m], shape (k,), of k states.
 
-    Parameters
-    ----------
-    tables : ModeTables
-        Tables of n modes.
-    states : ndarray, shape (k, 2 (2 + n))
-        States with inserted lengths in the range of the tables, or NaN.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Deflections [m]; NaN where the state is NaN.
-
+    States have shape (k, 2 (2 + n)), with depths in the range of the tables; a NaN state gives
+    NaN.
     """
     n = tables.modes.shape[1]
     grids, rows = np.empty((2, n, n)), np.empty((4, n))

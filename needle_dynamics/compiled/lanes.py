@@ -1,18 +1,17 @@
 r"""
-Many needles at once, in the lanes of the processor's vector registers.
+Simulation of many needles in parallel, in the lanes of the processor's vector registers.
 
-The step is that of `needle_dynamics.compiled.step`, for two modes in homogeneous tissue under
-Coulomb friction. Every loop over lanes is without calls and branches, so that the compiler takes
-several lanes with one instruction; what seldom happens (the motion stops, an interval ends) is
-done lane by lane. No lane knows of another: which needles share a register, and how many they
-are, changes no bit.
+The step equals `needle_dynamics.compiled.step` for two modes in homogeneous tissue under Coulomb
+friction. Loops over lanes have no calls and branches, so that the compiler can vectorize them;
+rare events (the motion stops, an interval ends) are handled lane by lane. Lanes are independent:
+results do not depend, to the bit, on the number and the order of the needles.
 
-Modes scale with the length of the needle: with those of a needle of length 1,
+Modes scale with the length of the needle: with the modes of a needle of length 1 (index 1),
 
 .. math:: G(s) = G_1(\xi), \quad H(s) = H_1(\xi) / l^4, \quad \phi(s) = \phi_1(\xi) / \sqrt l,
    \quad \phi''(s) = \phi_1''(\xi) / l^{5/2}, \quad \xi = s / l,
 
-so that one table serves all.
+and a single table is enough for all needles.
 """
 
 from __future__ import annotations
@@ -27,35 +26,35 @@ from needle_dynamics.compiled.modal_flow import normal_pair, turn_pair
 from needle_dynamics.compiled.step import GRADED_FROM
 import numpy as np
 
-#: Lanes that are taken through a step together: their rows stay in the fastest cache.
+#: Number of lanes per step: their rows fit into the first-level cache.
 LANES: Final = 32
 
 #: Columns of `ModeTables.series` for G, H, phi and phi'' of two modes.
 COLUMNS: Final = 26
 
-# Where each row of the lanes begins. First the constants.
+# Offset of each row of the lanes. First the constants.
 (
     _LENGTH, _DENSITY, _BENDING, _STIFFNESS, _DAMPING, _MASS, _COULOMB, _VISCOUS, _WITHDRAWAL,
     _LOW, _HIGH, _STOP, _INERTIA,
-    # Motion, modes, and what is left of the interval.
+    # Motion, modes, and time left of the interval.
     _S, _U, _A, _Q1, _Q2, _Z1, _Z2, _FORCE, _LEFT,
-    # One step: its length, what is left then, depth in its middle (over the length, and that to
-    # the fourth), whether that is in range, and the impulse of the modes.
+    # One step: its length, time left after it, relative depth in its middle and fourth power of
+    # this depth, whether the depth is in range, and the impulse of the modes.
     _H, _REST, _XI, _XI4, _INSIDE, _IMPULSE,
-    # What it leads to.
+    # Result of the step.
     _NEW_Q1, _NEW_Q2, _NEW_Z1, _NEW_Z2, _NEW_U, _TRAVEL, _STOPS,
-    # The series of the modes.
+    # Series of the modes.
     _SERIES,
 ) = range(0, 36 * LANES, LANES)  # fmt: skip
 
-#: Rows that go with a needle from lane to lane.
+#: Number of rows that move with a needle between lanes.
 _KEPT: Final = _H // LANES
 _ROWS: Final = _SERIES // LANES + COLUMNS
 
-#: Added and subtracted, it rounds to a whole number.
+#: Adding and subtracting this number rounds to an integer.
 _ROUND: Final = 1.5 * 2.0**52
 
-#: Half of pi in three parts; whole multiples of the first two are exact.
+#: pi / 2 as a sum of three parts; integer multiples of the first two are exact.
 _HALF_PI: Final = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
 _TURN: Final = 2.0 / pi
 
@@ -65,7 +64,7 @@ _TURN: Final = 2.0 / pi
     _F19,
 ) = (1.0 / factorial(k) for k in range(2, 20))  # fmt: skip
 
-#: exp(-x) is nothing beside 1 from here on.
+#: Exponent above which exp(-x) is negligible against 1.
 _DECAYED: Final = 40.0
 
 
@@ -76,11 +75,11 @@ class Constants(NamedTuple):
     Attributes
     ----------
     lowest, highest : float
-        Range of the inserted length [m].
+        Range of the insertion depth [m].
     stop : float
-        Inserted length at which the hub stops, or infinity [m].
+        Insertion depth at which the hub stops, or infinity [m].
 
-    The others are those of `needle_dynamics.parameters.NeedleParameters`.
+    Other fields: see `needle_dynamics.parameters.NeedleParameters`.
 
     """
 
@@ -101,7 +100,7 @@ class Constants(NamedTuple):
 
 class Course(NamedTuple):
     """
-    What happens to the needles of a batch.
+    Inputs and steps of a batch.
 
     Attributes
     ----------
@@ -112,7 +111,7 @@ class Course(NamedTuple):
     interval, longest : float
         Length of an interval and of the longest step [s].
     graded : bool
-        Let steps grow with the inserted length, as `Integrator` does.
+        Let steps grow with the insertion depth, as in `Integrator`.
 
     """
 
@@ -126,7 +125,7 @@ class Course(NamedTuple):
 
 @inlined
 def _sine_cosine(x: float) -> tuple[float, float]:
-    """Return sine and cosine."""
+    """Return sine and cosine of an angle [rad] without branches."""
     turns = (x * _TURN + _ROUND) - _ROUND
     r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     y = r * r
@@ -140,7 +139,7 @@ def _sine_cosine(x: float) -> tuple[float, float]:
     odd = abs(quarter) == 1.0
     one = cosine if odd else sine
     two = sine if odd else cosine
-    # Quarters are -2 to 2.
+    # ``quarter`` is -2 to 2.
     first = -one if quarter == -1.0 or abs(quarter) == 2.0 else one
     second = -two if quarter == 1.0 or abs(quarter) == 2.0 else two
     return first, second
@@ -148,7 +147,7 @@ def _sine_cosine(x: float) -> tuple[float, float]:
 
 @inlined
 def _decay_means(x: float) -> tuple[float, float]:
-    """Return what `oscillator.decay_means` does: for a part of x, doubled five times."""
+    """Return `oscillator.decay_means` without branches: series of x / 32, doubled five times."""
     z = -min(x, _DECAYED) / 32.0
     ramp = _F14 + z * (_F15 + z * (_F16 + z * (_F17 + z * (_F18 + z * _F19))))
     ramp = _F8 + z * (_F9 + z * (_F10 + z * (_F11 + z * (_F12 + z * (_F13 + z * ramp)))))
@@ -164,7 +163,7 @@ def _decay_means(x: float) -> tuple[float, float]:
 
 @compiled
 def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
-    """Choose the step of each lane, and find the depth in its middle."""
+    """Compute the step of each lane and the depth in its middle."""
     sixth = grade / 6.0
     for i in range(n):
         s, u, left, length = w[_S + i], w[_U + i], w[_LEFT + i], w[_LENGTH + i]
@@ -186,7 +185,7 @@ def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
 
 @compiled
 def _modes(w: FloatArray, n: int, table: FloatArray) -> None:
-    """Sum the series of the modes: a first term, and four more at a time."""
+    """Evaluate the series of the modes: a first term, and four more at a time."""
     last = table.shape[0] - 1
     for j in range(COLUMNS):
         row, top = _SERIES + j * LANES, table[last, j]
@@ -201,21 +200,21 @@ def _modes(w: FloatArray, n: int, table: FloatArray) -> None:
 
 @inlined
 def _powers(w: FloatArray, column: int, i: int, xi: float) -> float:
-    """Return a sum of three columns in powers of xi."""
+    """Evaluate a polynomial of three columns in xi."""
     at = _SERIES + column * LANES + i
     return float(w[at] + xi * w[at + LANES] + xi * xi * w[at + 2 * LANES])
 
 
 @inlined
 def _line(w: FloatArray, column: int, i: int, xi: float) -> float:
-    """Return a sum of two columns in powers of xi."""
+    """Evaluate a polynomial of two columns in xi."""
     at = _SERIES + column * LANES + i
     return float(w[at] + xi * w[at + LANES])
 
 
 @compiled
 def _rotate(w: FloatArray, n: int) -> None:
-    """Take the deflections through the step, as `modal_flow.rotate_two` does."""
+    """Advance the deflections through the step, as `modal_flow.rotate_two`."""
     for i in range(n):
         h, xi, rho = w[_H + i], w[_XI + i], w[_DENSITY + i]
         ka, length = w[_STIFFNESS + i], w[_LENGTH + i]
@@ -254,7 +253,7 @@ def _rotate(w: FloatArray, n: int) -> None:
 
 @compiled
 def _move(w: FloatArray, n: int) -> None:
-    """Move the insertion axis, as `friction.slide` does where the motion does not stop."""
+    """Move the insertion axis, as `friction.slide` where the motion does not stop."""
     for i in range(n):
         h, u, mass = w[_H + i], w[_U + i], w[_MASS + i]
         sign, factor = (1.0, 1.0) if u > 0.0 else (-1.0, w[_WITHDRAWAL + i])
@@ -277,7 +276,7 @@ def _move(w: FloatArray, n: int) -> None:
 
 @compiled
 def _end(w: FloatArray, n: int) -> None:
-    """End the step of each lane, or leave the lane where it was if it leaves its range."""
+    """End the step of each lane; a lane that would leave its range keeps its state."""
     for i in range(n):
         depth, speed = w[_S + i] + w[_TRAVEL + i], w[_NEW_U + i]
         stopped = depth >= w[_STOP + i]
@@ -312,7 +311,7 @@ def _gram(table: FloatArray, xi: float) -> tuple[float, float, float]:
 def _load(
     w: FloatArray, i: int, constants: FloatArray, state: FloatArray, table: FloatArray
 ) -> None:
-    """Put a needle into a lane."""
+    """Load a needle into a lane."""
     for k in range(len(constants)):
         w[k * LANES + i] = constants[k]
     length, rho = constants[0], constants[1]
@@ -326,11 +325,11 @@ def _load(
 
 @compiled
 def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
-    """Write the state of a lane, but for the angle and its rate."""
+    """Write the state of a lane, without the angle and its rate."""
     length, rho = w[_LENGTH + i], w[_DENSITY + i]
     g11, g12, g22 = _gram(table, w[_S + i] / length)
     z1, z2 = w[_Z1 + i], w[_Z2 + i]
-    # By Cholesky, as `advance` has it: G is nearly singular in shallow depths.
+    # By Cholesky, as in `advance`: G is nearly singular at small depths.
     l11 = sqrt(rho * g11)
     l21 = rho * g12 / l11
     l22 = sqrt(rho * g22 - l21 * l21)
@@ -351,24 +350,24 @@ def run(
     completed: Vector,
 ) -> None:
     """
-    Take needles through intervals of constant inputs.
+    Advance needles through intervals of constant inputs.
 
     Parameters
     ----------
     needles : ndarray, shape (all or 1, 13)
-        `Constants` of each run, or of all.
+        `Constants` of each run, or of all runs.
     table : ndarray, shape (1 + 4 m, 26)
         First columns of the series of two modes of length 1.
     course : Course
         Inputs and steps.
     runs : ndarray of int
-        Which of all runs to take.
+        Indices of the runs to compute.
     states : ndarray, shape (all, 8)
-        Initial states; overwritten with those at the end of the last interval of each.
+        Initial states; overwritten with the states at the end of the last interval.
     kept : ndarray, shape (all, count + 1, 8) or (all, 1, 8)
-        Filled with the states at the ends of the intervals; with one row it is left alone.
+        Output: states at the ends of the intervals; unused with one row.
     completed : ndarray, shape (all,)
-        Overwritten with the number of intervals that each has completed.
+        Output: number of completed intervals of each run.
 
     """
     w = np.zeros(_ROWS * LANES)
@@ -394,7 +393,7 @@ def run(
         _rotate(w, n)
         _move(w, n)
         _end(w, n)
-        # Backwards: a lane that ends is filled with the last one, which has been looked at.
+        # Backwards: a lane that ends is filled with the last lane, which is already checked.
         for i in range(n - 1, -1, -1):
             goes_on = w[_INSIDE + i] != 0.0
             if goes_on and w[_LEFT + i] == 0.0:
@@ -418,7 +417,7 @@ def _next(
     states: FloatArray,
     kept: FloatArray,
 ) -> bool:
-    """End the interval of a lane, and return whether it goes on with the next one."""
+    """End the interval of a lane; return whether the lane continues with the next interval."""
     state, time = states[which], course.interval
     turn = 2.0 / w[_INERTIA + i] * _input(course.torques, which, at[i])
     angle, rate = state[1], state[5]
@@ -441,6 +440,6 @@ def _next(
 
 @inlined
 def _input(values: FloatArray, which: int, k: int) -> float:
-    """Return an input of a run in an interval, where one value may stand for all."""
+    """Return the input of a run in an interval; arrays of length one apply to all."""
     first, second = values.shape
     return float(values[which if first > 1 else 0, k if second > 1 else 0])

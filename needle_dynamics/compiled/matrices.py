@@ -10,17 +10,7 @@ from needle_dynamics.compiled.cache import compiled
 
 @compiled
 def copy(matrix: FloatArray, to: FloatArray) -> None:
-    """
-    Copy a matrix: an assignment to a slice would compile its error message, too.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, m)
-        The matrix.
-    to : ndarray, shape (n, m)
-        Overwritten.
-
-    """
+    """Copy a matrix, shape (n, m), in loops: a slice assignment would compile an error message."""
     for i in range(matrix.shape[0]):
         for j in range(matrix.shape[1]):
             to[i, j] = matrix[i, j]
@@ -29,15 +19,10 @@ def copy(matrix: FloatArray, to: FloatArray) -> None:
 @compiled
 def cholesky(matrix: FloatArray, factor: FloatArray) -> None:
     """
-    Write the lower Cholesky factor L of a matrix, L L^T.
+    Write the lower Cholesky factor L of a symmetric positive definite matrix, shape (n, n).
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-        Symmetric and positive definite. Only the upper triangle is read.
-    factor : ndarray, shape (n, n)
-        The lower triangle is overwritten with L, the rest is left alone.
-
+    Only the upper triangle of the matrix is read and only the lower triangle of ``factor``
+    written.
     """
     n = matrix.shape[0]
     for j in range(n):
@@ -50,17 +35,7 @@ def cholesky(matrix: FloatArray, factor: FloatArray) -> None:
 
 @compiled
 def forward(factor: FloatArray, x: FloatArray) -> None:
-    """
-    Replace x by the solution y of L y = x.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (n, n)
-        Lower triangular L, as from `cholesky`.
-    x : ndarray, shape (n,)
-        Right-hand side; overwritten.
-
-    """
+    """Replace x, shape (n,), by the solution y of L y = x."""
     for i in range(x.shape[0]):
         value = x[i]
         for k in range(i):
@@ -70,17 +45,7 @@ def forward(factor: FloatArray, x: FloatArray) -> None:
 
 @compiled
 def backward(factor: FloatArray, x: FloatArray) -> None:
-    """
-    Replace x by the solution y of L^T y = x.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (n, n)
-        Lower triangular L, as from `cholesky`.
-    x : ndarray, shape (n,)
-        Right-hand side; overwritten.
-
-    """
+    """Replace x, shape (n,), by the solution y of L^T y = x."""
     for i in range(x.shape[0] - 1, -1, -1):
         value = x[i]
         for k in range(i + 1, x.shape[0]):
@@ -91,19 +56,11 @@ def backward(factor: FloatArray, x: FloatArray) -> None:
 @compiled
 def diagonalize(matrix: FloatArray, vectors: FloatArray) -> None:
     """
-    Find eigenvalues and eigenvectors by Jacobi rotations.
+    Compute eigenvalues and eigenvectors of a symmetric positive definite matrix.
 
-    They keep the relative accuracy of small eigenvalues, and are faster than LAPACK for a few
-    rows.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-        Symmetric and positive definite. Overwritten: its diagonal takes the eigenvalues,
-        ascending, and what is beside it is rounding.
-    vectors : ndarray, shape (n, n)
-        Overwritten with the orthonormal eigenvectors as columns.
-
+    Jacobi rotations keep the relative accuracy of small eigenvalues, and are faster than LAPACK
+    for a few rows. The diagonal of the matrix is overwritten with the eigenvalues, ascending, the
+    columns of ``vectors`` with the orthonormal eigenvectors.
     """
     n = matrix.shape[0]
     for i in range(n):
@@ -125,7 +82,7 @@ def diagonalize(matrix: FloatArray, vectors: FloatArray) -> None:
 
 @compiled
 def _sort(matrix: FloatArray, vectors: FloatArray) -> None:
-    """Bring the diagonal and the columns that belong to it into ascending order."""
+    """Sort the diagonal and the columns of the vectors in ascending order."""
     n = matrix.shape[0]
     for i in range(n):
         least = i
@@ -140,7 +97,7 @@ def _sort(matrix: FloatArray, vectors: FloatArray) -> None:
 
 @compiled
 def _rotate(matrix: FloatArray, vectors: FloatArray, i: int, j: int) -> None:
-    """Make the entry (i, j) of a symmetric matrix zero by a rotation, and turn the vectors."""
+    """Zero the entry (i, j) of a symmetric matrix by a rotation, and rotate the vectors."""
     n = matrix.shape[0]
     tau = (matrix[j, j] - matrix[i, i]) / (2.0 * matrix[i, j])
     t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))

@@ -2,9 +2,8 @@
 Exact flow of the deflections at a frozen depth, between two half steps of tissue damping.
 
 At frozen depth the undamped modal part is linear: it rotates in the normal modes of the inserted
-part. With the momenta p = rho A G q_dot as variables the terms of dG/dt need no step of their own.
-What the rotation exerts on the insertion axis, and what sensors see of it, are integrals over it
-in closed form.
+part. With the momenta p = rho A G q_dot as variables, dG/dt needs no separate step. The force of
+the modes on the insertion axis and the sensor loads are closed-form integrals over the rotation.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ import numpy as np
 
 class Elasticity(NamedTuple):
     """
-    Needle and tissue over one step.
+    Needle and tissue constants of one step.
 
     Attributes
     ----------
@@ -31,15 +30,15 @@ class Elasticity(NamedTuple):
     damping : float
         Tissue damping c_a per length [N s/m^2].
     as_printed : bool
-        Formulation `as_printed`: z are the rates, and the axis feels nothing of the modes.
+        Formulation `as_printed`: z are the rates, and the modes exert no force on the axis.
     layer : int
-        Layer that holds the tip.
+        Index of the layer that contains the tip.
     stiffness : float
         Stiffness of the tissue at the tip [N/m^2].
     growth : float
-        Factor by which the tissue has grown stiffer by swelling.
+        Stiffness factor of swelling.
     decay : float
-        Part of the rates that half a step of damping leaves.
+        Factor of the rates over half a step of damping.
 
     """
 
@@ -80,14 +79,14 @@ class Rotated(NamedTuple):
 
 class NormalPair(NamedTuple):
     """
-    Normal modes of two shape modes, and the way to their coordinates and back.
+    Normal modes of two shape modes, with the transformation of coordinates.
 
     Attributes
     ----------
     l11, l21, l22 : float
         Cholesky factor L of the modal mass rho A G.
     i11, i22 : float
-        One over its diagonal.
+        Reciprocals of the diagonal of L.
     cosine, sine : float
         Rotation that diagonalizes the stiffness in the coordinates y = L^T q.
     square1, square2, omega1, omega2 : float
@@ -110,14 +109,14 @@ class NormalPair(NamedTuple):
 
 class Turn(NamedTuple):
     """
-    What two normal modes do along a rotation.
+    Rotation of two normal modes through one step: end values and integrals.
 
     Attributes
     ----------
     y1, y2, v1, v2 : float
-        Coordinates y = L^T q at its end, and their rates after another half step of damping.
+        Coordinates y = L^T q at the end, and their rates after the second half step of damping.
     b1, b2, f1, f2 : float
-        Rates of the normal modes at the begin and at the end, between the two of damping.
+        Rates of the normal modes at the start and the end of the undamped rotation.
     n1, n2 : float
         Values of the normal modes at the tip.
     impulse : float
@@ -145,24 +144,7 @@ class Turn(NamedTuple):
 def normal_pair(
     rho: float, g11: float, g12: float, g22: float, k11: float, k12: float, k22: float
 ) -> NormalPair:
-    """
-    Find the normal modes of two shape modes: one Jacobi rotation is exact.
-
-    Parameters
-    ----------
-    rho : float
-        Mass per length rho A [kg/m].
-    g11, g12, g22 : float
-        G at the frozen depth [1].
-    k11, k12, k22 : float
-        Modal stiffness there [N/m].
-
-    Returns
-    -------
-    NormalPair
-        The normal modes.
-
-    """
+    """Compute the normal modes of G [1] and stiffness k [N/m] by one exact Jacobi rotation."""
     l11 = sqrt(rho * g11)
     l21 = rho * g12 / l11
     l22 = sqrt(rho * g22 - l21 * l21)
@@ -199,31 +181,11 @@ def turn_pair(
     h: float,
 ) -> Turn:
     """
-    Take two normal modes through a step, between two half steps of damping.
+    Rotate two normal modes through a step of h [s], between two half steps of damping.
 
-    Parameters
-    ----------
-    m : NormalPair
-        The normal modes.
-    rho, ei, ka : float
-        Mass per length [kg/m], bending stiffness [N m^2], and stiffness of the tissue at the tip
-        [N/m^2].
-    value, curvature : tuple of float
-        Values and curvatures of the shape modes at the tip.
-    y, v : tuple of float
-        Coordinates L^T q and their rates.
-    decay : float
-        Part of the rates that half a step of damping leaves.
-    first, second : tuple of float
-        Sine and cosine of the angle through which each normal mode turns.
-    h : float
-        Length of the step [s].
-
-    Returns
-    -------
-    Turn
-        Where they are then, and what they did.
-
+    ``y`` and ``v`` are L^T q and its rate, ``value`` and ``curvature`` the shape modes at the tip,
+    ``decay`` the factor of the rates over half a step of damping, ``first`` and ``second`` the
+    sine and cosine of the rotation angle of each normal mode.
     """
     cj, sj, square1, square2 = m.cosine, m.sine, m.square1, m.square2
     a1 = cj * y[0] - sj * y[1]
@@ -235,7 +197,7 @@ def turn_pair(
     b1 *= decay
     b2 *= decay
 
-    # Their values at the end.
+    # Values at the end.
     sin1, cos1 = first
     sin2, cos2 = second
     e1 = a1 * cos1 + b1 * sin1 / m.omega1
@@ -292,26 +254,9 @@ def rotate_two(
     h: float,
 ) -> Rotated:
     """
-    Do what `rotate_many` does for two modes, five times as fast: one Jacobi rotation is exact.
+    Advance the deflections q and momenta z of two modes through a step of h [s], in place.
 
-    Parameters
-    ----------
-    e : Elasticity
-        Needle and tissue.
-    layers : Layers
-        Layers of tissue.
-    at : ModeIntegrals
-        Two modes and their integrals at the frozen depth.
-    q, z : ndarray, shape (2,)
-        Deflections and momenta (rates as printed); overwritten.
-    h : float
-        Length of the step [s].
-
-    Returns
-    -------
-    Rotated
-        Integrals over the step.
-
+    Same result as `rotate_many`, five times as fast: one Jacobi rotation is exact.
     """
     rho, ei, ka, layer = e.density, e.bending, e.stiffness, e.layer
     growth = e.growth
@@ -349,7 +294,7 @@ def rotate_two(
     q[0] = (turned.y1 - m.l21 * q[1]) * m.i11
     moved1 = e.damping * (q[0] - q1)
     moved2 = e.damping * (q[1] - q2)
-    # The tissue holds the needle by the integral of k w, and damps it by that of c_a w_dot.
+    # Reaction of the tissue: integrals of the elastic load k w and the damping load c_a w_dot.
     reaction = (
         (ka * at.area[0] + growth * layers.area[layer, 0]) * mean1
         + (ka * at.area[1] + growth * layers.area[layer, 1]) * mean2
@@ -379,28 +324,7 @@ def rotate_many(
     z: FloatArray,
     h: float,
 ) -> Rotated:
-    """
-    Take the deflections of any number of modes through a step, in place.
-
-    Parameters
-    ----------
-    e : Elasticity
-        Needle and tissue.
-    layers : Layers
-        Layers of tissue.
-    at : ModeIntegrals
-        Modes and their integrals at the frozen depth.
-    q, z : ndarray, shape (n,)
-        Deflections and momenta (rates as printed); overwritten.
-    h : float
-        Length of the step [s].
-
-    Returns
-    -------
-    Rotated
-        Integrals over the step.
-
-    """
+    """Advance the deflections q and momenta z (rates if as printed) through h [s], in place."""
     n = q.shape[0]
     modes, rows, stiffness = empty_normal_modes(n), np.zeros((7, n)), np.empty((n, n))
     shapes, inverse, squares = modes.shapes, modes.inverse, modes.squares
@@ -448,12 +372,12 @@ def rotate_many(
 
 @compiled
 def _impulse(e: Elasticity, squares: FloatArray, rows: FloatArray, h: float) -> float:
-    """Return the impulse of the modes on the insertion axis from both ends of a rotation."""
+    """Compute the impulse of the modes on the axis [N s] from both ends of a rotation."""
     a, b, ends, rates, value, curvature = rows[0], rows[1], rows[2], rows[3], rows[5], rows[6]
     impulse = 0.0
     for i in range(squares.shape[0]):
         for j in range(i, squares.shape[0]):
-            # Integrals of a_i a_j and b_i b_j; those of unlike modes stand for both orders.
+            # Integrals of a_i a_j and b_i b_j; i < j counts for both orders.
             if i == j:
                 twice = (b[i] * b[i] + squares[i] * a[i] * a[i]) * h
                 change = ends[i] * rates[i] - a[i] * b[i]

@@ -24,8 +24,8 @@ class NormalModes(NamedTuple):
     Attributes
     ----------
     shapes : ndarray, shape (n, n)
-        N, one mode per column [kg^-1/2 m^1/2]: q = N a. Generalized forces and
-        values at the tip go the other way: N^T Q and N^T phi belong to a.
+        N, one mode per column [kg^-1/2 m^1/2]: q = N a. Generalized forces and values at the
+        tip transform with N^T: N^T Q and N^T phi.
     inverse : ndarray, shape (n, n)
         N^-1: a = N^-1 q. Momenta are p = N^-T a_dot.
     squares : ndarray, shape (n,)
@@ -40,20 +40,7 @@ class NormalModes(NamedTuple):
 
 @compiled
 def empty_normal_modes(n: int) -> NormalModes:
-    """
-    Return arrays for the normal modes of a needle with n modes.
-
-    Parameters
-    ----------
-    n : int
-        Number of modes.
-
-    Returns
-    -------
-    NormalModes
-        Arrays of zeros.
-
-    """
+    """Return arrays of zeros for n normal modes."""
     return NormalModes(np.zeros((n, n)), np.zeros((n, n)), np.zeros(n))
 
 
@@ -68,25 +55,11 @@ def modal_stiffness(
     out: FloatArray,
 ) -> None:
     """
-    Write the modal stiffness of needle and tissue, E I_y H plus the integral of k phi phi^T.
+    Compute the modal stiffness of needle and tissue, E I_y H plus the integral of k phi phi^T.
 
-    Parameters
-    ----------
-    bending : float
-        Bending stiffness E I_y [N m^2].
-    at : ModeIntegrals
-        Modes and their integrals at the inserted length.
-    stiffness : float
-        Stiffness of the tissue at the tip, grown by swelling [N/m^2].
-    growth : float
-        Factor by which the tissue has grown stiffer by swelling.
-    layers : Layers
-        Layers of tissue.
-    layer : int
-        Layer that holds the tip.
-    out : ndarray, shape (n, n)
-        Overwritten [N/m for modal coordinates in m^3/2].
-
+    ``stiffness`` is the tissue stiffness at the tip including swelling [N/m^2], ``growth`` the
+    stiffness factor of swelling, ``layer`` the layer of the tip; ``out``, shape (n, n), is in N/m
+    for modal coordinates in m^3/2.
     """
     n = out.shape[0]
     for i in range(n):
@@ -99,23 +72,9 @@ def modal_stiffness(
 def normal_modes(
     density: float, at: ModeIntegrals, stiffness: FloatArray, modes: NormalModes
 ) -> None:
-    """
-    Find the normal modes of the pair (stiffness, rho A G).
-
-    Parameters
-    ----------
-    density : float
-        Mass per length rho A [kg/m].
-    at : ModeIntegrals
-        Modes and their integrals at the inserted length.
-    stiffness : ndarray, shape (n, n)
-        Modal stiffness, as from `modal_stiffness`; destroyed.
-    modes : NormalModes
-        Overwritten.
-
-    """
+    """Compute the normal modes of the pair (stiffness, rho A G); ``stiffness`` is destroyed."""
     n = stiffness.shape[0]
-    # The Cholesky factor takes the place of the mass, and that of the inverse until the end.
+    # The Cholesky factor overwrites the mass, in the memory of the inverse.
     factor = modes.inverse
     for i in range(n):
         for j in range(n):
@@ -147,22 +106,9 @@ def coupling(
     density: float, bending: float, stiffness: float, bend: float, tip: float, rate: float
 ) -> float:
     """
-    Return the force of the bent needle against insertion, the row of d of N in (13) with its sign.
+    Return the force of the bent needle against insertion -N_d [N], the row of d of N in (13).
 
-    Parameters
-    ----------
-    density, bending : float
-        Mass per length rho A [kg/m] and bending stiffness E I_y [N m^2].
-    stiffness : float
-        Stiffness of the tissue at the tip [N/m^2].
-    bend, tip, rate : float
-        Curvature at the tip phi''(s) q [1/m], deflection of the tip phi(s) q [m] and
-        phi(s) q_dot [m/s].
-
-    Returns
-    -------
-    float
-        -N_d [N]: half of E I_y w''^2 + k w^2 - rho A (phi q_dot)^2.
-
+    Half of E I_y w''^2 + k w^2 - rho A (phi q_dot)^2, with ``bend`` = phi''(s) q [1/m], ``tip`` =
+    phi(s) q [m], ``rate`` = phi(s) q_dot [m/s] and the tissue stiffness at the tip [N/m^2].
     """
     return 0.5 * (bending * bend * bend + stiffness * tip * tip - density * rate * rate)

@@ -1,4 +1,4 @@
-"""The damped oscillator, and the first-order lag under a constant force; both exact."""
+"""Damped oscillator, and first-order lag under a constant force; both exact."""
 
 from __future__ import annotations
 
@@ -10,23 +10,11 @@ from needle_dynamics.compiled.cache import compiled, kernel
 @compiled
 def swing(damping: float, square: float, t: float) -> tuple[float, float, float, float]:
     """
-    Solve x_ddot + damping x_dot + square x = 0 for a time t, exactly.
+    Solve x_ddot + damping x_dot + square x = 0 for a time t [s], exactly.
 
-    Parameters
-    ----------
-    damping : float
-        Damping [1/s], not negative.
-    square : float
-        Square of the undamped natural frequency [1/s^2], positive.
-    t : float
-        Time [s].
-
-    Returns
-    -------
-    pp, pv, vp, vv : float
-        Response to the position x and velocity v before: the position after t is pp x + pv v and
-        the velocity vp x + vv v; pp and vv [1], pv [s], vp [1/s].
-
+    ``damping`` [1/s] is not negative; ``square`` [1/s^2], the squared undamped frequency, is
+    positive. Returns pp, pv [s], vp [1/s], vv: the position after t is pp x + pv v, the velocity
+    vp x + vv v.
     """
     half = 0.5 * damping
     apart = square - half * half
@@ -36,7 +24,7 @@ def swing(damping: float, square: float, t: float) -> tuple[float, float, float,
         pv = fall * (sin(w * t) / w if w > 0.0 else t)
         pp = fall * cos(w * t) + half * pv
         return pp, pv, -square * pv, pp - damping * pv
-    # Two real poles, the slow one in a form that does not cancel.
+    # Two real poles, the slow pole in a form without cancellation.
     r = sqrt(-apart)
     fast = -(half + r)
     slow = square / fast
@@ -47,20 +35,10 @@ def swing(damping: float, square: float, t: float) -> tuple[float, float, float,
 @kernel
 def decay_means(x: float) -> tuple[float, float]:
     """
-    Return the means of an exponential decay, without cancellation at small x.
+    Return the means of an exponential decay with exponent x >= 0, without cancellation at small x.
 
-    Parameters
-    ----------
-    x : float
-        Exponent of the decay over the whole time, not negative.
-
-    Returns
-    -------
-    mean : float
-        Mean of exp(-x r) over r in [0, 1], (1 - exp(-x)) / x.
-    ramp : float
-        Integral over r in [0, 1] of that mean over [0, r] times r, (x - 1 + exp(-x)) / x^2.
-
+    The mean of exp(-x r) over r in [0, 1], (1 - exp(-x)) / x, and the integral over r in [0, 1] of
+    the mean over [0, r] times r, (x - 1 + exp(-x)) / x^2.
     """
     if x < 1e-4:
         # Taylor: the next terms are below 1e-13.
@@ -71,28 +49,7 @@ def decay_means(x: float) -> tuple[float, float]:
 
 @compiled
 def glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
-    """
-    Solve u_dot = a - b u for a time t, exactly.
-
-    Parameters
-    ----------
-    u : float
-        Velocity [m/s].
-    a : float
-        Constant acceleration [m/s^2].
-    b : float
-        Damping [1/s], not negative.
-    t : float
-        Time [s].
-
-    Returns
-    -------
-    velocity : float
-        Velocity after t [m/s].
-    displacement : float
-        Distance moved [m].
-
-    """
+    """Solve u_dot = a - b u for a time t [s], exactly; return velocity and displacement."""
     x = b * t
     mean, ramp = decay_means(x)
     return u * (1.0 - x * mean) + a * t * mean, t * (u * mean + a * t * ramp)

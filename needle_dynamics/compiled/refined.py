@@ -1,10 +1,10 @@
 """
-A run of intervals whose steps follow the vibration of the needle.
+Sequences of intervals with steps adapted to the vibration of the needle.
 
-What a step neglects is in how modes and insertion axis act on each other within it: it matters
-in proportion to the frequency and while the needle vibrates. So steps are a part of the period
-of the slowest mode, which grows as the square of the inserted length, and become longer as the
-vibration fades. How good that is shows in a second run, whose steps are half as long everywhere.
+The error of a step is the neglected coupling between modes and insertion axis within it: it grows
+with the frequency and the amplitude of the vibration. Steps are therefore a fraction of the period
+of the slowest mode, which grows as the square of the insertion depth, and become longer as the
+vibration decays. A second run with steps of half the length everywhere gives the error.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals
 from needle_dynamics.compiled.step import advance, Inputs, Needle
 import numpy as np
 
-#: Step while the needle vibrates most, as a part of the slowest mode's period over 2 pi.
+#: Step at the largest vibration, as a fraction of the slowest mode's period over 2 pi.
 SHARE: Final = 0.25
 
-#: Steps after which their length is chosen anew.
+#: Number of steps between updates of the step length.
 _BLOCK: Final = 32
 
-#: Most steps of an interval: nobody waits for them.
+#: Largest number of steps of an interval.
 _MOST: Final = 1e12
 
 
@@ -39,32 +39,14 @@ def run_refined(
     steps: Vector,
 ) -> tuple[int, float]:
     """
-    Advance a state through intervals of constant force, in place.
+    Advance a state through k intervals of constant force, in place.
 
-    Parameters
-    ----------
-    c : Needle
-        The needle.
-    state : ndarray, shape (2 (2 + n),)
-        State; overwritten.
-    forces : ndarray, shape (k,)
-        Insertion force of each interval [N].
-    interval : float
-        Length of an interval [s].
-    finer : int
-        Every step is divided by this number.
-    states : ndarray, shape (k + 1, 2 (2 + n))
-        Overwritten with the states at the ends of the intervals.
-    steps : ndarray, shape (k,)
-        Overwritten with the shortest step of each interval [s].
+    ``forces``, shape (k,), are the insertion forces [N], ``interval`` is in s; every step is
+    divided by ``finer``. ``states``, shape (k + 1, 2 (2 + n)), takes the states at the ends of the
+    intervals, ``steps``, shape (k,), the shortest step of each interval [s].
 
-    Returns
-    -------
-    done : int
-        Number of intervals that were completed.
-    left : float
-        As from `advance`, of the next one; 0 if all were completed.
-
+    Returns the number of completed intervals and the time left of the next interval as from
+    `advance`, 0 if all were completed.
     """
     n = c.modes.modes.shape[1]
     grids, rows = np.empty((2, n, n)), np.empty((4, n))
@@ -83,7 +65,7 @@ def run_refined(
             depth = c.length - state[0]
             mode_integrals(c.modes, depth, work, at)
             square = (c.bending_stiffness * (slowest / depth) ** 4 + tissue) / c.linear_density
-            # Energy of the modes, as if all were of this frequency.
+            # Energy of the modes at the frequency of the slowest mode.
             size = 0.0
             for i in range(n):
                 for j in range(n):
@@ -92,8 +74,8 @@ def run_refined(
             largest = max(largest, size)
             count = 1.0
             if largest > 0.0:
-                # With the root of the amplitude: where it is large the error counts most, and
-                # so do steps.
+                # Steps in inverse proportion to the root of the amplitude: the error is largest
+                # at large amplitudes.
                 part = (size / largest) ** 0.25
                 count = max(1.0, ceil(min(part * sqrt(square) / SHARE * rest, _MOST)))
             taken = min(count, _BLOCK)

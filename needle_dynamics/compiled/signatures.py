@@ -1,5 +1,5 @@
 """
-From the annotations of a function to the types for which it is compiled.
+Conversion of function annotations to Numba types.
 
 This file imports Numba: import it where it is first needed.
 """
@@ -27,24 +27,10 @@ _tuple_type: Any = types.BaseTuple.from_types  # type: ignore[attr-defined]
 
 def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
     """
-    Return Numba's types of the arguments of a function.
+    Return Numba's types of the arguments of a function; TypeError if an annotation has none.
 
-    Parameters
-    ----------
-    function : callable
-        Its arguments are annotated by numbers, arrays of `needle_dynamics.arrays` with a known
-        number of dimensions, tuples, named tuples of these, and `Held` named tuples.
-
-    Returns
-    -------
-    tuple
-        One type for each argument.
-
-    Raises
-    ------
-    TypeError
-        If an annotation does not determine a type.
-
+    Annotations are numbers, arrays of `needle_dynamics.arrays` with a known number of dimensions,
+    tuples, named tuples of these, and `Held` named tuples.
     """
     hints = get_type_hints(function, localns={'Held': Held}, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
@@ -55,25 +41,7 @@ def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
 
 
 def numba_type(hint: Any) -> Any:
-    """
-    Return Numba's type of an annotation.
-
-    Parameters
-    ----------
-    hint : type
-        The annotation.
-
-    Returns
-    -------
-    object
-        The type.
-
-    Raises
-    ------
-    TypeError
-        If the annotation does not determine a type.
-
-    """
+    """Return Numba's type of an annotation; TypeError if it does not determine a type."""
     if hint in _SCALARS:
         return _SCALARS[hint]
     origin, arguments = get_origin(hint), get_args(hint)

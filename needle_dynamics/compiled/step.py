@@ -1,10 +1,10 @@
 """
-The step of the integrator, and runs of steps under constant inputs.
+Step of the integrator, and sequences of steps under constant inputs.
 
 One step of length h from (s, u, q, p) is a symmetric splitting, see `needle_dynamics.simulated`:
-drift the depth to the middle of the step, take the modes through it at that depth
-(`modal_flow`), and move the insertion axis under the force, the mean force of the modes and
-friction (`friction`). Steps end where a layer of tissue does, and the motion stops at the hub.
+drift the depth to the middle of the step, advance the modes at that depth (`modal_flow`), and
+move the insertion axis under the force, the mean force of the modes and friction (`friction`).
+Steps end at the borders of tissue layers, and the motion stops at the hub.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from needle_dynamics.compiled.modal_flow import Elasticity, rotate_many, rotate_
 from needle_dynamics.compiled.tissue import growth_at, layer_at, Layers, time_to_layer
 import numpy as np
 
-#: Relative inserted length from which on graded steps grow in proportion to it.
+#: Relative insertion depth above which graded steps grow in proportion to the depth.
 GRADED_FROM: Final = 0.1
 
 
 class Needle(NamedTuple):
     """
-    One needle in its tissue, as `needle_dynamics.model.NeedleModel.compiled` makes it; SI units.
+    Constants of a needle in tissue, from `needle_dynamics.model.NeedleModel.compiled`; SI units.
 
     Attributes
     ----------
     minimum_depth, maximum_depth : float
-        Range of the inserted length [m].
+        Range of the insertion depth [m].
     as_printed : bool
         Formulation `as_printed` instead of `complete`.
     friction : FrictionConstants
@@ -64,24 +64,7 @@ class Needle(NamedTuple):
 
 @compiled
 def adapted(c: Needle, coulomb: float, viscous: float, layers: Layers) -> Needle:
-    """
-    Return a needle with other friction, in other tissue.
-
-    Parameters
-    ----------
-    c : Needle
-        The needle.
-    coulomb, viscous : float
-        Coulomb friction [N] and viscous friction [N s/m].
-    layers : Layers
-        Layers of tissue.
-
-    Returns
-    -------
-    Needle
-        The needle, otherwise the same.
-
-    """
+    """Return the needle with other friction coefficients [N], [N s/m] and other tissue layers."""
     f = c.friction
     friction = FrictionConstants(
         f.law, coulomb, viscous, f.withdrawal, f.breakaway, f.stribeck_speed, f.smoothing_speed
@@ -95,19 +78,18 @@ def adapted(c: Needle, coulomb: float, viscous: float, layers: Layers) -> Needle
 
 class Inputs(NamedTuple):
     """
-    What the base does over a time.
+    Inputs of the base over an interval.
 
     Attributes
     ----------
     force : float
-        Insertion force [N], positive into the tissue; not used if the base is moved.
+        Insertion force [N], positive into the tissue; ignored if ``moved``.
     torque : float
         Torque about x [N m].
     velocity : float
-        Insertion velocity of a moved base at the end [m/s].
+        Insertion velocity at the end of the interval [m/s], if ``moved``.
     moved : bool
-        Whether the base is moved: its velocity goes evenly to ``velocity``, whatever force that
-        takes.
+        Whether the base follows a velocity ramp to ``velocity``, at any force.
 
     """
 
@@ -119,7 +101,7 @@ class Inputs(NamedTuple):
 
 class Sums(NamedTuple):
     """
-    Sums over steps.
+    Integrals accumulated over steps.
 
     Attributes
     ----------
@@ -129,13 +111,13 @@ class Sums(NamedTuple):
         Impulse of the tissue's reaction along z [N s] and of its moment about the entry point
         [N m s].
     resistance : float
-        Impulse of the base that moves the needle, without that of inertia [N s].
+        Impulse of a moved base on the needle, without the inertial part [N s].
     friction_work, damping_work, input_work : float
         Energy lost to friction and to tissue damping, and work of the inputs [J].
     impact_loss : float
-        Energy lost on the hub [J].
+        Energy lost in contacts of the hub [J].
     contact_time : float
-        Time of the last contact with the hub [s]; -1 if there is none.
+        Time of the last hub contact [s]; -1 without contact.
 
     """
 
@@ -151,7 +133,7 @@ class Sums(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """Inserted length, its velocity, and how fast that changed in the last step."""
+    """Insertion depth [m], velocity [m/s], and mean acceleration in the last step [m/s^2]."""
 
     depth: float
     velocity: float
@@ -159,7 +141,7 @@ class _Motion(NamedTuple):
 
 
 class _Border(NamedTuple):
-    """Motion and sums with the needle's momentum along z and its moment about the entry point."""
+    """State at the border of a part: lateral momentum, and angular momentum about the entry."""
 
     motion: _Motion
     sums: Sums
@@ -171,7 +153,7 @@ class _Border(NamedTuple):
 def _rates(
     c: Needle, at: ModeIntegrals, z: FloatArray, factor: FloatArray, rates: FloatArray
 ) -> None:
-    """Write the rates that belong to ``z``, momenta unless `as_printed`."""
+    """Compute the rates of the modes from ``z``: momenta, or rates if `as_printed`."""
     n = z.shape[0]
     for i in range(n):
         rates[i] = z[i]
@@ -193,7 +175,7 @@ def _border(
     motion: _Motion,
     sums: Sums,
 ) -> _Border:
-    """Return what the balance of momentum needs where a part of the time begins or ends."""
+    """Compute the momenta for the momentum balance at the border of a part."""
     _rates(c, at, z, factor, rates)
     momentum, angular = 0.0, 0.0
     for i in range(rates.shape[0]):
@@ -206,9 +188,9 @@ def _border(
 def _hub_contact(
     c: Needle, u: float, drive: float, gain: float, moved: bool, room: float, h: float
 ) -> tuple[float, float]:
-    """Return when in a step the needle reaches the hub, -1 if it rests there, and how fast."""
+    """Return the time of the hub contact within a step [s], -1 at rest, and the velocity [m/s]."""
     if room <= 0.0:
-        # It started on the hub: all its velocity is lost at once.
+        # Starts on the hub: all velocity is lost at once.
         return (0.0, u) if u > 0.0 else (-1.0, 0.0)
     early, late = 0.0, h
     for _ in range(60):
@@ -230,15 +212,15 @@ def _hub_contact(
 def _resistance(
     c: Needle, u: float, new_u: float, travel: float, impulse: float, h: float
 ) -> tuple[float, float]:
-    """Return the energy that friction takes from a needle that is moved, and what that takes."""
+    """Return the friction loss of a moved needle [J] and the impulse that it requires [N s]."""
     f, mean = c.friction, 0.5 * (u + new_u)
     factor = 1.0 if mean >= 0.0 else f.withdrawal
     path = abs(u) + abs(new_u)
     if path > 0.0:
-        # Dry friction counts for the time spent in each direction.
+        # Dry friction weighted by the time spent in each direction.
         dry = dry_friction(f, factor * f.coulomb, abs(mean))[0] * (u + new_u) / path
     else:
-        # At rest it holds what it can of the pull of the modes.
+        # At rest, static friction balances the pull of the modes up to its limit.
         bearable = dry_friction(f, f.coulomb, 0.0)[0]
         dry = min(max(-impulse / h, -f.withdrawal * bearable), bearable)
     viscous = f.viscous * factor
@@ -249,7 +231,7 @@ def _resistance(
 def _write_felt(
     c: Needle, inputs: Inputs, before: _Border, now: _Border, span: float, felt: FloatArray
 ) -> None:
-    """Write what the base felt in a part of the time, by balance of momentum."""
+    """Write the mean load on the base in a part of the duration, by balance of momentum."""
     gained = now.motion.velocity - before.motion.velocity
     if inputs.moved:
         axial = c.linear_density * c.length * gained
@@ -279,9 +261,9 @@ def _steps(  # noqa: C901
     graded: bool,
 ) -> tuple[_Motion, Sums, float]:
     """
-    Take steps through a time; return motion, sums and the time left undone.
+    Take steps through a span of time; return motion, sums and the time left undone [s].
 
-    ``gain`` is the acceleration of a moved base. The time ends at ``end`` - ``later``.
+    ``gain`` is the acceleration of a moved base. The span ends at ``end`` - ``later``.
     """
     q, z, q_before, z_before = modal[0], modal[1], modal[2], modal[3]
     layers, two = c.layers, q.shape[0] == 2
@@ -295,7 +277,7 @@ def _steps(  # noqa: C901
         if renew:
             if graded:
                 whole = longest * max(1.0, s / (GRADED_FROM * c.length))
-            # A time of a whole number of steps is not rounded up.
+            # No extra step if the time is a whole number of steps.
             count = ceil(left / whole * (1.0 - 1e-9))
             even = left / count
             renew = graded
@@ -305,11 +287,11 @@ def _steps(  # noqa: C901
         if layered:
             border = time_to_layer(layers, s, u)
             if 1e-3 * h < border < h:
-                # A step ends where a layer does: its stiffness is that of one layer.
+                # A step ends at a layer border, so that its stiffness is constant.
                 h, rest, renew = border, left - border, True
         middle = s + 0.5 * h * u
         if graded:
-            # Mean depth of the step if it accelerates as the last one did: a steadier phase.
+            # Mean depth of the step at the acceleration of the last step: smaller phase error.
             middle += h * h * acceleration / 6.0
         if c.hub_stop and middle > c.length:
             middle = c.length
@@ -334,14 +316,14 @@ def _steps(  # noqa: C901
             turned = rotate_many(elasticity, layers, at, q, z, h)
         drive = inputs.force - turned.impulse / h
         if inputs.moved:
-            # Counted from the end, so that a base that shall rest does so exactly.
+            # Computed from the end, so that an end velocity of zero is exact.
             new_u = inputs.velocity - (rest + later) * gain
             travel = 0.5 * h * (u + new_u)
         else:
             new_u, travel = friction_flow(f, c.moving_mass, u, drive, h)
         stopped = c.hub_stop and s + travel >= c.length
         if s + travel < c.minimum_depth or (s + travel > c.maximum_depth and not stopped):
-            # The last valid state is the one before this step.
+            # Keep the state before this step, the last valid state.
             for i in range(q.shape[0]):
                 q[i], z[i] = q_before[i], z_before[i]
             break
@@ -384,41 +366,19 @@ def advance(
     felt: Matrix,
 ) -> tuple[float, Sums]:
     """
-    Advance a state under constant inputs, in place.
+    Advance a state under constant inputs for ``duration`` [s], in place.
 
-    Parameters
-    ----------
-    c : Needle
-        The needle.
-    state : ndarray, shape (2 (2 + n),)
-        State X = [q, q_dot], SI units; overwritten.
-    time : float
-        Time at the beginning [s], for tissue that swells.
-    inputs : Inputs
-        What the base does.
-    longest : float
-        Longest step [s].
-    graded : bool
-        Let steps grow with the inserted length once it exceeds a tenth of the needle's, since the
-        modes slow down.
-    duration : float
-        Time to advance [s].
-    felt : ndarray, shape (parts, 3) or (0, 3)
-        Overwritten with the load on the base in equal parts of the duration, where steps then end:
-        the mean force of the base on the needle along y and along z [N], and the mean moment about
-        x at the base [N m], by the balance of momentum. Not computed if it is empty.
+    ``state`` is X = [q, q_dot], shape (2 (2 + n),), SI units; ``time`` [s] counts for swelling;
+    ``longest`` is the longest step [s]. With ``graded``, steps grow with the insertion depth above
+    a tenth of the needle length, since the modes slow down. ``felt``, shape (parts, 3) or (0, 3),
+    takes the load on the base in equal parts of the duration, at whose ends steps end: mean forces
+    along y and z [N] and mean moment about x at the base [N m], by balance of momentum.
 
-    Returns
-    -------
-    left : float
-        Time left undone [s], if the inserted length would leave its range. NaN if the state
-        became non-finite.
-    sums : Sums
-        Sums over the steps.
-
+    Returns the time left undone [s], positive if the insertion depth would leave its range and NaN
+    if the state became non-finite, and the sums over the steps.
     """
     n = c.modes.modes.shape[1]
-    # Few blocks: an allocation takes a sixth of a step.
+    # Few arrays: an allocation takes a sixth of the time of a step.
     grids, rows = np.empty((3, n, n)), np.empty((9, n))
     work = np.empty(c.modes.series.shape[1] + 4 * n)
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
@@ -427,7 +387,7 @@ def advance(
         q[i], z[i] = state[2 + i], state[4 + n + i]
     mode_integrals(c.modes, c.length - state[0], work, at)
     if not c.as_printed:
-        # From rates to momenta p = rho A G q_dot, in which dG/dt needs no term.
+        # Momenta p = rho A G q_dot, whose equations have no term of dG/dt.
         for i in range(n):
             z[i] = 0.0
             for j in range(n):
@@ -489,29 +449,10 @@ def run(
     states: Matrix,
 ) -> int:
     """
-    Advance a state through intervals of constant inputs, in place.
+    Advance a state through intervals of constant inputs, in place; return the completed count.
 
-    Parameters
-    ----------
-    c : Needle
-        The needle.
-    state : ndarray, shape (2 (2 + n),)
-        State; overwritten.
-    forces, torques : ndarray, shape (k,)
-        Insertion force [N] and torque [N m] of each interval.
-    interval, longest : float
-        Length of an interval and of the longest step [s].
-    graded : bool
-        As in `advance`.
-    states : ndarray, shape (k + 1, 2 (2 + n)) or (1, 2 (2 + n))
-        Filled with the states at the ends of the intervals; with a single row it is left alone,
-        and only ``state`` is the result.
-
-    Returns
-    -------
-    int
-        Number of intervals that were completed.
-
+    ``forces`` [N] and ``torques`` [N m] have shape (k,). ``states``, shape (k + 1, 2 (2 + n)),
+    takes the states at the ends of the intervals; with a single row it is unused.
     """
     keep, none = states.shape[0] > 1, np.empty((0, 3))
     if keep:

@@ -1,13 +1,13 @@
 """
 Machine code on disk: one file for each function and signature.
 
-The name of a file has a digest of everything that its machine code depends on: sources, signature,
-processor, and versions of Python and Numba. So an entry is never wrong, only missing, and several
-processes, users and machines can share a folder. A file is written under another name and renamed;
-a damaged file counts as missing.
+The name of a file contains a digest of all inputs of its machine code: sources, signature,
+processor, and versions of Python and Numba. An entry is therefore never outdated, and several
+processes, users and machines can share a folder. A file is written under a temporary name and
+renamed; a damaged file is ignored.
 
 Entries are read from the folder of this package, which may be read-only, and from the cache folder
-of the user. New entries go to the first of the two that is writable.
+of the user. New entries are written to the first writable folder of the two.
 """
 
 from __future__ import annotations
@@ -30,34 +30,26 @@ import warnings
 
 _FOLDER: Final = Path(__file__).parent
 
-#: Environment variable with a folder that replaces both; it is also Numba's.
+#: Environment variable of Numba with a folder that replaces both.
 FOLDER_VARIABLE: Final = 'NUMBA_CACHE_DIR'
 
 #: Suffix of an entry.
 SUFFIX: Final = '.nbc'
 
-#: Longest wait for another process that compiles the same function, and time between checks [s].
+#: Longest wait for another process that compiles the same function, and polling period [s].
 _LONGEST, _CHECK = 120.0, 0.05
 
 _DIGEST: Final = 32
 
-#: Called with the name of each function that is loaded or compiled, whether it is loaded, and
-#: whether that was asked for by `preparing`.
+#: Called with the name of each loaded or compiled function, whether it is loaded, and whether
+#: it is inside `preparing`.
 LISTENERS: Final[list[Callable[[str, bool, bool], None]]] = []
 
 _PREPARED: Final = local()
 
 
 def folders() -> tuple[Path, ...]:
-    """
-    Return the folders of machine code.
-
-    Returns
-    -------
-    tuple of Path
-        In the order in which they are read.
-
-    """
+    """Return the folders of machine code, in reading order."""
     given = os.environ.get(FOLDER_VARIABLE)
     if given:
         return (Path(given),)
@@ -73,15 +65,7 @@ def folders() -> tuple[Path, ...]:
 
 @cache
 def writable_folder() -> Path | None:
-    """
-    Return the folder that new entries are written to.
-
-    Returns
-    -------
-    Path or None
-        The first writable folder of `folders`; None if there is none.
-
-    """
+    """Return the first writable folder of `folders`, or None."""
     for folder in folders():
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +78,7 @@ def writable_folder() -> Path | None:
 
 @cache
 def _stamp(folder: Path) -> str:
-    """Return a digest of all sources in this folder and in another one."""
+    """Return a digest of all sources in this folder and in the given folder."""
     digest = sha256()
     for place in sorted({_FOLDER, folder}):
         for path in sorted(place.glob('*.py')):
@@ -113,17 +97,7 @@ def preparing() -> Iterator[None]:
 
 
 class Store:
-    """
-    The machine code of one function, in the interface of Numba's caches.
-
-    Parameters
-    ----------
-    function : callable
-        The Python source.
-    options : dict
-        Options of the compiler.
-
-    """
+    """Machine code of one function, with the interface of Numba's caches."""
 
     def __init__(self, function: Callable[..., object], options: dict[str, Any]) -> None:
         code = function.__code__
@@ -134,58 +108,30 @@ class Store:
 
     @property
     def cache_path(self) -> str:
-        """The folder of new entries, for Numba's statistics."""
+        """Folder of new entries, for Numba's statistics."""
         return str(writable_folder())
 
     def enable(self) -> None:
-        """Do nothing: it is always enabled."""
+        """Do nothing: always enabled."""
 
     def disable(self) -> None:
-        """Do nothing: it is always enabled."""
+        """Do nothing: always enabled."""
 
     def flush(self) -> None:
         """Do nothing: entries do not become invalid."""
 
     def has(self, signature: Any, target_context: Any) -> bool:
-        """
-        Return whether there is an entry for a signature.
-
-        Parameters
-        ----------
-        signature : tuple
-            Numba's types of the arguments.
-        target_context : object
-            Numba's context of the processor.
-
-        Returns
-        -------
-        bool
-            Whether one of the folders has it.
-
-        """
+        """Return whether a folder contains an entry for a signature on a target."""
         name = self._file_name(signature, target_context.codegen())
         return any((folder / name).is_file() for folder in folders())
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """
-        Load the machine code for a signature; Numba calls this.
-
-        Parameters
-        ----------
-        signature, target_context
-            As for `has`.
-
-        Returns
-        -------
-        object
-            The result of the compiler; None if Numba must compile the function.
-
-        """
+        """Load the machine code for a signature; None if Numba must compile the function."""
         target_context.refresh()
         name = self._file_name(signature, target_context.codegen())
         found, folder = self._read(name, signature, target_context), writable_folder()
         if found is None and folder is not None:
-            # Another process may be compiling it: wait, rather than do the same work again.
+            # Another process may be compiling it: wait for the result.
             deadline = monotonic() + _LONGEST
             while not _lock(folder, name) and monotonic() < deadline:
                 sleep(_CHECK)
@@ -197,17 +143,7 @@ class Store:
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """
-        Write machine code for a signature; Numba calls this after compiling it.
-
-        Parameters
-        ----------
-        signature : tuple
-            Numba's types of the arguments.
-        result : object
-            The result of the compiler.
-
-        """
+        """Write machine code for a signature; called by Numba after compilation."""
         folder = writable_folder()
         if folder is None:
             return
@@ -223,7 +159,7 @@ class Store:
             _unlock(folder, name)
 
     def _file_name(self, signature: Any, codegen: Any) -> str:
-        """Return the name of the entry for a signature on this processor."""
+        """Return the file name of the entry for a signature on this processor."""
         from numba import __version__
         from numba.core.sigutils import normalize_signature
 
@@ -251,13 +187,13 @@ class Store:
         return None
 
     def _write(self, folder: Path, name: str, data: bytes) -> None:
-        """Write an entry; remove those of earlier sources in the folder of the package."""
+        """Write an entry; remove entries of earlier sources from the folder of the package."""
         try:
             handle, draft = tempfile.mkstemp(dir=folder, prefix=name, suffix='.tmp')
             try:
                 with os.fdopen(handle, 'wb') as file:
                     file.write(sha256(data).digest() + data)
-                # mkstemp makes it private; an installation by root serves every user.
+                # mkstemp creates private files; an installation by root is for every user.
                 Path(draft).chmod(0o644)
                 Path(draft).replace(folder / name)
             except BaseException:
@@ -273,16 +209,16 @@ class Store:
 
 @cache
 def _lock_file(folder: Path) -> int:
-    """Open the file whose bytes are locks, for the life of the process."""
+    """Open the file whose bytes are locks, until the end of the process."""
     return os.open(folder / 'needle.lock', os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
 
 def _lock(folder: Path, name: str) -> bool:
-    """Lock an entry; return False while another process has it."""
+    """Lock an entry; return False if another process holds the lock."""
     try:
         fcntl.lockf(_lock_file(folder), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, _byte(name))
     except OSError as error:
-        # A file system without locks: both processes compile it.
+        # A file system without locks: both processes compile.
         return error.errno not in (errno.EACCES, errno.EAGAIN)
     return True
 
@@ -291,10 +227,10 @@ def _unlock(folder: Path, name: str) -> None:
     try:
         fcntl.lockf(_lock_file(folder), fcntl.LOCK_UN, 1, _byte(name))
     except OSError:
-        # It ends with the process.
+        # The lock ends with the process.
         return
 
 
 def _byte(name: str) -> int:
-    """Return the byte of the lock file that stands for an entry."""
+    """Return the offset of the lock byte of an entry."""
     return int.from_bytes(sha256(name.encode()).digest()[:7], 'big')

@@ -1,4 +1,4 @@
-"""A needle that cuts its path, for many causes at once."""
+"""Planar insertion of a needle for many load cases (causes) at once."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def insert_causes(
     felt: Matrix,
 ) -> None:
     """
-    Insert a needle in one plane, for each cause alone, with the same nodes for all causes.
+    Insert a needle in one plane for m independent causes, with the same k depths for all of them.
 
     The compliance of the needle and the transfer over an element do not depend on the cause and
-    are computed once. The force on the guide is carried from node to node too: by reciprocity, a
+    are computed once. The force on the guide is propagated from node to node: by reciprocity, a
     load at the end of the needle acts on the guide as the guide acts on that end.
 
     Parameters
@@ -38,8 +38,7 @@ def insert_causes(
     free : float
         Free length between guide and skin [m].
     depths : ndarray, shape (k,)
-        Depths of the tip [m], from 0: it cuts an element up to each depth that is greater than
-        the previous one, and rests at a depth that is repeated.
+        Insertion depths [m], from 0: an increase cuts an element, a repeated depth is at rest.
     stiffness : ndarray, shape (k,)
         Stiffness of the tissue along the element that ends at each depth [N/m^2].
     tilts : ndarray, shape (m,)
@@ -47,7 +46,7 @@ def insert_causes(
     guides, loads : ndarray, shape (k, m)
         Position of the guide [m] and lateral load on the tip [N] at each depth, by cause.
     tips, felt : ndarray, shape (k, m)
-        For the deflection of the tip [m] and the force of the needle on the guide [N].
+        Output: deflection of the tip [m] and force of the needle on the guide [N].
 
     """
     count = len(tilts)
@@ -60,17 +59,17 @@ def insert_causes(
     # Deflection and slope of the unloaded end per position and tilt of the guide.
     w_b, w_tilt = s.response[0, 0, 0], s.response[0, 0, 1]
     t_b, t_tilt = s.response[0, 1, 0], s.response[0, 1, 1]
-    # Force on the guide per position and tilt of the guide, and per place of the entry point:
-    # without a free length the skin is held at the guide, which then does not feel it.
+    # Force on the guide per position and tilt of the guide, and per position of the entry
+    # point: without a free length the skin is fixed to the guide and exerts no force on it.
     entry_force = skin * w_b if free > 0.0 else 0.0
     force_b, force_tilt = -entry_force, -entry_force * free
     # By cause: the unloaded end and the force on the guide, both with the guide at zero; the path
-    # at this node and at the previous one.
+    # at this node and at the previous node.
     w, t, force = np.empty(count), np.empty(count), np.empty(count)
     path, previous = np.empty(count), np.zeros(count)
     restarted = np.ones(count, dtype=np.bool_)
     for j in range(count):
-        # The load bends the needle before the skin holds it.
+        # The load bends the needle before the skin supports it.
         entry = guides[0, j] + free * tilts[j] + free**3 / (3.0 * ei) * loads[0, j]
         path[j], force[j] = entry, entry_force * entry
         w[j], t[j] = (1.0 - w_b) * entry, -t_b * entry
@@ -93,8 +92,8 @@ def insert_causes(
             force_tilt += force_w * w_tilt + force_t * t_tilt
             w_b, t_b = end_w, end_t
             w_tilt, t_tilt = c.t00 * w_tilt + c.t01 * t_tilt, c.t10 * w_tilt + c.t11 * t_tilt
-            # The path goes on as a parabola through the previous node, this node and the tip, or
-            # from this node as a straight line; the tip is on it.
+            # The path continues as a parabola through the previous node, this node and the tip,
+            # or from this node as a straight line to the tip.
             line = 1.0 / h
             curved = 2.0 / (h * (h + before))
             turned = 0.5 * before * curved

@@ -1,4 +1,4 @@
-"""Layers of tissue along the needle."""
+"""Tissue layers along the needle."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from needle_dynamics.compiled.cache import compiled
 
 class Layers(NamedTuple):
     """
-    Layers of tissue, and what those above a layer add to the integrals of the modes.
+    Tissue layers, and the contributions of the layers above to the integrals of the modes.
 
-    The tissue holds the needle by k(y) w per length. With the tip in layer m the integrals of
+    The tissue load is k(y) w per length. With the tip in layer m the integrals of
     k phi phi^T, k phi and k y phi over the inserted part are the stiffness of that layer times
-    the integrals without k, plus row m of ``gram``, ``area`` and ``moment``. All of it grows with
-    the swelling of the tissue.
+    the integrals without k, plus row m of ``gram``, ``area`` and ``moment``. All of them
+    scale with the swelling of the tissue.
 
     Attributes
     ----------
@@ -40,24 +40,7 @@ class Layers(NamedTuple):
 
 @compiled
 def layer_at(starts: FloatArray, depth: float, layer: int = 0) -> int:
-    """
-    Return the layer that holds a depth.
-
-    Parameters
-    ----------
-    starts : ndarray, shape (m,)
-        As in `Layers`.
-    depth : float
-        Distance from the entry point [m].
-    layer : int
-        Layer from which to search.
-
-    Returns
-    -------
-    int
-        Number of the layer. At a border it is the lower layer.
-
-    """
+    """Return the layer at a depth [m], searched from ``layer``; at a border the lower layer."""
     while layer + 1 < starts.shape[0] and depth >= starts[layer + 1]:
         layer += 1
     while layer > 0 and depth < starts[layer]:
@@ -67,24 +50,7 @@ def layer_at(starts: FloatArray, depth: float, layer: int = 0) -> int:
 
 @compiled
 def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
-    """
-    Return the time until the tip reaches the next border between unlike layers.
-
-    Parameters
-    ----------
-    layers : Layers
-        Layers.
-    depth : float
-        Inserted length [m].
-    velocity : float
-        Insertion velocity [m/s].
-
-    Returns
-    -------
-    float
-        Time at that velocity [s]; infinite if there is no border ahead.
-
-    """
+    """Return the time to the next border between unlike layers [s], inf without border ahead."""
     starts, stiffnesses = layers.starts, layers.stiffnesses
     soonest = inf
     for i in range(1, starts.shape[0]):
@@ -97,21 +63,8 @@ def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
 @compiled
 def growth_at(swelling: float, swelling_time: float, time: float) -> float:
     """
-    Return the factor by which swelling has made the tissue stiffer.
+    Return the stiffness factor of swelling at a time since its start [s]; 1 without swelling.
 
-    Parameters
-    ----------
-    swelling : float
-        Relative growth of the stiffness in the long run.
-    swelling_time : float
-        Time constant of the swelling [s].
-    time : float
-        Time since the swelling began [s].
-
-    Returns
-    -------
-    float
-        1 without swelling.
-
+    ``swelling`` is the final relative increase, ``swelling_time`` the time constant [s].
     """
     return 1.0 - swelling * expm1(-time / swelling_time) if swelling != 0.0 else 1.0

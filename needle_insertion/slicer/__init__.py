@@ -1,1 +1,1 @@
-"""The node that speaks OpenIGTLink with 3D Slicer; only `messages` needs the package pyigtl."""
+"""OpenIGTLink connection of the node `slicer` with 3D Slicer; only `messages` requires pyigtl."""

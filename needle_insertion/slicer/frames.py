@@ -1,4 +1,4 @@
-"""Whole OpenIGTLink messages from a stream of bytes, in bounded memory."""
+"""Split a byte stream into OpenIGTLink messages, in bounded memory."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from needle_ros.errors import MessageError
 #: Version, type, device name, time stamp (whole and fraction), size of the body, checksum.
 HEADER: Final = struct.Struct('>H12s20sIIQQ')
 
-#: Versions of the header: those of OpenIGTLink 1 and 2, of 3, and one to come.
+#: Versions of the header: 1 and 2 of OpenIGTLink 1 to 3, and a future version.
 _VERSIONS: Final = (1, 2, 3)
 
-#: Largest body that is taken [bytes]: 481 points.
+#: Largest accepted body [bytes]: 481 points.
 LARGEST: Final = 1 << 16
 
-#: Largest body that is passed over [bytes]. A larger one is no message.
+#: Largest skipped body [bytes]; a larger size is a protocol error.
 _LARGEST_SKIPPED: Final = 1 << 30
 
 
 class Frame(NamedTuple):
     """
-    A message as it came.
+    Unparsed message: header and body.
 
     Attributes
     ----------
     kind : str
-        Its type, such as ``POINT``.
+        Type, such as ``POINT``.
     device : str
-        Name of its device.
+        Name of the device.
     data : bytes
         Header and body.
 
@@ -43,14 +43,14 @@ class Frame(NamedTuple):
 
 class Frames:
     """
-    Cuts a stream into messages; those that nobody wants are passed over and never stored.
+    Splitter of a byte stream into messages; unwanted messages are skipped and never stored.
 
     Parameters
     ----------
     wanted : callable
         Returns whether a message of a type and a device name is wanted.
     refuse : callable
-        Called with a line about a message that is wanted, but too large.
+        Called with a line about a wanted message that is too large.
 
     """
 
@@ -63,23 +63,9 @@ class Frames:
 
     def take(self, data: bytes) -> list[Frame]:
         """
-        Take the next bytes.
+        Process the next bytes of the stream; return the messages that are complete.
 
-        Parameters
-        ----------
-        data : bytes
-            Any part of the stream.
-
-        Returns
-        -------
-        list of Frame
-            The messages that are complete now.
-
-        Raises
-        ------
-        MessageError
-            If this is not OpenIGTLink; where the next message begins is not known then.
-
+        `MessageError` if this is not OpenIGTLink; the start of the next message is unknown then.
         """
         stream, at, found = self._rest + data, 0, []
         while True:
@@ -113,5 +99,5 @@ def _header(header: bytes) -> tuple[str, str, int]:
         raise MessageError(f'not OpenIGTLink: it begins with {header[:14]!r}')
     if size > _LARGEST_SKIPPED:
         raise MessageError(f'not OpenIGTLink: a {name.decode()} message of {size} bytes')
-    # Slicer takes names of nodes, which may be cut within a letter.
+    # Slicer uses names of nodes, which may be truncated within a character.
     return name.decode(), device.rstrip(b' \0').decode(errors='replace'), size

@@ -1,11 +1,10 @@
 """
-One TCP connection, as server or as client. It has no thread, and nothing in it waits.
+TCP connection to a peer, as server or as client, without threads and without blocking calls.
 
-pyigtl has a server and a client, too. They are not used, because a node could not live with them:
-the server takes over SIGINT and SIGTERM, and listens on addresses that it chooses itself. Both
-take a whole core when a peer has closed its end, until something is sent; they read whatever size
-a header announces, do not compare checksums, send what has waited for a peer since long, and
-print tracebacks.
+The server and the client of pyigtl are not used, because they are unsuitable for a node: the
+server replaces the handlers of SIGINT and SIGTERM and selects its own addresses. Both use a full
+core after a peer has closed its end, until data is sent; they read any size that a header
+declares, do not verify checksums, send outdated data, and print tracebacks.
 """
 
 from __future__ import annotations
@@ -27,44 +26,44 @@ from needle_ros.journal import Journal, Severity
 #: Time between attempts to listen or to connect [s].
 _RETRY: Final = 1.0
 
-#: A peer that takes no byte for so long has gone [s].
+#: Timeout of a peer that accepts no byte [s].
 _PATIENCE: Final = 5.0
 
-#: What is read at once and in one call of `poll`, and what may wait to be sent [bytes].
+#: Largest read, largest sum of reads in a call of `poll`, and largest send queue [bytes].
 _AT_ONCE: Final = 1 << 14
 _MOST_READ: Final = 1 << 18
 _MOST_WAITING: Final = 1 << 18
 
-#: Buffers of the system: what waits there is old when it arrives [bytes].
+#: Buffers of the system; small, because data in them becomes outdated [bytes].
 _SYSTEM_BUFFER: Final = 1 << 16
 
-#: Strangers that are turned away in one call of `poll`.
+#: Largest number of additional peers that are rejected in a call of `poll`.
 _MOST_STRANGERS: Final = 8
 
 
 class Link:
     """
-    Keeps a connection to one peer, and takes it up again whenever it is lost.
+    Connection to a peer, which is restored whenever it is lost.
 
     Parameters
     ----------
     settings : LinkSettings
-        Where, and who connects.
+        Role and address.
     wanted : callable
         Returns whether a message of a type and a device name is wanted.
     journal : Journal
-        Takes what there is to say.
+        Event log.
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        Returns the time of a monotonic clock [s].
 
     Attributes
     ----------
     peer : str
-        Address of the peer, '' if there is none.
+        Address of the peer, '' without a connection.
     complaint : str
-        Why there can be no peer, '' if there can.
+        Reason why no connection is possible, or ''.
     left_out : int
-        Messages that were not sent because the peer reads too slowly.
+        Number of messages that were dropped because the peer reads too slowly.
 
     """
 
@@ -80,36 +79,28 @@ class Link:
         self._settings, self._wanted = settings, wanted
         self._journal, self._steady = journal, steady
         self._listener: socket.socket | None = None
-        #: The connection, or one that is being made.
+        #: The connection, established or in progress.
         self._socket: socket.socket | None = None
         self._frames = Frames(wanted, journal.refuse)
         self._out = bytearray()
-        #: When the peer took something last, and when there was an attempt last.
+        #: Times of the last byte that the peer accepted, and of the last attempt to connect.
         self._moved = self._tried = -_RETRY
 
     @property
     def place(self) -> str:
-        """Address and port of the settings."""
+        """Configured address and port."""
         return f'{self._settings.host}:{self._settings.port}'
 
     @property
     def state(self) -> str:
-        """Whether there is a peer, in words."""
+        """State of the connection as text."""
         if self.peer:
             return f'connected with {self.peer}'
         verb = 'waits for a peer on' if self._settings.role == 'server' else 'tries to connect to'
         return self.complaint or f'{verb} {self.place}'
 
     def poll(self) -> list[Frame]:
-        """
-        Take up a connection if there is none, read what has come, and send what waits.
-
-        Returns
-        -------
-        list of Frame
-            The wanted messages that have come.
-
-        """
+        """Restore the connection if necessary, send queued data, and return received messages."""
         found = self._read() if self.peer else []
         if self._settings.role == 'server':
             self._listen()
@@ -120,20 +111,7 @@ class Link:
         return found
 
     def send(self, message: bytes) -> bool:
-        """
-        Send a message, all of it or nothing.
-
-        Parameters
-        ----------
-        message : bytes
-            Header and body.
-
-        Returns
-        -------
-        bool
-            Whether it is on its way; False if there is no peer, or one that reads too slowly.
-
-        """
+        """Queue a message (header and body); False without a peer or with a full queue."""
         if not self.peer:
             return False
         if len(self._out) + len(message) > _MOST_WAITING:
@@ -149,14 +127,14 @@ class Link:
         return True
 
     def close(self) -> None:
-        """End the connection, and listen no more."""
+        """Close the connection and the listening socket."""
         for one in (self._socket, self._listener):
             if one is not None:
                 one.close()
         self._forget()
         self._listener, self._tried = None, -_RETRY
 
-    # A peer comes.
+    # Connection.
 
     def _is_time(self) -> bool:
         now = self._steady()
@@ -166,7 +144,7 @@ class Link:
         return True
 
     def _listen(self) -> None:
-        """Open the port, if it is not open."""
+        """Open the port if it is not open."""
         if self._listener is not None or not self._is_time():
             return
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -185,7 +163,7 @@ class Link:
         self._journal.say(Severity.INFO, f'listens on {self.place}')
 
     def _accept(self) -> None:
-        """Take the first who comes, and turn all others away."""
+        """Accept the first peer and reject all others."""
         listener = self._listener
         for _ in range(_MOST_STRANGERS):
             if listener is None:
@@ -193,7 +171,7 @@ class Link:
             try:
                 came, (host, port) = listener.accept()
             except OSError:
-                # Nobody, or one who has gone again.
+                # No peer, or a connection closed by the peer.
                 return
             if self.peer:
                 came.close()
@@ -207,7 +185,7 @@ class Link:
                 self._greet(came, f'{host}:{port}')
 
     def _connect(self) -> None:
-        """Begin to connect, or see how it goes."""
+        """Start a connection, or check its progress."""
         coming = self._socket
         if coming is None:
             if not self._is_time():
@@ -236,31 +214,31 @@ class Link:
             self._greet(coming, self.place)
 
     def _greet(self, connection: socket.socket, peer: str) -> None:
-        """Begin with a peer."""
+        """Initialize an established connection."""
         self._socket, self.peer = connection, peer
         self._frames = Frames(self._wanted, self._journal.refuse)
-        # Whoever has gone already is found out when something is read.
+        # A connection that is already closed is detected by the next read.
         with suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SYSTEM_BUFFER)
-            # One who has gone without a word, such as a machine without power.
+            # A peer that disappears without closing, such as a machine without power.
             connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1e3 * _PATIENCE)
             )
         self._journal.say(Severity.INFO, f'connected with {peer}', 'connected')
 
     def _complain(self, line: str) -> None:
-        """Say why there can be no peer, once."""
+        """Log the reason why no connection is possible, once."""
         if line != self.complaint:
             self.complaint = line
             self._journal.say(
                 Severity.ERROR, f'{line}; tries again every {_RETRY:g} s', 'no connection'
             )
 
-    # A peer is there.
+    # Data.
 
     def _read(self) -> list[Frame]:
-        """Read what has come, a bounded part of it at once."""
+        """Read received data up to a limit and return the messages."""
         found: list[Frame] = []
         for _ in range(_MOST_READ // _AT_ONCE):
             if self._socket is None:
@@ -275,13 +253,13 @@ class Link:
                 break
             except MessageError as error:
                 self._journal.refuse(f'peer {self.peer} refused: {error}')
-                self._lose('what it says cannot be understood')
+                self._lose('it sent invalid data')
             except OSError as error:
                 self._lose(_words(error))
         return found
 
     def _flush(self) -> None:
-        """Send what waits, as far as it goes without waiting."""
+        """Send queued data without blocking."""
         while self._socket is not None and self._out:
             try:
                 sent = self._socket.send(self._out)
@@ -296,7 +274,7 @@ class Link:
             self._moved = self._steady()
 
     def _lose(self, why: str) -> None:
-        """End with the peer, and say so."""
+        """Log and close a lost connection."""
         self._journal.say(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
@@ -311,5 +289,5 @@ class Link:
 
 
 def _words(error: OSError) -> str:
-    """Return what the system says of an error."""
+    """Return the system's description of an error."""
     return (error.strerror or str(error)).lower()

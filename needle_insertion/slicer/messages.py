@@ -1,9 +1,10 @@
 """
-What OpenIGTLink messages say, in quantities of the contract, and the other way round.
+Conversion between OpenIGTLink messages and the quantities of the ROS interface.
 
-Lengths of the messages are in mm, in the frame of the images (RAS in 3D Slicer); ours are in m, in
-``needle_entry``. A `Registration` is in between. The names of the devices are those of SmartNeedle
-(trajcontrol, and its module of 3D Slicer), as far as it has some: docs/howto/slicer.md.
+Lengths of the messages are in mm, in the frame of the images (RAS in 3D Slicer); lengths of the
+nodes are in m, in ``needle_entry``; a `Registration` transforms between them. Device names are
+those used by SmartNeedle (trajcontrol, and its module of 3D Slicer), where it defines a name:
+docs/howto/slicer.md.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 from pyigtl.messages import CRC64, MessageBase, PointMessage, StringMessage, TransformMessage
 
-#: Name of the target: of a point in any POINT message, or of the device.
+#: Name of the target: a point name in any POINT message, or a device name.
 TARGET: Final = 'TARGET'
 
-#: Devices that are sent.
+#: Device names of transmitted messages.
 SHAPE: Final = 'NeedleShapeZ'
 SHAPE_HEADER: Final = 'NeedleShapeHeader'
 TIP: Final = 'NeedleTip'
 TIP_EXPECTED: Final = 'NeedleTipExpected'
 STATE: Final = 'NeedleState'
 
-#: Numbers of the messages have 32 bits, and people point at the skin [m].
+#: Tolerance of a target on the skin, for 32-bit numbers and manual input [m].
 _ROUNDING: Final = 1e-4
 
 #: Longest state [characters]; the length of a STRING has 16 bits.
@@ -41,41 +42,28 @@ _LONGEST_STATE: Final = 8000
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
-#: What may be between the numbers of a STRING.
+#: Separators of the numbers of a STRING.
 _BETWEEN: Final = re.compile(r'[\s,;]+')
 
-#: What pyigtl raises for bodies that do not fit their type.
+#: Exceptions of pyigtl for bodies that do not match their type.
 _NOT_UNDERSTOOD: Final = (struct.error, ValueError, TypeError, IndexError)
 
 
 def is_wanted(kind: str, device: str) -> bool:
-    """
-    Return whether a message may have a target.
-
-    Parameters
-    ----------
-    kind, device : str
-        Its type, and the name of its device.
-
-    Returns
-    -------
-    bool
-        Whether it may.
-
-    """
+    """Return whether a message of a type and a device name can contain a target."""
     return kind == 'POINT' or (device == TARGET and kind in ('TRANSFORM', 'STRING'))
 
 
 class Interpreter:
     """
-    Turns messages of the peer into targets, and the needle into messages for it.
+    Converter from messages of the peer to targets, and from the needle to messages.
 
     Parameters
     ----------
     registration : Registration
-        Where the needle is in the images.
+        Pose of the needle frame in the images.
     reach : float
-        Farthest target from the entry point [m].
+        Largest accepted distance of a target from the entry point [m].
 
     """
 
@@ -84,24 +72,10 @@ class Interpreter:
 
     def target(self, frame: Frame) -> FloatArray | None:
         """
-        Read the target of a message.
+        Return the target of a message in ``needle_entry`` [m], shape (3,), or None.
 
-        Parameters
-        ----------
-        frame : Frame
-            The message, see `is_wanted`.
-
-        Returns
-        -------
-        ndarray, shape (3,), or None
-            Where the tip shall be in ``needle_entry`` [m]; None if these are points of something
-            else.
-
-        Raises
-        ------
-        MessageError
-            If the message is damaged, or its target makes no sense.
-
+        None if the message has other points only; `MessageError` if the message is damaged or the
+        target is invalid. See `is_wanted`.
         """
         found = _said(_message(frame))
         if found is None:
@@ -114,32 +88,21 @@ class Interpreter:
         if not distance <= self._reach:
             raise MessageError(
                 f'{_millimeters(at)} is {MILLIMETERS * distance:.6g} mm from the entry point, '
-                f'reach is {MILLIMETERS * self._reach:g} mm; is the registration right?'
+                f'reach is {MILLIMETERS * self._reach:g} mm; check the registration'
             )
         if point[1] < -_ROUNDING:
             raise MessageError(
                 f'{_millimeters(at)} is {-MILLIMETERS * point[1]:.6g} mm outside of the tissue; '
-                'is the registration right?'
+                'check the registration'
             )
         return point
 
     def shape(self, shape: Shape, number: int) -> list[bytes]:
         """
-        Tell the shape of the needle: its points, and a line about them.
+        Return a POINT message with the shape, from the guide to the tip, and its STRING header.
 
-        Parameters
-        ----------
-        shape : Shape
-            The shape.
-        number : int
-            How many there were before.
-
-        Returns
-        -------
-        list of bytes
-            A POINT message from the guide to the tip, then a STRING message: time, number, number
-            of points, frame and source, with semicolons between.
-
+        The string has time, number of the shape, number of points, frame and source, separated by
+        semicolons.
         """
         time = _seconds(shape.stamp)
         count = len(shape.points)
@@ -155,37 +118,11 @@ class Interpreter:
         return [points.pack(), header.pack()]
 
     def tip(self, shape: Shape) -> bytes:
-        """
-        Tell where the tip is.
-
-        Parameters
-        ----------
-        shape : Shape
-            The needle.
-
-        Returns
-        -------
-        bytes
-            A TRANSFORM message, with y along the needle.
-
-        """
+        """Return the pose of the tip as a TRANSFORM message, with y along the needle."""
         return self._pose(TIP, Pose(shape.stamp, shape.points[-1], shape.turn))
 
     def tip_expected(self, pose: Pose) -> bytes:
-        """
-        Tell where the tip is expected.
-
-        Parameters
-        ----------
-        pose : Pose
-            Where.
-
-        Returns
-        -------
-        bytes
-            A TRANSFORM message.
-
-        """
+        """Return the predicted pose of the tip as a TRANSFORM message."""
         return self._pose(TIP_EXPECTED, pose)
 
     def _pose(self, device: str, pose: Pose) -> bytes:
@@ -194,23 +131,8 @@ class Interpreter:
         return bytes(message.pack())
 
     def state(self, stamp: int, lines: Iterable[str]) -> bytes:
-        """
-        Tell what the nodes say of themselves.
-
-        Parameters
-        ----------
-        stamp : int
-            Time [ns].
-        lines : iterable of str
-            One for each node.
-
-        Returns
-        -------
-        bytes
-            A STRING message.
-
-        """
-        # pyigtl cannot write other letters: it waits for the wrong error of the encoding.
+        """Return the states of the nodes, one line per node, as a STRING message; time in ns."""
+        # pyigtl cannot encode other characters: it catches the wrong exception.
         text = '\n'.join(lines).encode('ascii', 'replace').decode()[:_LONGEST_STATE]
         message = StringMessage(text, timestamp=_seconds(stamp), device_name=STATE)
         return bytes(message.pack())
@@ -221,9 +143,9 @@ def _millimeters(at: FloatArray) -> str:
 
 
 def _message(frame: Frame) -> Any:
-    """Return a message as pyigtl reads it."""
+    """Parse a message with pyigtl."""
     header, body = frame.data[: HEADER.size], frame.data[HEADER.size :]
-    # pyigtl does not compare the checksum.
+    # pyigtl does not verify the checksum.
     if HEADER.unpack(header)[-1] != CRC64(body):
         raise MessageError('the message is damaged: its checksum is wrong')
     try:
@@ -236,7 +158,7 @@ def _message(frame: Frame) -> Any:
 
 
 def _said(message: Any) -> Any:
-    """Return the target as a message has it, None if it has none."""
+    """Return the coordinates of the target in a message, None without a target."""
     if isinstance(message, TransformMessage):
         return message.matrix[:3, 3]
     if isinstance(message, StringMessage):
@@ -248,7 +170,7 @@ def _said(message: Any) -> Any:
     places = dict(enumerate(message.positions))
     named = [k for k, name in enumerate(message.names) if name == TARGET]
     if not named and message.device_name == TARGET:
-        # A list of this name with a point of any name.
+        # A list with this name and a point with any name.
         named = list(places)
     elif not named:
         return None
@@ -260,5 +182,5 @@ def _said(message: Any) -> Any:
 
 
 def _seconds(stamp: int) -> float:
-    """Return a time as the header takes it, which has 32 bits for the seconds."""
+    """Return a time [s] within the range of the header, which has 32 bits for the seconds."""
     return min(max(stamp, 0), (1 << 32) * NANOSECONDS - NANOSECONDS) / NANOSECONDS

@@ -1,4 +1,4 @@
-"""What is known of the needle at a moment: its shape, or the line to its tip."""
+"""Present state of the needle: its measured shape, or a line to its tip."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from needle_ros.errors import MessageError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: What comes no more is not shown after this time [s].
+#: Timeout of measurements [s].
 _LASTS: Final = 1.0
 
-#: Farthest from the entry point that anything can be [m].
+#: Largest plausible coordinate [m].
 _FARTHEST: Final = 10.0
 
-#: Most points of a shape: 0.5 m at every millimeter.
+#: Largest number of points of a shape: 0.5 m with a point per millimeter.
 MOST_POINTS: Final = 480
 
-#: Where a shape is from. The second is a straight line.
+#: Source of a shape: measured, or a straight line.
 MEASURED: Final = 'needle_poses'
 LINE: Final = 'line from guide to tip, not measured'
 
 
 class Shape(NamedTuple):
     """
-    The needle in ``needle_entry``.
+    Shape of the needle in ``needle_entry``.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Shape(NamedTuple):
     points : ndarray, shape (n, 3)
         From the guide to the tip [m]; at least two.
     turn : ndarray, shape (4,)
-        Orientation of the tip, which brings y along the needle: quaternion x, y, z, w.
+        Orientation of the tip, with y along the needle: quaternion x, y, z, w.
     source : str
         `MEASURED` or `LINE`.
 
@@ -49,14 +49,14 @@ class Shape(NamedTuple):
 
 class Pose(NamedTuple):
     """
-    A pose in ``needle_entry``.
+    Pose in ``needle_entry``.
 
     Attributes
     ----------
     stamp : int
-        Its time [ns].
+        Time [ns].
     position : ndarray, shape (3,)
-        Where it is [m].
+        Position [m].
     turn : ndarray, shape (4,)
         Orientation: quaternion x, y, z, w.
 
@@ -69,12 +69,12 @@ class Pose(NamedTuple):
 
 class NeedleView:
     """
-    Collects what comes of the needle; times are those of a clock that never jumps [s].
+    Latest measurements of the needle; times of arrival are of a monotonic clock [s].
 
     Attributes
     ----------
     expected : Pose or None
-        Where the tip was last expected.
+        Last prediction of the tip.
 
     """
 
@@ -86,106 +86,32 @@ class NeedleView:
 
     def take_poses(self, stamp: int, points: ArrayLike, turn: ArrayLike, now: float) -> None:
         """
-        Take a shape.
+        Store a shape: points (n, 3) from the guide to the tip [m], and the quaternion of the tip.
 
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        points : array_like, shape (n, 3)
-            From the guide to the tip [m].
-        turn : array_like, shape (4,)
-            Orientation of the last one: quaternion x, y, z, w.
-        now : float
-            Time [s].
-
-        Raises
-        ------
-        MessageError
-            If it is no shape.
-
+        ``stamp`` is in ns and ``now`` in s; `MessageError` if the shape is invalid.
         """
         there = _places(points)
         if there.ndim != 2 or not 2 <= len(there) <= MOST_POINTS:
-            raise MessageError(f'it has {len(there)} poses, 2 to {MOST_POINTS} are a shape')
+            raise MessageError(f'it has {len(there)} poses, a shape has 2 to {MOST_POINTS}')
         self._shape = now, Shape(stamp, there, _turn(turn), MEASURED)
 
     def take_tip(self, stamp: int, tip: ArrayLike, now: float) -> None:
-        """
-        Take a reading of the tip.
-
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        tip : array_like, shape (3,)
-            Where it is [m].
-        now : float
-            Time [s].
-
-        Raises
-        ------
-        MessageError
-            If it is nowhere.
-
-        """
+        """Store a tip position [m]; `MessageError` if it is invalid."""
         self._tip = now, stamp, _places(tip)
 
     def take_guide(self, x: float, z: float, now: float) -> None:
-        """
-        Take a reading of the guide.
-
-        Parameters
-        ----------
-        x, z : float
-            Where it holds the needle [m].
-        now : float
-            Time [s].
-
-        Raises
-        ------
-        MessageError
-            If it is nowhere.
-
-        """
+        """Store the position of the guide [m]; `MessageError` if it is invalid."""
         self._guide = now, _places([x, 0.0, z])
 
     def take_expected(self, stamp: int, position: ArrayLike, turn: ArrayLike) -> None:
-        """
-        Take where the tip is expected.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the estimate [ns].
-        position : array_like, shape (3,)
-            Where it will be [m].
-        turn : array_like, shape (4,)
-            Orientation there: quaternion x, y, z, w.
-
-        Raises
-        ------
-        MessageError
-            If it is no pose.
-
-        """
+        """Store a prediction of the tip pose; `MessageError` if it is invalid."""
         self.expected = Pose(stamp, _places(position), _turn(turn))
 
     def shape(self, now: float) -> Shape | None:
         """
-        Return the needle as it is known.
+        Return the last shape, or after its timeout a line from the guide to the last tip position.
 
-        Parameters
-        ----------
-        now : float
-            Time [s].
-
-        Returns
-        -------
-        Shape or None
-            The last shape that came, if it is not old; else a line from the guide to the last
-            tip; None if that is old, too.
-
+        None after the timeout of both; ``now`` is in s.
         """
         if self._shape is not None and now - self._shape[0] <= _LASTS:
             return self._shape[1]
@@ -198,7 +124,7 @@ class NeedleView:
 
 
 def _places(given: ArrayLike) -> FloatArray:
-    """Return positions that can be."""
+    """Return positions as an array [m]; `MessageError` if one is implausible."""
     there = np.array(given, dtype=np.float64)
     if not (np.abs(there) <= _FARTHEST).all():
         raise MessageError(f'a position is not within {_FARTHEST:g} m')
@@ -206,7 +132,7 @@ def _places(given: ArrayLike) -> FloatArray:
 
 
 def _turn(given: ArrayLike) -> FloatArray:
-    """Return an orientation that is one."""
+    """Return a quaternion as an array; `MessageError` if it is invalid."""
     try:
         rotation_matrix(given)
     except ParameterError as error:
@@ -215,11 +141,11 @@ def _turn(given: ArrayLike) -> FloatArray:
 
 
 def _along(way: FloatArray) -> FloatArray:
-    """Return the shortest turn that brings y along a way: quaternion x, y, z, w."""
+    """Return the shortest rotation from y to a direction: quaternion x, y, z, w."""
     length = float(np.linalg.norm(way))
     if length == 0.0:
         return np.array([0.0, 0.0, 0.0, 1.0])
     x, y, z = way / length
-    # Half the angle from y, about the normal of both; opposite ways have any normal.
+    # Half the angle from y, about the normal of both; for opposite directions any normal.
     turn = np.array([z, 0.0, -x, 1.0 + y]) if y > -1.0 else np.array([1.0, 0.0, 0.0, 0.0])
     return np.asarray(turn / np.linalg.norm(turn))

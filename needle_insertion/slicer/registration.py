@@ -1,4 +1,4 @@
-"""From the frame of the needle to that of the images, and back."""
+"""Transformation between the frame of the needle and the frame of the images."""
 
 from __future__ import annotations
 
@@ -12,32 +12,18 @@ from needle_ros.settings import check_constants, constant
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Lengths of OpenIGTLink and of 3D Slicer [per m].
+#: Millimeters per meter: OpenIGTLink and 3D Slicer use mm.
 MILLIMETERS: Final = 1e3
 
-#: Numbers of a quaternion that was written with three digits are off by this.
+#: Tolerance of the norm of a quaternion that is rounded to three digits.
 _ROUNDED: Final = 2e-3
 
 
 def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
     """
-    Return the rotation of a quaternion.
+    Return the rotation matrix, shape (3, 3), of a quaternion x, y, z, w.
 
-    Parameters
-    ----------
-    quaternion : array_like, shape (4,)
-        x, y, z, w; it is scaled to norm 1.
-
-    Returns
-    -------
-    ndarray, shape (3, 3)
-        Turns vectors as the quaternion does.
-
-    Raises
-    ------
-    ParameterError
-        If its norm is not 1, but for rounding.
-
+    The quaternion is normalized; `ParameterError` if its norm is not 1 up to rounding.
     """
     given = np.array(quaternion, dtype=np.float64)
     norm = sqrt(given @ given) if given.shape == (4,) and np.isfinite(given).all() else 0.0
@@ -58,7 +44,7 @@ def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
     r"""
-    Where the frame ``needle_entry`` is in the images.
+    Pose of the frame ``needle_entry`` in the images.
 
     .. math:: p_{image} = R p_{needle} + t
 
@@ -69,15 +55,15 @@ class Registration:
     rotation: tuple[float, ...] = constant(
         (0.0, 0.0, 0.0, 1.0),
         '1',
-        'turns vectors of needle_entry into the frame of the images: quaternion x, y, z, w',
+        'rotation from needle_entry to the frame of the images: quaternion x, y, z, w',
         low=-1.0,
         high=1.0,
     )
     translation: tuple[float, ...] = constant(
         (0.0, 0.0, 0.0),
         'm',
-        'where the entry point is in the frame of the images: x, y, z; in m, while Slicer shows '
-        'mm',
+        'position of the entry point in the frame of the images: x, y, z; in m (3D Slicer shows '
+        'mm)',
         low=-10.0,
         high=10.0,
     )
@@ -94,62 +80,21 @@ class Registration:
             raise ParameterError(f'rotation {error}') from error
 
     def to_image(self, points: ArrayLike) -> FloatArray:
-        """
-        Convert points of the needle.
-
-        Parameters
-        ----------
-        points : array_like, shape (..., 3)
-            In ``needle_entry`` [m].
-
-        Returns
-        -------
-        ndarray, shape (..., 3)
-            In the frame of the images [mm].
-
-        """
+        """Transform points (..., 3) from ``needle_entry`` [m] to the frame of the images [mm]."""
         turned = np.asarray(points, dtype=np.float64) @ rotation_matrix(self.rotation).T
         return np.asarray(MILLIMETERS * (turned + self.translation))
 
     def to_needle(self, points: ArrayLike) -> FloatArray:
-        """
-        Convert points of the images.
-
-        Parameters
-        ----------
-        points : array_like, shape (..., 3)
-            In the frame of the images [mm].
-
-        Returns
-        -------
-        ndarray, shape (..., 3)
-            In ``needle_entry`` [m].
-
-        """
+        """Transform points (..., 3) from the frame of the images [mm] to ``needle_entry`` [m]."""
         lengths = np.asarray(points, dtype=np.float64) / MILLIMETERS
         return np.asarray((lengths - self.translation) @ rotation_matrix(self.rotation))
 
     def pose_to_image(self, position: ArrayLike, quaternion: ArrayLike) -> FloatArray:
         """
-        Convert a pose of the needle.
+        Transform a pose in ``needle_entry`` to a homogeneous matrix in the frame of the images.
 
-        Parameters
-        ----------
-        position : array_like, shape (3,)
-            In ``needle_entry`` [m].
-        quaternion : array_like, shape (4,)
-            Orientation in ``needle_entry``: x, y, z, w.
-
-        Returns
-        -------
-        ndarray, shape (4, 4)
-            Homogeneous matrix in the frame of the images, lengths in mm.
-
-        Raises
-        ------
-        ParameterError
-            If the norm of the quaternion is not 1.
-
+        The position is in m, the quaternion x, y, z, w, and lengths of the matrix, shape (4, 4),
+        in mm.
         """
         pose = np.eye(4)
         pose[:3, :3] = rotation_matrix(self.rotation) @ rotation_matrix(quaternion)

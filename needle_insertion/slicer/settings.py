@@ -1,4 +1,4 @@
-"""Where the peer is, how the image lies, and which targets make sense, as parameters."""
+"""Settings of the connection and of targets, as parameters."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from typing import Final
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
-#: Who waits for whom.
+#: Roles in the connection.
 ROLES: Final = ('server', 'client')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """Where the peer is, and who connects."""
+    """Role and address of the connection."""
 
     role: str = field(
         default=ROLES[0],
-        metadata={'description': f'one of {", ".join(ROLES)}: whether the peer connects, or we'},
+        metadata={
+            'description': f'one of {", ".join(ROLES)}: the server waits, the client connects'
+        },
     )
     host: str = field(
         default='127.0.0.1',
         metadata={
-            'description': 'IPv4 address: as server, of this machine, on which to listen '
-            '(0.0.0.0: all of them); as client, that of the peer'
+            'description': 'IPv4 address: as server, address of this machine to listen on '
+            '(0.0.0.0: all addresses); as client, address of the peer'
         },
     )
     port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0)
@@ -34,7 +36,7 @@ class LinkSettings:
         if self.role not in ROLES:
             raise ParameterError(f'role must be one of {", ".join(ROLES)}, got {self.role!r}')
         try:
-            # Looking a name up could block.
+            # A name lookup can block.
             IPv4Address(self.host)
         except AddressValueError as error:
             raise ParameterError(
@@ -48,10 +50,10 @@ class LinkSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetSettings:
-    """Which targets make sense."""
+    """Limits of targets."""
 
     reach: float = constant(
-        0.3, 'm', 'farthest target from the entry point that is passed on', open_low=True
+        0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
     )
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Node `slicer`: targets from 3D Slicer, and the needle to it, by OpenIGTLink."""
+"""Node `slicer`: OpenIGTLink connection to 3D Slicer, targets in and needle pose out."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _PERIOD: Final = 0.05
 #: Time between two states, unless something changes [s].
 _STATE_PERIOD: Final = 1.0
 
-#: Most messages that are read at a time.
+#: Largest number of messages per reading.
 _AT_ONCE: Final = 16
 
-#: Most nodes whose state is sent, and time after which a node is silent, or left out [s].
+#: Largest number of transmitted node states, and ages of a silent and of a removed node [s].
 _MOST_NODES: Final = 20
 _SILENT: Final = 5.0
 _FORGOTTEN: Final = 60.0
@@ -49,7 +49,7 @@ _LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
 
 _PACKAGE: Final = 'pyigtl'
 
-#: Who takes targets, until a node has answered.
+#: Name of the receiver of targets until a node has answered.
 _TAKER: Final = 'controller or steering'
 
 
@@ -58,15 +58,15 @@ class SlicerNode(BaseNode):
     Connect 3D Slicer by OpenIGTLink: targets to ``target``, the needle to 3D Slicer.
 
     It receives POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the
-    images, and sends each target until a node acknowledges it. It transmits, 20 times a second,
-    the shape of the needle and the pose of its tip; also the expected tip, and the state of all
-    nodes from ``/diagnostics``. ``registration.*`` is the pose of ``needle_entry`` in the images.
-    The pose of the tip is published on ``tip_pose``, too.
+    images, and publishes each target until a node acknowledges it. It transmits the shape of the
+    needle and the pose of its tip at 20 Hz, the predicted tip pose, and the state of all nodes
+    from ``/diagnostics``. ``registration.*`` is the pose of ``needle_entry`` in the images. The
+    pose of the tip is also published on ``tip_pose``.
 
-    The shape is from ``needle_poses``. Without them it is the line from the guide
-    (``joint_states``) to the tip (``tip_deflection``), and is marked as not measured.
+    The source of the shape is ``needle_poses``. Without this topic the shape is the line from the
+    guide (``joint_states``) to the tip (``tip_deflection``), marked as not measured.
 
-    The connection is looked after by a timer of the node: there is no thread, and nothing waits.
+    A timer of the node serves the connection, without threads and blocking calls.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -81,7 +81,7 @@ class SlicerNode(BaseNode):
         self._shapes = self._targets = 0
         self._source = ''
         self._rate = RateCounter()
-        #: The target that has no answer yet, with its message.
+        #: Unanswered target with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
         #: Latest status of each node: time, level and message.
         self._said: dict[str, tuple[float, int, str]] = {}
@@ -89,13 +89,13 @@ class SlicerNode(BaseNode):
 
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
-        # The driver of a sensor may offer its shapes as other sensors theirs.
+        # Sensor drivers may publish their shapes with the QoS of sensors.
         self.subscribe(replace(contract.NEEDLE_POSES, qos=contract.SENSOR), self._on_poses)
         self.listen(contract.JOINT_STATES, self._on_joints)
         self.listen(contract.TIP_DEFLECTION, self._on_tip)
         self.subscribe(contract.TIP_EXPECTED, self._on_expected)
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
-        #: A clock that stands still does not stop the connection.
+        #: Steady clock: a stopped ROS clock does not stop the connection.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     # Transitions.
@@ -114,27 +114,26 @@ class SlicerNode(BaseNode):
         self._link = Link(self.settings('', LinkSettings), is_wanted, self._journal)
 
     def cleanup(self) -> None:
-        """Forget the connection."""
+        """Discard the connection."""
         if self._link is not None:
             self._link.close()
         self._link = self._interpreter = None
 
     def activate(self) -> None:
-        """Open the connection, and look after it from now on."""
+        """Open the connection and start its timer."""
         self._due = monotonic()
         self._timer = self.create_timer(_LOOK, self._tick, clock=self._steady)
 
     def deactivate(self) -> None:
-        """Close the connection."""
         self.destroy_timer(self._timer)
         if self._link is not None:
             self._link.close()
 
     def about(self) -> str:
-        """Name the connection and the topics."""
+        """Describe the connection and the topics."""
         return (
             f'{self._link.state if self._link is not None else ""}; publishes '
-            f'{contract.TARGET.name} and {contract.TIP_POSE.name}, takes '
+            f'{contract.TARGET.name} and {contract.TIP_POSE.name}, subscribes to '
             f'{contract.NEEDLE_POSES.name}, or {contract.JOINT_STATES.name} and '
             f'{contract.TIP_DEFLECTION.name}'
         )
@@ -155,7 +154,7 @@ class SlicerNode(BaseNode):
         found = dict(zip(reading.names, reading.values[0], strict=False))
         if contract.INSERTION not in found:
             return
-        # A guide that does not move is where the needle enters.
+        # A guide without joints is at the entry point.
         x, z = found.get(contract.GUIDE_X, 0.0), found.get(contract.GUIDE_Z, 0.0)
         try:
             self._view.take_guide(x, z, monotonic())
@@ -223,7 +222,7 @@ class SlicerNode(BaseNode):
         self.tell(self._journal)
 
     def _repeat_target(self) -> None:
-        """Send the target again until it has an answer, and report a rejection."""
+        """Publish the target again until it is answered, and report a rejection."""
         if self._sending is None:
             return
         pending, message = self._sending
@@ -236,7 +235,7 @@ class SlicerNode(BaseNode):
             self._target.publish(message)
 
     def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
-        """Pass the newest target on."""
+        """Publish the newest target."""
         newest = None
         for frame in frames[-_AT_ONCE:]:
             try:
@@ -248,7 +247,7 @@ class SlicerNode(BaseNode):
         if len(frames) > 2:
             self._journal.say(
                 Severity.WARNING,
-                f'{len(frames)} messages within {_LOOK:g} s: only the newest target counts',
+                f'{len(frames)} messages within {_LOOK:g} s: only the newest target is used',
                 'flood',
             )
         if newest is None:
@@ -256,7 +255,7 @@ class SlicerNode(BaseNode):
         frame, (x, y, z) = newest
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
-        # The clock of the peer may be any.
+        # The clock of the peer is not synchronized.
         message.header.stamp = request_stamp(self)
         message.point.x, message.point.y, message.point.z = x, y, z
         self._target.publish(message)
@@ -268,7 +267,7 @@ class SlicerNode(BaseNode):
         self._journal.say(
             Severity.INFO if heard else Severity.WARNING,
             f'target ({words}) mm in {contract.ENTRY}, by {frame.kind} of {frame.device}'
-            + ('' if heard else f': no node takes {contract.TARGET.name}'),
+            + ('' if heard else f': no node subscribes to {contract.TARGET.name}'),
             'target',
         )
 
@@ -310,13 +309,13 @@ class SlicerNode(BaseNode):
         return int(monotonic() * NANOSECONDS)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Report the connection, the shapes sent and the targets received."""
+        """Report the connection, the transmitted shapes and the received targets."""
         link = self._link
         if link is None or not self.is_active:
             return super().diagnose()
         source = self._source or (
             f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
-            f'{contract.TIP_DEFLECTION.name} come'
+            f'{contract.TIP_DEFLECTION.name} received'
         )
         values: dict[str, object] = {
             'shapes sent': self._shapes,

@@ -1,1 +1,1 @@
-"""What is happening, as a page in a browser: live, or from a bag."""
+"""Live or recorded state of the nodes as a page in a browser."""

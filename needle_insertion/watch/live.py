@@ -1,4 +1,4 @@
-"""Frames of what is happening now, and of a recording, as the readers of the page get them."""
+"""JSON frames of live nodes and of a recording for the readers of the page."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def _json(content: object) -> str:
 
 class Live:
     """
-    Makes a frame now and then, the same for all readers.
+    Generator of frames at a fixed rate, the same for all readers.
 
     Parameters
     ----------
     view : View
-        What is seen.
+        State of the page.
     poll : callable
-        Brings what has come to the view.
+        Updates the view at a time [s].
     control : bool
         Whether the page has buttons.
 
@@ -45,7 +45,7 @@ class Live:
         self.number, self.frame = 0, ''
 
     async def run(self) -> None:
-        """Make frames, until it is cancelled."""
+        """Generate frames until cancelled."""
         due = monotonic()
         while True:
             now = monotonic()
@@ -56,43 +56,27 @@ class Live:
             self.number, self.frame = self.number + 1, _json(frame)
             async with self._changed:
                 self._changed.notify_all()
-            # A machine that was busy does not catch up.
+            # No extra frames after a delay.
             due = max(due + PERIOD, now)
             await asyncio.sleep(due - monotonic())
 
     def reader(self) -> LiveReader:
-        """Return what a new reader sees."""
+        """Return the interface of a new reader."""
         return LiveReader(self)
 
     @property
     def beginning(self) -> dict[str, Any]:
-        """What a reader needs before its first frame."""
+        """Content that a reader needs before its first frame."""
         return {'setting': self._setting, 'history': list(self._history)}
 
     async def newer(self, number: int) -> None:
-        """
-        Wait for a newer frame.
-
-        Parameters
-        ----------
-        number : int
-            Number of the frame that is known.
-
-        """
+        """Wait for a frame newer than ``number``."""
         async with self._changed:
             await self._changed.wait_for(lambda: self.number > number)
 
 
 class LiveReader:
-    """
-    What one reader sees of what is happening.
-
-    Parameters
-    ----------
-    live : Live
-        What is happening.
-
-    """
+    """Frames of live nodes for one reader."""
 
     def __init__(self, live: Live) -> None:
         self._live = live
@@ -100,15 +84,7 @@ class LiveReader:
         self._scene: dict[str, Any] = {}
 
     async def next(self) -> str:
-        """
-        Wait for a frame that is newer than the last one.
-
-        Returns
-        -------
-        str
-            The newest frame, with the scene if it has changed, as JSON.
-
-        """
+        """Wait for the next newer frame; return it, with the scene if it has changed, as JSON."""
         live, first = self._live, self._number == 0
         await live.newer(self._number)
         self._number = live.number
@@ -121,35 +97,20 @@ class LiveReader:
         return '{' + ','.join(parts) + '}'
 
     def take(self, message: dict[str, Any]) -> None:
-        """
-        Refuse what is asked for: there is no other time than now.
-
-        Parameters
-        ----------
-        message : dict
-            From the page.
-
-        Raises
-        ------
-        ParameterError
-            Always.
-
-        """
-        raise ParameterError(
-            f'what is happening now takes "seen" and "ask" only, got {sorted(message)}'
-        )
+        """Raise `ParameterError`: live frames have no playback."""
+        raise ParameterError(f'the live page accepts "seen" and "ask" only, got {sorted(message)}')
 
 
 class RecordedReader:
     """
-    What one reader sees of a recording.
+    Frames of a recording for one reader.
 
     Parameters
     ----------
     recording : Recording
-        The recording.
+        Recording.
     losses : sequence of str
-        What could not be read.
+        Descriptions of unreadable parts.
 
     """
 
@@ -169,21 +130,13 @@ class RecordedReader:
         self._asked.set()
 
     async def next(self) -> str:
-        """
-        Wait until there is another frame.
-
-        Returns
-        -------
-        str
-            The frame of the present time, with the history if that has jumped, as JSON.
-
-        """
+        """Wait for the next frame; return it, with the history after a jump, as JSON."""
         playback = self._playback
         if playback.playing:
             await asyncio.sleep(self._due - monotonic())
         else:
             await self._asked.wait()
-        # One that was slow does not catch up.
+        # No extra frames after a delay.
         self._due = max(self._due, monotonic() - PERIOD) + PERIOD
         self._asked.clear()
         at = playback.at
@@ -203,19 +156,6 @@ class RecordedReader:
         return _json(content)
 
     def take(self, message: dict[str, Any]) -> None:
-        """
-        Go to a time, play, pause, or change the speed.
-
-        Parameters
-        ----------
-        message : dict
-            As `Playback.take` takes it.
-
-        Raises
-        ------
-        ParameterError
-            If it is not valid.
-
-        """
+        """Process a playback message; see `Playback.take`."""
         self._jumped |= self._playback.take(message)
         self._asked.set()

@@ -1,4 +1,4 @@
-"""Frames of a bag, for any time in it."""
+"""Frames of a bag at any time."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import read_line, read_string, Reader, Reading
 
-#: Topics of which the page shows something; each also in a namespace.
+#: Topics shown on the page; each also in a namespace.
 STREAMS: Final = (
     contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION, contract.REFERENCE,
     contract.TRACKING_ERROR, contract.TARGET,
 )  # fmt: skip
 _OTHERS: Final = (contract.NEEDLE_SHAPE, contract.TIP_EXPECTED, contract.DIAGNOSTICS)
 
-#: Most messages that are kept of each; of a longer recording every other one is left out.
+#: Largest number of stored messages per topic; longer recordings are decimated by two.
 _MOST: Final = 8192
 
-#: Rows of the history per second; a node that was silent for so long is so at the end [Hz].
+#: Rows of the history per second [Hz].
 _HISTORY_RATE: Final = 10.0
 
-#: Speeds at which a recording may be shown, in multiples of that of its time.
+#: Range of the playback speed, relative to real time.
 SLOWEST, FASTEST = 0.02, 50.0
 
 _Item = TypeVar('_Item')
@@ -45,7 +45,7 @@ def _same(item: _Item) -> _Item:
 
 
 class _Kept(Generic[_Item]):
-    """Messages of a topic by time, not more than so many a second, and not more than `_MOST`."""
+    """Messages of a topic by time, decimated to an interval [s] and to `_MOST` messages."""
 
     def __init__(self, interval: float = 0.0) -> None:
         self.interval = interval
@@ -53,7 +53,7 @@ class _Kept(Generic[_Item]):
         self._items: list[_Item] = []
 
     def add(self, time: float, make: Callable[[], _Item]) -> None:
-        """Keep what is made for a time, if that is not too soon after the one before."""
+        """Store the result of ``make`` unless it is too soon after the previous message."""
         if self._times and time < self._times[-1] + self.interval:
             return
         self._items.append(make())
@@ -64,28 +64,28 @@ class _Kept(Generic[_Item]):
             del self._times[1::2], self._items[1::2]
 
     def at(self, time: float) -> tuple[float, _Item] | None:
-        """Return the newest at a time, and when it came."""
+        """Return time and content of the newest message at a time."""
         k = bisect_right(self._times, time) - 1
         return (self._times[k], self._items[k]) if k >= 0 else None
 
 
 class Recording:
     """
-    What a bag shows, by time from its beginning.
+    Content of a bag for the page, by time from its start.
 
     Parameters
     ----------
     path : Path
-        The bag, as `needle_identification.Bag` takes it.
+        Bag in a format of `needle_identification.Bag`.
 
     Attributes
     ----------
     name : str
         Name of the bag.
     duration : float
-        From the first to the last message that is shown [s].
+        Time from the first to the last shown message [s].
     losses : tuple of str
-        What could not be read.
+        Descriptions of unreadable parts.
 
     Raises
     ------
@@ -127,7 +127,7 @@ class Recording:
         self.duration = (last - (first or 0)) / NANOSECONDS
         self.losses = tuple(bag.losses)
         if self._invalid:
-            self.losses += (f'{self._invalid} messages are not of the type of their topic',)
+            self.losses += (f'{self._invalid} messages do not match the type of their topic',)
         shown: list[_Kept[Any]] = [*self._readings.values(), *self._lines.values()]
         if not any(kept.at(self.duration) for kept in shown):
             reasons = '; '.join((f'{path} has no readings to show', *self.losses))
@@ -136,7 +136,7 @@ class Recording:
         self._silent = max(1.0, 3.0 * longest)
 
     def _take(self, name: str, message: Recorded, first: int) -> None:
-        """Keep what a message says."""
+        """Store the content of a message."""
         time, data = (message.received - first) / NANOSECONDS, message.data
         if name in self._readers:
             read = self._readers[name].read
@@ -155,20 +155,7 @@ class Recording:
             self._configurations[name].add(time, lambda: parameters)
 
     def view(self, time: float) -> View:
-        """
-        Return all that was known at a time.
-
-        Parameters
-        ----------
-        time : float
-            Time from the beginning [s].
-
-        Returns
-        -------
-        View
-            What can be seen then.
-
-        """
+        """Return the state of the page at a time from the start [s]."""
         view = View(self._silent)
         view.invalid = self._invalid
         for topic, readings in self._readings.items():
@@ -188,20 +175,7 @@ class Recording:
         return view
 
     def history(self, time: float) -> list[list[float | None]]:
-        """
-        Return what was seen before a time.
-
-        Parameters
-        ----------
-        time : float
-            Time from the beginning [s].
-
-        Returns
-        -------
-        list of list of float or None
-            As `view.row` returns them, 10 a second.
-
-        """
+        """Return the history before a time [s]: rows of `view.row` at 10 Hz."""
         count = int(min(SPAN, time) * _HISTORY_RATE)
         rows = []
         for k in range(count, 0, -1):
@@ -216,21 +190,21 @@ class Recording:
 
 class Playback:
     """
-    A recording as one reader of the page goes through it.
+    Playback of a recording for one reader.
 
     Parameters
     ----------
     duration : float
         Length of the recording [s].
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        Returns the time of a monotonic clock [s].
 
     Attributes
     ----------
     playing : bool
-        Whether its time goes on.
+        Whether the playback runs.
     speed : float
-        Multiple of the time of the recording.
+        Playback speed relative to real time.
 
     """
 
@@ -243,7 +217,7 @@ class Playback:
 
     @property
     def at(self) -> float:
-        """Time from the beginning [s]; at the end it no longer plays."""
+        """Time from the start [s]; playback stops at the end."""
         if self.playing:
             now = self._steady()
             self._at += self.speed * (now - self._since)
@@ -254,23 +228,9 @@ class Playback:
 
     def take(self, message: dict[str, Any]) -> bool:
         """
-        Do what a reader asks for.
+        Process a playback message: ``at`` (a time [s]), ``play`` (bool) or ``speed``.
 
-        Parameters
-        ----------
-        message : dict
-            One of ``at`` (a time [s]), ``play`` (true or false) and ``speed``.
-
-        Returns
-        -------
-        bool
-            Whether time has jumped.
-
-        Raises
-        ------
-        ParameterError
-            If it is none of these.
-
+        Returns whether the time has jumped; `ParameterError` if the message is invalid.
         """
         now = self.at
         match message:
@@ -286,7 +246,7 @@ class Playback:
                 self.speed = float(speed)
             case _:
                 raise ParameterError(
-                    'a recording takes {"at": seconds}, {"play": true or false} or {"speed": '
+                    'a recording accepts {"at": seconds}, {"play": true or false} or {"speed": '
                     f'{SLOWEST:g} to {FASTEST:g}}}'
                 )
         self._since = self._steady()
@@ -294,7 +254,7 @@ class Playback:
 
 
 def _chosen(there: tuple[Topic, ...]) -> dict[Topic, str]:
-    """Return the topics to read, with their names in the contract or of the node that tells."""
+    """Return the topics to read, by contract name or, for configurations, by node name."""
     chosen: dict[Topic, str] = {}
     for topic in sorted(there, key=lambda one: len(one.name), reverse=True):
         space, _, last = topic.name.rpartition('/')

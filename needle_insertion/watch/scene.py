@@ -1,4 +1,4 @@
-"""What the nodes say of needle, tissue and limits in their configurations."""
+"""Needle, tissue and limits for the page, from the configurations of the nodes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any, Final
 
 from needle_ros.documents import DocumentError, read_document
 
-#: Nodes that know needle and tissue; the first there is counts, since a plant is what it says.
+#: Nodes with parameters of needle and tissue; the first available node is used.
 _KNOWING: Final = ('plant', 'steering', 'controller')
 
 #: Nodes whose configurations are read.
 CONFIGURED: Final = _KNOWING
 
-#: Limits of the controller, by the name that the page has for them.
+#: Parameters of the limits of the controller, by their names on the page.
 _LIMITS: Final = {
     'force': 'force_limit',
     'load': 'safety.axial_load',
@@ -25,20 +25,7 @@ _LIMITS: Final = {
 
 
 def parameters_of(text: str) -> dict[str, Any]:
-    """
-    Return the parameters that a node has published as its configuration.
-
-    Parameters
-    ----------
-    text : str
-        A parameter file with one node.
-
-    Returns
-    -------
-    dict
-        Values by name; empty if the text is something else.
-
-    """
+    """Return the parameters in a configuration (parameter file of one node); {} if invalid."""
     try:
         document = read_document(text)
         (content,) = document.values()
@@ -49,22 +36,13 @@ def parameters_of(text: str) -> dict[str, Any]:
 
 def scene(configurations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """
-    Return what the page needs to know of needle, tissue and limits.
+    Return needle, tissue and limits for the page from the parameters of nodes, by node name.
 
-    Parameters
-    ----------
-    configurations : mapping
-        Parameters of nodes, by name of the node.
-
-    Returns
-    -------
-    dict
-        ``tissue``: whose configuration it is (``of``), ``length`` of the needle, ``free`` length
-        between guide and skin [m], ``layers`` (depth [m] and stiffness [N/m^2] of each) and
-        ``membranes`` (depth [m] and strength [N]); None if no node has told. ``limits``: of
-        force, load [N], speed [m/s], error, deflection and the depths ``low`` and ``high`` [m],
-        as far as the controller has told. ``steered``: whether a node aims the tip.
-
+    ``tissue``: source node (``of``), ``length`` of the needle, ``free`` length between guide and
+    skin [m], ``layers`` (depth [m] and stiffness [N/m^2] of each) and ``membranes`` (depth [m] and
+    strength [N]); None without a configuration. ``limits``: of force, load [N], speed [m/s],
+    error, deflection and the depths ``low`` and ``high`` [m], if configured in the controller.
+    ``steered``: whether a node aims the tip.
     """
     whose = next((name for name in _KNOWING if name in configurations), None)
     return {
@@ -96,7 +74,7 @@ def _tissue(whose: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
         _numbers(parameters, 'steering.membrane_strengths'),
         strict=False,
     )
-    # Every node knows the free length; only that of a needle that is steered means anything.
+    # All nodes have the parameter free length; it is valid for a steered needle only.
     steered = whose == 'steering' or parameters.get('steered') is True
     return {
         'of': whose,
@@ -109,7 +87,7 @@ def _tissue(whose: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def _limits(parameters: Mapping[str, Any]) -> dict[str, float]:
     found = {name: _number(parameters, of) for name, of in _LIMITS.items()}
-    # As the controller has them: within what the needle has.
+    # As in the controller: limited to the range of the needle.
     for name, of, model, choose in (
         ('low', 'lowest_depth', 'model.minimum_depth', max),
         ('high', 'highest_depth', 'model.length', min),

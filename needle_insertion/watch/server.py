@@ -1,12 +1,12 @@
 """
-The page's server: one page, its files, and frames over a WebSocket.
+HTTP and WebSocket server of the page: its files, frames and commands.
 
-Who may do what, and what refuses the others:
+Access control:
 
-- It listens on an address of this machine only, unless it is opened for looking.
-- A request must name an address, not a name that somebody else's name server may lead here, and
-  a WebSocket must come from the page itself.
-- Commands are taken only where there is a control, and only with the token of this process.
+- The server listens on a loopback address unless other machines are given read access.
+- The header Host must be an address, not a host name that another name server resolves to this
+  machine, and a WebSocket must have the origin of the page itself.
+- Commands require a control and the token of this process.
 """
 
 from __future__ import annotations
@@ -29,27 +29,26 @@ from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 
-#: Port by default.
+#: Default port.
 PORT: Final = 8642
 
-#: Most readers at a time, and longest message of one [bytes].
+#: Largest number of readers, and of bytes in a message of a reader.
 MOST_READERS: Final = 16
 LONGEST: Final = 4096
 
-#: Frames that a reader gets before it has seen the first of them, and commands of one that may
-#: be under way.
+#: Largest number of unacknowledged frames and of commands in progress, per reader.
 _AHEAD: Final = 2
 _MOST_ASKED: Final = 8
 
 #: A reader that accepts no data for this time is disconnected [s].
 _PATIENCE: Final = 10.0
 
-#: Time between two looks whether a reader is still there [s].
+#: Period of the heartbeat of a WebSocket [s].
 _HEARTBEAT: Final = 20.0
 
 _PAGE: Final = Path(__file__).with_name('page')
 
-#: The files of the page; the drawing of the needle is that of the reports.
+#: Files of the page; the drawing of the needle is shared with the reports.
 _FILES: Final = {
     '/': (_PAGE / 'watch.html', 'text/html'),
     '/watch.css': (_PAGE / 'watch.css', 'text/css'),
@@ -57,7 +56,7 @@ _FILES: Final = {
     '/needle.js': (TEMPLATE_FOLDER / 'needle.js', 'text/javascript'),
 }
 
-#: The browser loads nothing from elsewhere, shows the page in no other, and tells nobody of it.
+#: No content from other origins, no embedding in other pages, no referrer.
 _HEADERS: Final = {
     'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -71,98 +70,53 @@ _HEADERS: Final = {
 
 
 class Reader(Protocol):
-    """What one reader of the page sees."""
+    """Interface of the source of frames for one reader of the page."""
 
     async def next(self) -> str:
-        """Wait until there is something new, and return it as JSON; what is old is left out."""
+        """Wait for the next frame and return it as JSON; outdated frames are skipped."""
 
     def take(self, message: dict[str, Any]) -> None:
-        """
-        Do what this reader asks for.
-
-        Parameters
-        ----------
-        message : dict
-            From the page.
-
-        Raises
-        ------
-        ParameterError
-            If it is not valid.
-
-        """
+        """Process a message from the page; `ParameterError` if it is invalid."""
 
 
 class Control(Protocol):
-    """Requests that the buttons of the page send."""
+    """Interface of the requests that the buttons of the page send."""
 
     async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
-        """
-        Send a target of the tip.
-
-        Parameters
-        ----------
-        x, y, z : float
-            The target [m].
-
-        Returns
-        -------
-        bool, str
-            Whether it is accepted, and the answer of the node.
-
-        Raises
-        ------
-        JobError
-            If there is no answer.
-
-        """
+        """Send a target [m]; return acceptance and answer, `JobError` without an answer."""
 
     async def ask(self, what: str) -> tuple[bool, str]:
         """
-        Call the services of a request.
+        Call the services of a request, a key of `needle_insertion.live.requests.REQUESTS`.
 
-        Parameters
-        ----------
-        what : str
-            A key of `needle_insertion.live.requests.REQUESTS`.
-
-        Returns
-        -------
-        bool, str
-            Whether it was executed, and the answers of the nodes.
-
-        Raises
-        ------
-        JobError
-            If there is no answer.
-
+        Returns success and the answers of the nodes; `JobError` without an answer.
         """
 
 
 class Server:
     """
-    Serves the page.
+    HTTP and WebSocket server of the page.
 
     Parameters
     ----------
     readers : callable
-        Makes what a new reader sees.
+        Returns the source of frames for a new reader.
     host : str
         Address to listen on.
     port : int
-        Port; 0 for a free one.
+        Port; 0 for a free port.
     control : Control, optional
-        What the buttons do; without it there are none.
+        Requests of the buttons; without it the page is read-only.
 
     Attributes
     ----------
     token : str
-        Whoever has it may use the buttons; '' without a control.
+        Token that authorizes commands; '' without a control.
 
     Raises
     ------
     ParameterError
-        If the address is not one, or a control would be open to other machines.
+        If the address is invalid, or a control would be open to other machines.
 
     """
 
@@ -182,7 +136,7 @@ class Server:
         if control is not None and not self._local:
             raise ParameterError(
                 f'--control works on this machine only, and --host {host} opens the page to '
-                'others: leave out one of them'
+                'other machines: remove one of the options'
             )
         if not 0 <= port <= 65535:
             raise ParameterError(f'--port must be 0 to 65535, got {port}')
@@ -194,35 +148,27 @@ class Server:
 
     @property
     def address(self) -> str:
-        """URL of the page, with the token if there is one."""
+        """URL of the page, including the token of a control."""
         host = '127.0.0.1' if ip_address(self._host).is_unspecified else self._host
         host = f'[{host}]' if ':' in host else host
-        # What follows # stays in the browser.
+        # The fragment after # is not sent by the browser.
         return f'http://{host}:{self._port}/' + (f'#token={self.token}' if self.token else '')
 
     @property
     def words(self) -> list[str]:
-        """What to say at the start, in lines."""
+        """Lines to print at the start."""
         lines = [f'page: {self.address}']
         if self.token:
-            lines.append('whoever has this address may move the needle: keep it to yourself')
+            lines.append('this address permits motion of the needle: do not share it')
         elif not self._local:
             lines.append(
-                f'other machines may look, by an address of this one and port {self._port}; '
-                'nobody may command here'
+                f'read access for other machines, at an address of this machine and port '
+                f'{self._port}; no commands'
             )
-        return [*lines, 'Ctrl-C ends it']
+        return [*lines, 'stop with Ctrl-C']
 
     async def start(self) -> None:
-        """
-        Begin to listen.
-
-        Raises
-        ------
-        ParameterError
-            If the port is in use, or the address is not of this machine.
-
-        """
+        """Start to listen; `ParameterError` if the port is in use or the address is not local."""
         app = web.Application(middlewares=[self._guard], client_max_size=LONGEST)
         for path, (file, kind) in _FILES.items():
             app.router.add_get(path, _file(file, kind))
@@ -243,7 +189,7 @@ class Server:
         self._port = self._runner.addresses[0][1]
 
     async def end(self) -> None:
-        """Let all readers go, and stop listening."""
+        """Disconnect all readers and stop listening."""
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None
@@ -253,7 +199,7 @@ class Server:
             with suppress(asyncio.TimeoutError, ConnectionError):
                 await asyncio.wait_for(socket.close(code=WSCloseCode.GOING_AWAY), 0.5)
 
-    # Who is let in.
+    # Access control.
 
     @web.middleware
     async def _guard(
@@ -261,7 +207,7 @@ class Server:
         request: web.Request,
         handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
     ) -> web.StreamResponse:
-        """Refuse what a page of somebody else could make a browser ask for."""
+        """Reject requests that a foreign page can make a browser send."""
         fault = self._fault(request.headers.get('Host', ''), request.headers.get('Origin'))
         if fault:
             return web.Response(status=403, text=f'{fault}\n', headers=_HEADERS)
@@ -272,11 +218,11 @@ class Server:
             raise
 
     def _fault(self, host: str, origin: str | None) -> str:
-        """Return why a request is refused; '' if it is not."""
+        """Return the reason for the rejection of a request, or ''."""
         try:
             parts = urlsplit(f'//{host}')
             name, port = parts.hostname or '', parts.port or 80
-            # The name of this machine, or an address: no name server leads to these.
+            # localhost or an address: not resolved by a name server.
             allowed = name == 'localhost' or ip_address(name).is_loopback or not self._local
         except ValueError:
             allowed, port = False, 0
@@ -289,7 +235,7 @@ class Server:
             return printable(f'the header Origin must be http://{host}, got {origin!r}')
         return ''
 
-    # A reader.
+    # Readers.
 
     async def _frames(self, request: web.Request) -> web.StreamResponse:
         if len(self._open) >= MOST_READERS:
@@ -303,7 +249,7 @@ class Server:
         self._open.add(socket)
         connection = _Connection(socket, self._readers())
         sending = asyncio.create_task(connection.send())
-        # A reader that takes nothing would keep `close` waiting.
+        # A reader that accepts no data would block `close`.
         sending.add_done_callback(lambda _: _break_off(request))
         try:
             async for message in socket:
@@ -315,7 +261,7 @@ class Server:
         return socket
 
     async def _take(self, connection: _Connection, message: WSMessage) -> None:
-        """Do what a message asks for, or say why not."""
+        """Process a message, or answer with the error."""
         try:
             content = _message(message)
             if 'ask' in content:
@@ -328,16 +274,14 @@ class Server:
             await connection.answer(success=False, words=str(error))
 
     async def _do(self, message: dict[str, Any]) -> tuple[bool, str]:
-        """Pass a command on, if it is one and may be given."""
+        """Execute a command if it is valid and authorized."""
         if self._control is None:
-            raise ParameterError('this page is for looking only: needle watch --control')
+            raise ParameterError('this page is read-only: use needle watch --control')
         token = message.pop('token', '')
-        # Text of JSON may have what cannot be encoded.
+        # JSON text can contain characters that cannot be encoded.
         given = token.encode(errors='replace') if isinstance(token, str) else b''
         if not compare_digest(given, self.token.encode()):
-            raise ParameterError(
-                'the token is not that of this process: open the URL that needle watch has printed'
-            )
+            raise ParameterError('wrong token: open the URL printed by needle watch')
         what = message.pop('ask')
         if what == 'target':
             at = message.pop('at', None)
@@ -352,10 +296,10 @@ class Server:
 
 class _Connection:
     """
-    One reader: what is sent to it, and what it has asked for.
+    Connection to one reader, with flow control.
 
-    It gets a frame only after it has seen those before, but for a few: one that is slow misses
-    some and sees no old ones, and nothing piles up.
+    A frame is sent only after acknowledgement of previous frames, up to `_AHEAD`: a slow reader
+    skips frames, receives no outdated frames, and nothing accumulates.
     """
 
     def __init__(self, socket: web.WebSocketResponse, reader: Reader) -> None:
@@ -366,13 +310,13 @@ class _Connection:
         self._ahead = 0
 
     def seen(self, number: int) -> None:
-        """Note that frames have been seen."""
+        """Process the acknowledgement of frames."""
         for _ in range(min(number, self._ahead)):
             self._ahead -= 1
             self._credit.release()
 
     async def send(self) -> None:
-        """Send what is new."""
+        """Send frames until the connection ends."""
         while True:
             await self._credit.acquire()
             self._ahead += 1
@@ -380,7 +324,7 @@ class _Connection:
                 return
 
     def begin(self, doing: Coroutine[Any, Any, tuple[bool, str]], what: str) -> None:
-        """Answer when something is done; meanwhile others may be asked for."""
+        """Execute a command in a task and answer at its end."""
 
         async def answer() -> None:
             try:
@@ -391,18 +335,18 @@ class _Connection:
 
         if len(self.asking) >= _MOST_ASKED:
             doing.close()
-            raise JobError(f'{_MOST_ASKED} commands are under way already')
+            raise JobError(f'{_MOST_ASKED} commands are already in progress')
         task = asyncio.create_task(answer())
         self.asking.add(task)
         task.add_done_callback(self.asking.discard)
 
     async def answer(self, *, success: bool, words: str, asked: str = '') -> None:
-        """Say what came of a message."""
+        """Send the result of a message."""
         said = {'asked': asked, 'success': success, 'words': printable(words)}
         await self._put(json.dumps({'answer': said}))
 
     async def _put(self, text: str) -> bool:
-        """Send a text; return whether it was taken."""
+        """Send a text; return whether the reader accepted it."""
         try:
             await asyncio.wait_for(self._socket.send_str(text), _PATIENCE)
         except (ConnectionError, asyncio.TimeoutError):
@@ -411,7 +355,7 @@ class _Connection:
 
 
 def _break_off(request: web.Request) -> None:
-    """End the connection of a request at once."""
+    """Abort the connection of a request."""
     if request.transport is not None:
         request.transport.abort()
 
@@ -426,7 +370,7 @@ def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.Stream
 
 
 def _message(message: WSMessage) -> dict[str, Any]:
-    """Return what a message says."""
+    """Parse a message as a JSON object."""
     try:
         content = json.loads(message.data, parse_constant=_no_number)
     except (ValueError, TypeError, RecursionError):
@@ -442,12 +386,12 @@ def _no_number(name: str) -> float:
 
 def _real(value: object) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    # Integers of JSON may have any number of digits.
+    # JSON integers can have any number of digits.
     return number and abs(value) < 1e9 and isfinite(value)  # type: ignore[arg-type]
 
 
 def _reason(error: OSError) -> str:
-    """Return what the system says, without what asyncio adds to it."""
+    """Return the system's description of an error, without additions of asyncio."""
     if error.errno == errno.EADDRINUSE:
         return 'the port is in use'
     return error.strerror or str(error)

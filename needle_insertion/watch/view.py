@@ -1,4 +1,4 @@
-"""What is seen: takes what comes on the topics, and gives it as frames for the page."""
+"""State of the page: stores messages of all topics and returns frames."""
 
 from __future__ import annotations
 
@@ -16,63 +16,41 @@ import numpy as np
 #: Frames per second.
 RATE: Final = 30.0
 
-#: Columns of the history, and how far back it goes [s].
+#: Columns of the history, and its duration [s].
 HISTORY: Final = ('time', 'depth', 'reference', 'force', 'tip_x', 'tip_z')
 SPAN: Final = 20.0
 
-#: Age from which a node is silent; it says something every second [s].
+#: Timeout of the status of a node, which is published every second [s].
 _SILENT_NODE: Final = 3.0
 
-#: Position, velocity and effort of a joint that is not there.
+#: Position, velocity and effort of a missing joint.
 _NOTHING: Final = (None, None, None)
 
-#: Most points of a line, and most nodes that are told of.
+#: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
 _NODES: Final = 64
 
-#: Half of an interval of 95 % over the standard deviation.
+#: Half width of a 95 % interval, in standard deviations.
 _NORMAL: Final = 1.96
 
-#: Values of /diagnostics by which nodes tell of their target.
+#: Keys of /diagnostics for the target of a node.
 _AIM: Final = 'target x, y, z [m]'
 _DEPTH: Final = 'target [m]'
 
-#: Values of /diagnostics of a node that people need beside its message.
+#: Keys of /diagnostics that are shown in addition to the message.
 _SHOWN: Final = ('step', 'chance to come within 1 mm', 'last complaint')
 
 
 def number(value: float | None) -> float | None:
-    """
-    Return a number as a frame has it.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-
-    Returns
-    -------
-    float or None
-        Rounded to 1e-7; None for what is none or not finite.
-
-    """
+    """Return a number rounded to 1e-7; None if missing or not finite."""
     return None if value is None or not isfinite(value) else round(float(value), 7)
 
 
 def line(points: FloatArray) -> list[list[float]]:
     """
-    Return a line as a frame has it.
+    Return points (n, 3) [m] as columns x, y and z, decimated to 120 points.
 
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        Points x, y, z [m].
-
-    Returns
-    -------
-    list of list of float
-        Columns x, y and z [m], with 120 points at most; points that are not finite are left out.
-
+    Points that are not finite are left out.
     """
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) > _POINTS:
@@ -82,21 +60,19 @@ def line(points: FloatArray) -> list[list[float]]:
 
 class View:
     """
-    The newest of everything that is known.
-
-    All times are those of one clock, in s.
+    Newest message of each topic; all times are of a single clock [s].
 
     Parameters
     ----------
     silent : float
-        Age from which a stream is silent [s].
+        Timeout of a topic [s].
 
     Attributes
     ----------
     invalid : int
-        Number of messages that could not be read.
+        Number of unreadable messages.
     scene : dict
-        Needle, tissue and limits, as `scene.scene` returns them.
+        Needle, tissue and limits, from `scene.scene`.
 
     """
 
@@ -104,57 +80,25 @@ class View:
         self.invalid = 0
         self.scene = scene({})
         self._silence = silent
-        #: Newest reading of each stream and when it came.
+        #: Newest reading of each topic and its time of arrival.
         self._readings: dict[str, tuple[float, Reading]] = {}
         self._lines: dict[str, tuple[float, list[list[float]]]] = {}
         self._expected: dict[str, Any] | None = None
         self._configurations: dict[str, dict[str, Any]] = {}
         self._nodes: dict[str, tuple[float, Any]] = {}
 
-    # What comes in.
+    # Input.
 
     def reading(self, topic: str, reading: Reading, now: float) -> None:
-        """
-        Take a reading of a stream.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic in the contract.
-        reading : Reading
-            Its content.
-        now : float
-            When it came [s].
-
-        """
+        """Store a reading of a topic, by its name in the contract, at a time [s]."""
         self._readings[topic] = now, reading
 
     def line(self, name: str, points: FloatArray, now: float) -> None:
-        """
-        Take a line of ``needle_shape``.
-
-        Parameters
-        ----------
-        name : str
-            ``needle`` or ``path``.
-        points : ndarray, shape (n, 3)
-            Its points [m].
-        now : float
-            When it came [s].
-
-        """
+        """Store a line of ``needle_shape``, ``needle`` or ``path``, with points (n, 3) [m]."""
         self._lines[name] = now, line(points)
 
     def expected(self, message: Any) -> None:
-        """
-        Take where the tip will be.
-
-        Parameters
-        ----------
-        message : PoseWithCovarianceStamped
-            Position and covariance.
-
-        """
+        """Store a prediction of the tip with its covariance."""
         at, covariance = message.pose.pose.position, np.asarray(message.pose.covariance)
         xx, xz, zz = (float(covariance[k]) for k in (0, 2, 14))
         if not all(map(isfinite, (at.x, at.y, at.z, xx, xz, zz))):
@@ -164,22 +108,12 @@ class View:
         self._expected = {
             'at': [number(one) for one in (at.x, at.y, at.z)],
             'half': [number(_NORMAL * one) for one in (x, z)],
-            # Of the ellipse: the correlation of x and z.
+            # Correlation of x and z, for the ellipse.
             'correlation': number(xz / (x * z)) if x * z > 0.0 else 0.0,
         }
 
     def configuration(self, node: str, parameters: dict[str, Any]) -> None:
-        """
-        Take the configuration of a node.
-
-        Parameters
-        ----------
-        node : str
-            Its name without namespace.
-        parameters : dict
-            Its parameters by name, as `scene.parameters_of` returns them.
-
-        """
+        """Store the parameters of a node, by its name without namespace."""
         if not parameters:
             self.invalid += 1
         elif parameters != self._configurations.get(node):
@@ -187,37 +121,14 @@ class View:
             self.scene = scene(self._configurations)
 
     def status(self, status: Any, now: float) -> None:
-        """
-        Take what a node says of its state.
-
-        Parameters
-        ----------
-        status : DiagnosticStatus
-            What it says.
-        now : float
-            When it came [s].
-
-        """
+        """Store the status of a node at a time [s]."""
         if status.name in self._nodes or len(self._nodes) < _NODES:
             self._nodes[status.name] = now, status
 
-    # What is seen.
+    # Output.
 
     def frame(self, now: float) -> dict[str, Any]:
-        """
-        Return what is seen now.
-
-        Parameters
-        ----------
-        now : float
-            Time [s].
-
-        Returns
-        -------
-        dict
-            For JSON: lengths in m, forces in N, times in s; None for what is not known.
-
-        """
+        """Return the frame at a time [s] for JSON: lengths in m, forces in N; None if unknown."""
         joints = self._joints(contract.JOINT_STATES.name)
         depth, velocity, effort = joints.get(contract.INSERTION, _NOTHING)
         aim = self._joints(contract.REFERENCE.name).get(contract.INSERTION, _NOTHING)
@@ -229,7 +140,7 @@ class View:
             'time': round(now, 3),
             'depth': depth,
             'velocity': velocity,
-            # Without a sensor, what the robot says that it exerts.
+            # Without a sensor, the effort reported by the robot.
             'force': effort if force is None else force[1],
             'sensed': force is not None,
             'reference': aim[0],
@@ -261,7 +172,7 @@ class View:
         return None if reading is None else [number(value) for value in reading.values[0][:3]]
 
     def _target(self) -> list[float | None] | None:
-        """Return the target x, y, z [m]; x and z are None where only the depth counts."""
+        """Return the target x, y, z [m]; x and z are None for a depth target."""
         told = [{pair.key: pair.value for pair in one.values} for _, one in self._nodes.values()]
         aims = [values[_AIM] for values in told if _AIM in values]
         depths = [values[_DEPTH] for values in told if _DEPTH in values]
@@ -272,7 +183,7 @@ class View:
                 return None if depths[0] == 'None' else [None, number(float(depths[0])), None]
         except ValueError:
             return None
-        # Of a controller that is not of this package.
+        # Target for a controller of another package.
         return self._vector(contract.TARGET.name) if not told else None
 
     def _shape(
@@ -282,7 +193,7 @@ class View:
         guide: Sequence[float | None],
         now: float,
     ) -> dict[str, Any]:
-        """Return needle and path, and where the shape is from."""
+        """Return needle, path, and source of the shape."""
         came, needle = self._lines.get('needle', (0.0, None))
         path = self._lines.get('path', (0.0, None))[1]
         if needle is not None and now - came < self._silence:
@@ -300,9 +211,9 @@ class View:
         return {'needle': line(np.array(ends)), 'path': path, 'shape': 'straight'}
 
     def _silent(self, now: float) -> dict[str, float]:
-        """Return the age of each stream that has been there and no longer comes [s]."""
+        """Return the age of each topic after its timeout [s]."""
         ages = {name: now - came for name, (came, _) in self._readings.items()}
-        # A target comes once.
+        # A target is published once.
         return {
             name: round(age, 1)
             for name, age in ages.items()
@@ -310,7 +221,7 @@ class View:
         }
 
     def _told(self, now: float) -> list[dict[str, Any]]:
-        """Return what each node says, the worst first."""
+        """Return the status of each node, sorted by level, the worst first."""
         nodes = []
         for name, (came, status) in self._nodes.items():
             level = status.level
@@ -330,20 +241,7 @@ class View:
 
 
 def row(frame: Mapping[str, Any]) -> list[float | None]:
-    """
-    Return what of a frame the strip charts show.
-
-    Parameters
-    ----------
-    frame : mapping
-        As `View.frame` returns it.
-
-    Returns
-    -------
-    list of float or None
-        Columns `HISTORY`.
-
-    """
+    """Return the values of a frame for the strip charts, in the columns `HISTORY`."""
     tip = frame['tip'] or [None] * 3
     charted = [frame['time'], frame['depth'], frame['reference'], frame['force']]
     return [*charted, tip[0], tip[2]]

@@ -1,4 +1,4 @@
-"""Node `watch`: subscribes to the topics of the page, at the least cost for the other nodes."""
+"""Node `watch`: subscriptions of the page, with minimum load on the other nodes."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 
-#: Only the newest reading counts.
+#: QoS for the newest message only.
 _NEWEST: Final = contract.SENSOR._replace(depth=1)
 
-#: Needle and path of a picture, and those of the one before.
+#: QoS for needle and path of two pictures.
 _LINES: Final = contract.SENSOR._replace(depth=4)
 
-#: Longest time to plan an insertion, and time between two checks for the answer of a node [s].
+#: Timeout of a target, including planning, and polling period of answers [s].
 _PLANNED: Final = 60.0
 _LOOK: Final = 0.01
 
-#: Events that are worked off at a time: the rest waits.
+#: Largest number of events per call.
 _EVENTS: Final = 50
 
-#: A burst at the start: every node says something.
+#: QoS for the burst of status messages at the start.
 _SAID: Final = contract.SENSOR._replace(depth=50)
 
 
 class WatchNode(Node):
     """
-    Brings the newest of every topic to a view, when it is asked to.
+    Forward the newest message of each topic to a view on request.
 
-    It is not spun: messages wait in the middleware, which keeps the newest ones only, and `poll`
-    takes these. It asks for best effort, so that nobody waits for it or sends anything again, and
-    it publishes nothing.
+    The node is not spun: messages wait in the middleware, which keeps the newest only, and `poll`
+    takes them. Subscriptions are best effort, so that no publisher waits or resends, and the node
+    publishes nothing.
 
     Parameters
     ----------
     view : View
-        Where the messages go.
+        Receiver of the messages.
     context : Context
         Context of the node.
 
@@ -92,7 +92,7 @@ class WatchNode(Node):
         *,
         raw: bool = True,
     ) -> None:
-        """Keep what comes on a topic until it is taken."""
+        """Subscribe to a topic and register the callback for its messages."""
         self._takers.append((waiting(self, topic, qos, raw=raw), take))
 
     def _configured(self, node: str, data: bytes, _now: float) -> None:
@@ -103,15 +103,7 @@ class WatchNode(Node):
             self._view.status(status, now)
 
     def poll(self, now: float) -> None:
-        """
-        Take what has come.
-
-        Parameters
-        ----------
-        now : float
-            Time of a steady clock [s].
-
-        """
+        """Process waiting messages at a time of a steady clock [s]."""
         for come, take in self._takers:
             for message in come():
                 try:
@@ -121,15 +113,7 @@ class WatchNode(Node):
 
 
 class Buttons:
-    """
-    Requests of the buttons of the page, through an `Operator`.
-
-    Parameters
-    ----------
-    context : Context
-        Context of its node.
-
-    """
+    """Requests of the buttons of the page, through an `Operator` in a node of its own."""
 
     def __init__(self, context: Context) -> None:
         self._node = Node(
@@ -140,33 +124,15 @@ class Buttons:
         self._executor.add_node(self._node)
 
     def spin(self) -> None:
-        """Receive the answers of nodes."""
+        """Process answers of nodes."""
         for _ in range(_EVENTS):
             self._executor.spin_once(timeout_sec=0.0)
 
     async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
-        """
-        Send a target of the tip.
-
-        Parameters
-        ----------
-        x, y, z : float
-            The target [m].
-
-        Returns
-        -------
-        bool, str
-            Whether it is accepted, and the answer of the node.
-
-        Raises
-        ------
-        JobError
-            If there is no answer.
-
-        """
-        # One of them is the `WatchNode` of this process.
+        """Send a target [m]; return acceptance and answer, `JobError` without an answer."""
+        # The `WatchNode` of this process is a subscriber too.
         if self._node.count_subscribers(contract.TARGET.name) < 2:
-            raise JobError('no node takes targets: start a controller or the node steering')
+            raise JobError('no node subscribes to target: start a controller or the node steering')
         pending = self._operator.target(x, y, z)
         await self._spin_until(lambda: pending.done, 'the target', _PLANNED)
         return pending.outcome
@@ -181,28 +147,15 @@ class Buttons:
             self.spin()
 
     async def ask(self, what: str) -> tuple[bool, str]:
-        """
-        Call the services of a request.
-
-        Parameters
-        ----------
-        what : str
-            A key of `needle_insertion.live.requests.REQUESTS`.
-
-        Returns
-        -------
-        bool, str
-            Whether it was executed, and the answers of the nodes.
-
-        """
+        """Call the services of a request in `REQUESTS`; return success and the answers."""
         answer = self._operator.ask(what)
-        # Without an answer it is done, too.
+        # Ends without an answer, too.
         await self._spin_until(answer.done, what)
         success, words = answer.result()
         return bool(success), str(words)
 
     def end(self) -> None:
-        """Leave the graph."""
+        """Destroy the node."""
         self._executor.remove_node(self._node)
         self._executor.shutdown()
         self._node.destroy_node()
@@ -211,22 +164,9 @@ class Buttons:
 @contextmanager
 def watching(*, control: bool) -> Iterator[tuple[View, Callable[[float], None], Buttons | None]]:
     """
-    Join the graph of the user, to watch it.
+    Join the ROS graph of the user; yield the view, a function to update it, and the buttons.
 
-    Parameters
-    ----------
-    control : bool
-        Whether there are buttons.
-
-    Yields
-    ------
-    View
-        What is seen.
-    callable
-        Brings what has come to the view.
-    Buttons or None
-        What the buttons do.
-
+    The buttons are None unless ``control`` is true.
     """
     stay_local(os.environ)
     context = Context()

@@ -1,4 +1,4 @@
-"""The benchmark of the control step compares the same law; times are not tested."""
+"""Benchmark of the control step: equality of the compared laws; times are not tested."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ import pytest
 PHANTOM = NeedleParameters.preset('phantom')
 
 
-def test_the_plain_law_is_ours() -> None:
+def test_numpy_law_equals_package_law() -> None:
     plain = NumpyInverseDynamics(PHANTOM, InverseDynamicsGains())
     law = sampled_laws(PHANTOM, PERIOD)['paper_inverse_dynamics']
     ours = SampledLoop(law, bench_control.DELAY, 15.0)
@@ -27,7 +27,7 @@ def test_the_plain_law_is_ours() -> None:
         expected = ours.command(depth, speed, Setpoint(target, 0.01))
         found = plain.command(depth, speed, np.array([target, 0.01, 0.0]))
         if k == 0:
-            # The plain one does not know that nothing was on its way: friction stops no needle.
+            # The NumPy law has no pending command at the start: friction stops no needle.
             plain.last = expected
             continue
         assert_allclose(found, expected, rtol=1e-9)

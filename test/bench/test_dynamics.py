@@ -1,4 +1,4 @@
-"""The benchmark of the dynamics compares like with like; times are not tested."""
+"""Benchmark of the dynamics: equality of the compared models; times are not tested."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def open_loop() -> OpenLoop:
 
 
 def states() -> Iterator[FloatArray]:
-    """States from shallow to deep: under way, withdrawing, at rest under a push that moves it."""
+    """States at increasing depths: moving, withdrawing, and at rest under a sufficient force."""
     random = np.random.default_rng(3)
     for depth, speed in ((0.02, 1.0), (0.1, 8.0), (0.199, -0.5), (0.07, 0.0)):
         modal = 1e-5 * random.standard_normal(2)
@@ -37,9 +37,7 @@ def states() -> Iterator[FloatArray]:
 @pytest.mark.parametrize('state', list(states()))
 @pytest.mark.parametrize('preset', ['paper_si', 'phantom'])
 @pytest.mark.parametrize('how', ['compiled', 'gauss', 'quad'])
-def test_every_solver_is_given_the_equations_of_the_model(
-    state: FloatArray, preset: str, how: str
-) -> None:
+def test_all_solvers_use_model_equations(state: FloatArray, preset: str, how: str) -> None:
     model = NeedleModel(NeedleParameters.preset(preset))
     if how == 'compiled':
         right_hand_side = solvers.compiled_right_hand_side(model, FORCE)
@@ -47,14 +45,14 @@ def test_every_solver_is_given_the_equations_of_the_model(
         right_hand_side = solvers.user_right_hand_side(model, FORCE, adaptive=how == 'quad')
     exact = model.derivative(state, FORCE)
     # Quadrature of the shapes in sin and sinh loses some nine digits of the accelerations at
-    # shallow depth, in proportion to the largest of them.
+    # small depth, relative to the largest.
     scale = np.abs(exact).max()
     assert_allclose(right_hand_side(0.0, state), exact, rtol=0.0, atol=1e-6 * scale)
     if how == 'compiled':
         assert_allclose(right_hand_side(0.0, state), exact, rtol=1e-9, atol=1e-12)
 
 
-def test_a_push_that_friction_holds_does_not_move_any_of_them() -> None:
+def test_force_below_friction_causes_no_motion_in_any_solver() -> None:
     model = NeedleModel(NeedleParameters.preset('paper_si'))
     state = model.state_at(0.1, 0.0)
     for right_hand_side in (
@@ -64,27 +62,27 @@ def test_a_push_that_friction_holds_does_not_move_any_of_them() -> None:
         assert_allclose(right_hand_side(0.0, state), np.zeros(8), atol=1e-15)
 
 
-def test_the_error_of_a_run_is_that_of_its_tip(open_loop: OpenLoop) -> None:
+def test_run_error_is_relative_tip_error(open_loop: OpenLoop) -> None:
     run = open_loop.solve('DOP853', 1e-8, 1e-12, open_loop.right_hand_side)
     assert open_loop.error(run.t, run.y) < 1e-6
     wrong = run.y.copy()
     wrong[2:4] *= 1.01
     assert open_loop.error(run.t, wrong) == pytest.approx(0.01, rel=0.05)
-    # A run that gave up has no error to speak of.
+    # An incomplete run has an infinite error.
     assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
 
 
-def test_a_trial_outside_the_range_is_survived(open_loop: OpenLoop) -> None:
+def test_right_hand_side_accepts_states_outside_range(open_loop: OpenLoop) -> None:
     beyond = open_loop.start.copy()
     for remaining in (-1.0, 0.3, np.nan):
         beyond[0] = remaining
         assert open_loop.right_hand_side(0.0, beyond).shape == (8,)
 
 
-def test_our_integrator_meets_the_error_it_is_timed_at(
+def test_integrator_meets_accuracy_of_timing(
     open_loop: OpenLoop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A run to each time of the grid: fewer of them tell the same.
+    # A coarser grid of run times is sufficient.
     monkeypatch.setattr(solvers, '_GRID', 8.0 * solvers._GRID)
     ours = open_loop.ours(graded=True)
     assert ours.error <= solvers.ACCURACY
@@ -95,18 +93,18 @@ def test_steps_are_counted(open_loop: OpenLoop) -> None:
     assert open_loop.steps(solvers.DURATION / 300, graded=False) == 300
 
 
-def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for() -> None:
+def test_batches_are_independent_of_threads_and_store_states_on_request() -> None:
     many = batches.Batches(40)
     ends = [many.run(workers).states for workers in (1, 2)]
     assert np.array_equal(ends[0], ends[1])
-    # Each insertion has a friction of its own.
+    # Each insertion has different friction.
     assert len(np.unique(ends[0], axis=0)) == 40
     short, long = (many.peak_memory(part, keep=False) for part in (0.1, 1.0))
     kept = many.peak_memory(1.0, keep=True)
     assert long < 1.5 * short < kept
 
 
-def test_exact_frequency_solves_the_equation_of_the_beam() -> None:
+def test_exact_frequency_solves_beam_equation() -> None:
     stiffness, density, foundation, length = 0.0256, 0.01016, 520.0, 0.15
 
     def beam(y: FloatArray, w: FloatArray, unknown: FloatArray) -> FloatArray:
@@ -125,13 +123,13 @@ def test_exact_frequency_solves_the_equation_of_the_beam() -> None:
     assert (2.0 * np.pi * found) ** 2 == pytest.approx(solution.p[0], rel=1e-6)
 
 
-def test_without_tissue_it_is_the_frequency_of_the_textbooks() -> None:
+def test_frequency_without_tissue_equals_textbook_value() -> None:
     # 1.875104... is the first root of cos x cosh x = -1.
     found = rods.beam_frequency(0.2, 2.0, 0.5)
     assert found == pytest.approx(1.8751040687**2 / 0.04 * 2.0 / (2.0 * np.pi), rel=1e-9)
 
 
-def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one() -> None:
+def test_frequency_of_sinusoid_is_measured_with_harmonics() -> None:
     time = np.linspace(0.0, 0.1, 301)
     values = np.cos(250.0 * time + 0.4) + 0.05 * np.sin(1600.0 * time) + 3.0
     found = rods.measured_frequency(time, values, 38.0)
@@ -139,10 +137,10 @@ def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one() -> None:
 
 
 @pytest.mark.parametrize('interval', [1e-3, 1e-5])
-def test_two_modes_are_within_a_percent_of_the_beam_at_15_cm(interval: float) -> None:
+def test_two_mode_frequency_is_within_percent_of_beam_at_15_cm(interval: float) -> None:
     assert abs(rods.needle(interval).error) < rods.FREQUENCY_ERROR
     error = rods.mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
-    # From above, as Rayleigh has it.
+    # An upper bound, by Rayleigh.
     assert 0.0 < error < rods.FREQUENCY_ERROR
 
 
@@ -170,7 +168,7 @@ def _arithmetic(x: Any, values: Any, n: Any) -> Any:
     return _helper(sin(total)) - 2.0 * x
 
 
-def test_operations_are_counted_as_they_are_done() -> None:
+def test_executed_operations_are_counted() -> None:
     values = np.array([1.0, 2.0, 3.0])
     counts = step.count_operations(_arithmetic, (2.0, values, 3))
     assert dict(counts) == {
@@ -186,19 +184,19 @@ def test_operations_are_counted_as_they_are_done() -> None:
     assert_allclose(values, [1.0, 2.0, 3.0])
 
 
-def test_operations_are_grouped_as_they_are_timed() -> None:
+def test_operations_are_grouped_by_timed_kind() -> None:
     counts = step.operations_of_a_step(20)
     groups = step.grouped(counts)
-    # Two modes turn: a sine and a cosine each; the axis glides: one exponential.
+    # Rotation of two modes: a sine and a cosine each; motion of the axis: one exponential.
     assert groups['sine and cosine'] == 2
     assert groups['expm1'] == 1
     assert 'log1p' not in groups
     assert groups['multiply-add, series'] == counts['series multiply']
-    # One of them is in the function that holds the series.
+    # Including the division in the function with the series.
     assert groups['division'] == counts['divide'] + counts['series divide']
 
 
-def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_tools_are_reported_and_other_rods_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rods, 'optional', lambda _name: None)
     monkeypatch.setattr(rods, 'least_times', lambda jobs, _repeats: least_times(jobs, 1))
     [section], bars = rods.compare(lambda _stage: None)
@@ -206,7 +204,7 @@ def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch: pytest.Mon
     assert [bar.found is None for bar in bars] == [True, True, False]
 
 
-def test_a_cable_of_mujoco_converges_to_its_beam() -> None:
+def test_mujoco_cable_converges_to_beam() -> None:
     mujoco = pytest.importorskip('mujoco')
     libraries = list((Path(mujoco.__file__).parent / 'plugin').glob('*elasticity*'))
     for library in libraries:
@@ -219,14 +217,14 @@ def test_a_cable_of_mujoco_converges_to_its_beam() -> None:
         )
         found = rods.measured_frequency(*cable.sample(4.0 / exact), exact)
         errors.append(abs(found / exact - 1.0))
-    # Half an element in the clamp: second order.
+    # Clamp at the middle of an element: second order.
     assert errors[1] < 0.6 * errors[0] < 0.012
 
 
-def test_a_rod_of_pyelastica_is_near_its_beam() -> None:
+def test_pyelastica_rod_is_near_beam() -> None:
     elastica = pytest.importorskip('elastica')
     _, _, _, exact = rods._section()
     rod = rods._Rod(elastica, 'PositionVerlet', 5, 1.9e-7)
     time, tips = rod.sample(0.3 / exact)
-    # A quarter of a period to the first peak: near enough to tell a wrong section or clamp.
+    # First peak after a quarter of a period: sufficient to detect a wrong section or clamp.
     assert 1.0 / (4.0 * time[tips.argmax()]) == pytest.approx(exact, rel=0.03)

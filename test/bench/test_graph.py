@@ -1,4 +1,4 @@
-"""The benchmark of the nodes reports every figure and counts losses; times are not tested."""
+"""Benchmark of the nodes: metrics and loss counts; times are not tested."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def found(
     told: list[str] = []
     folder = tmp_path_factory.mktemp('graph')
     with pytest.MonkeyPatch.context() as patch:
-        # Figures need time to settle, their presence does not.
+        # Only the presence of the metrics is tested, without settling time.
         patch.setattr(bench_pairs, '_SETTLE', 0.05)
         pairs = bench_graph.compare_pairs(folder, plan, told.append)
     return plan, told, pairs
 
 
-def test_every_pair_has_every_figure(
+def test_every_node_pair_has_all_metrics(
     found: tuple[Plan, list[str], dict[str, list[dict[str, float]]]],
 ) -> None:
     plan, told, pairs = found
@@ -50,10 +50,10 @@ def test_every_pair_has_every_figure(
     assert all(bar.found > 0.0 and not bar.at_least for bar in bars)
 
 
-def test_the_recorder_is_given_what_is_counted(tmp_path: Path) -> None:
+def test_recorder_receives_counted_messages(tmp_path: Path) -> None:
     [section], [bar] = endurance.record(tmp_path, 1.0)
     assert 'lost' in [row[0] for row in section.rows]
-    # What is lost depends on the machine; most of it is there.
+    # Losses depend on the machine; most messages are recorded.
     assert 0.0 <= bar.found < 5000.0
     numbers = endurance.sample_numbers(tmp_path / 'bag')
     assert set(numbers) == {*STREAMS, 'wrench_command'}
@@ -61,14 +61,14 @@ def test_the_recorder_is_given_what_is_counted(tmp_path: Path) -> None:
         assert 0 < found.min() < found.max()
 
 
-def test_memory_is_watched_over_time(tmp_path: Path) -> None:
+def test_memory_growth_is_measured(tmp_path: Path) -> None:
     [section], [bar] = endurance.watch_memory(tmp_path, 1.0, lambda _stage: None)
     assert [row[0] for row in section.rows] == ['plant', 'controller', 'recorder']
     assert bar.figure.startswith('growth of memory in 1 s')
 
 
 def write_bag(path: Path, numbers: list[int]) -> None:
-    """Write one message of a kind, and those of another with given numbers in their stamps."""
+    """Write a message of a topic, and messages of another topic with the given sample numbers."""
     time_of, header = (
         message_type(n) for n in ('builtin_interfaces/msg/Time', 'std_msgs/msg/Header')
     )
@@ -84,7 +84,7 @@ def write_bag(path: Path, numbers: list[int]) -> None:
             bag.write('/tip_deflection', encode(message), 1)
 
 
-def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path: Path) -> None:
+def test_sample_numbers_of_bag_follow_from_stamps(tmp_path: Path) -> None:
     expected = [1, 2, 2, 5, 1234]
     write_bag(tmp_path / 'bag', expected)
     numbers = endurance.sample_numbers(tmp_path / 'bag')
@@ -92,19 +92,19 @@ def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path: Path) -> None:
     assert all(len(others) == 0 for others in numbers.values())
 
 
-def test_losses_are_what_is_missing_after_the_first_second() -> None:
+def test_losses_count_missing_samples_after_first_second() -> None:
     numbers = {'a': np.array([900, 1001, 1002, 1002, 1004, 1005]), 'b': np.arange(1000, 1006)}
     assert endurance.losses(numbers, 1005) == {'a': 1, 'b': 0}
 
 
-def test_a_ratio_is_the_median_of_those_within_rounds() -> None:
+def test_ratio_is_median_over_rounds() -> None:
     ours = [{'x': 2.0}, {'x': 30.0}, {'x': 3.0}]
     theirs = [{'x': 1.0}, {'x': 10.0}, {'x': 0.0}]
     assert bench_graph.ratio(ours, theirs, 'x') == 2.5
     assert np.isnan(bench_graph.ratio(ours[2:], theirs[2:], 'x'))
 
 
-def test_all_parts_are_on_the_page(
+def test_report_has_all_sections(
     found: tuple[Plan, list[str], dict[str, list[Figures]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = [

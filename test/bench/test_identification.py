@@ -1,4 +1,4 @@
-"""The benchmark of identification reads what it says it reads; times are not tested."""
+"""Benchmark of identification: equality of the read data; times are not tested."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_bag_holds_the_friction_it_was_made_with(bag: Path) -> None:
+def test_bag_contains_friction_of_its_generator(bag: Path) -> None:
     recording = read_friction_recording(bag)
     assert recording.losses == ()
     assert_allclose(np.diff(recording.time), 1.0 / 250.0, rtol=1e-6)
-    # The speed is the derivative of the inserted length, to the second order of the step.
+    # The velocity is the derivative of the insertion depth, to second order of the step.
     slope = np.gradient(recording.depth, recording.time)[1:-1]
     assert_allclose(slope, recording.speed[1:-1], atol=2e-5)
     estimate = bench_identification.ours(bag)
@@ -33,13 +33,13 @@ def test_the_bag_holds_the_friction_it_was_made_with(bag: Path) -> None:
         assert abs(estimate[name].value - true) < 5.0 * estimate[name].error
 
 
-def test_bags_of_any_length_have_as_many_messages_as_asked_for(tmp_path: Path) -> None:
-    # More than one block of messages is made of.
+def test_bag_has_requested_number_of_messages(tmp_path: Path) -> None:
+    # More than a block of messages.
     bench_identification.write_bag(tmp_path / 'bag', 2**16 + 3)
     assert set(message_counts(tmp_path / 'bag').values()) == {2**16 + 3}
 
 
-def test_rosbags_takes_the_numbers_that_we_do(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rosbags_reads_same_numbers(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: dict[str, Any] = {}
     monkeypatch.setattr(bench_identification, '_arrays', taken.update)
     bench_identification.any_reader(bag)
@@ -50,9 +50,7 @@ def test_rosbags_takes_the_numbers_that_we_do(bag: Path, monkeypatch: pytest.Mon
     assert_allclose(motion[:, 1:].T, [recording.depth, recording.speed], rtol=1e-12)
 
 
-def test_mcap_ros2_support_takes_the_numbers_that_we_do(
-    bag: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mcap_ros2_support_reads_same_numbers(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('mcap_ros2.reader')
     taken: dict[str, Any] = {}
     monkeypatch.setattr(bench_identification, '_arrays', taken.update)
@@ -60,14 +58,14 @@ def test_mcap_ros2_support_takes_the_numbers_that_we_do(
     assert_allclose(np.array(taken['/base_wrench'])[:, 1], read_friction_recording(bag).force)
 
 
-def test_a_process_of_its_own_tells_its_time_and_memory(bag: Path) -> None:
+def test_separate_process_reports_time_and_memory(bag: Path) -> None:
     figures = bench_identification.measured('needle_identification', bag, bag, 1)
     assert figures['seconds'] > 0.0
-    # NumPy alone takes 10 MB.
+    # NumPy alone needs 10 MB.
     assert 1e7 < figures['before'] <= figures['memory'] < 1e10
 
 
-def test_what_is_not_installed_is_said_and_the_rest_is_compared(
+def test_missing_readers_are_reported_and_others_compared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(bench_identification, 'optional', lambda _name: None)

@@ -1,4 +1,4 @@
-"""The study of the laws judges what it runs; its figures are not tested here."""
+"""Study of the control laws: evaluation of runs; its metrics are not tested here."""
 
 from benchmarks import laws as study_of_laws
 from benchmarks.laws import Cell, compare, laws, situations, study
@@ -9,7 +9,7 @@ import pytest
 
 
 def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
-    """Return the runs of one needle with these depths."""
+    """Return a batch with a single run of these depths [m]."""
     path = np.array([depths])
     return LoopBatch(
         final=path[:, -1],
@@ -24,7 +24,7 @@ def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
     )
 
 
-def test_a_cycle_is_told_from_a_creep_and_from_a_lost_needle() -> None:
+def test_limit_cycle_creep_and_lost_needle_are_distinguished() -> None:
     goal, time = np.zeros(1001), np.arange(1001)
     moving = Cell.of(batch(list(2e-5 * np.sin(0.05 * time))), goal, 1.0)
     assert (moving.cycles, moving.lost) == (1, 0)
@@ -36,7 +36,7 @@ def test_a_cycle_is_told_from_a_creep_and_from_a_lost_needle() -> None:
     assert Cell.of(batch([6e-3] * 1001), goal, 1.0).lost == 1
 
 
-def test_every_situation_ends_at_rest_within_two_centimeters() -> None:
+def test_every_scenario_ends_at_rest_within_20_mm() -> None:
     for one in situations():
         end = one.reference.at(one.duration)
         assert abs(one.reference.at(0.0).position - one.start) < 1e-12
@@ -44,12 +44,12 @@ def test_every_situation_ends_at_rest_within_two_centimeters() -> None:
         assert 1e-3 < abs(end.position - one.start) < 0.021
 
 
-def test_the_default_law_comes_first() -> None:
+def test_default_law_is_first() -> None:
     assert next(iter(laws())) == LAWS[0]
 
 
-def test_a_membrane_makes_a_needle_go_too_far() -> None:
-    """The drop of 3 N moves it beyond the reference by a tenth of a millimeter, and no more."""
+def test_puncture_causes_overshoot() -> None:
+    """A force drop of 3 N causes an overshoot of about a tenth of a millimeter."""
     names = {one.name: one for one in situations()}
     puncture, law = names['puncture, 3 N'], laws()['adaptive']
     cell = study(puncture, law, 0.3, 1, 2.0, 4)
@@ -58,7 +58,7 @@ def test_a_membrane_makes_a_needle_go_too_far() -> None:
     assert plain.beyond.max() < 0.05e-3
 
 
-def test_the_page_has_a_map_for_each_situation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_has_map_for_each_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study_of_laws, '_DELAYS', (1,))
     monkeypatch.setattr(study_of_laws, '_CARRIAGES', (0.0,))
     sections, bars = compare(lambda _stage: None, needles=2)

@@ -1,4 +1,4 @@
-"""The simulator of noises and the damage of files: what they make, and what is reported."""
+"""Noise simulator and damaged files: generated data and reports."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from numpy.testing import assert_allclose
 import pytest
 
 
-def test_without_noise_the_force_is_the_truth() -> None:
+def test_force_without_noise_equals_ground_truth() -> None:
     kind = Kind(white=0.0, position_counts=0.0)
     recording, truth = recorded(kind, np.random.default_rng(0))
     moving = np.abs(recording.speed) > 0.0
     expected = truth['coulomb_friction'] * np.sign(recording.speed)
     expected += truth['viscous_friction'] * recording.speed
     assert_allclose(recording.force[moving], expected[moving], rtol=1e-12)
-    # The trapezoidal rule is exact for a speed of straight lines, but for its corners.
+    # The trapezoidal rule is exact for piecewise linear velocity, except at its corners.
     assert_allclose(np.gradient(recording.depth, recording.time), recording.speed, atol=1e-3)
 
 
 @pytest.mark.parametrize('name', ['AR(1), 20 ms', 'AR(1), 0.2 s', 'AR(1), 1 s'])
-def test_colored_noise_forgets_in_its_time(name: str) -> None:
+def test_colored_noise_has_configured_correlation_time(name: str) -> None:
     kind = LINES[name].kind
     noise = noises._noise(kind, np.random.default_rng(0), 500_000)
     later = round(kind.memory * kind.rate)
     alike = np.mean(noise[:-later] * noise[later:]) / (np.var(noise) - kind.white**2)
-    # The mean of 500,000 products of noise that is correlated over 250 of them or less.
+    # Mean of 500,000 products of noise with a correlation length of at most 250 samples.
     assert abs(alike - np.exp(-1.0)) < 0.1
 
 
-def test_the_table_has_a_line_of_each_kind_and_the_bars() -> None:
+def test_table_has_row_for_each_noise_and_bars() -> None:
     [section], bars = noises.compare(print, recordings=4, seed=1)
     assert [row[0] for row in section.rows] == list(LINES)
     figures = {bar.figure: bar for bar in bars}
@@ -42,7 +42,7 @@ def test_the_table_has_a_line_of_each_kind_and_the_bars() -> None:
     assert figures['lowest coverage of mu_s and mu_v'].at_least
 
 
-def test_every_form_holds_the_same_recording(tmp_path: Path) -> None:
+def test_all_file_formats_contain_same_recording(tmp_path: Path) -> None:
     found = {
         form: identify_friction(read_friction_recording(path))['viscous_friction'].value
         for form, path in damage.forms(tmp_path).items()
@@ -52,8 +52,8 @@ def test_every_form_holds_the_same_recording(tmp_path: Path) -> None:
     assert_allclose(list(found.values()), found['mcap, zstd'], rtol=1e-5)
 
 
-def test_damaged_recordings_end_well() -> None:
-    # In a process of its own, whose memory is that of no other test.
+def test_damaged_recordings_are_read_or_rejected() -> None:
+    # In a separate process, because memory is measured.
     with processes(1) as pool:
         [section], bars = pool.submit(damage.compare, print, files=120, seed=3).result()
     assert sum(int(count) for row in section.rows for count in row[2:]) == 120

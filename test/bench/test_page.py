@@ -1,4 +1,4 @@
-"""What every benchmark shares: timing, bars, and the page with its verdict."""
+"""Common parts of the benchmarks: timing, bars, and report with verdict."""
 
 from __future__ import annotations
 
@@ -28,15 +28,13 @@ ABSENT = Bar('other tool', None, 1.0)
         (Bar('speed', 50.0, 100.0, at_least=True), '>= 100', '50', 'missed by a factor 2.00'),
         (Bar('lost', 0.0, 0.0), '<= 0', '0', 'met'),
         (Bar('lost', 1.0, 0.0), '<= 0', '1', 'missed'),
-        # Memory may shrink.
+        # Memory can decrease.
         (Bar('growth', -0.1, 2.0, 'MB'), '<= 2 MB', '-0.1 MB', 'met'),
         (Bar('ratio of nothing', np.nan, 2.0), '<= 2', 'nan', 'missed'),
         (ABSENT, '<= 1', '', NOT_INSTALLED),
     ],
 )
-def test_a_bar_tells_by_what_factor_it_is_missed(
-    bar: Bar, wanted: str, found: str, verdict: str
-) -> None:
+def test_bar_reports_factor_of_miss(bar: Bar, wanted: str, found: str, verdict: str) -> None:
     assert bar.row() == (bar.figure, wanted, found, verdict)
     assert bar.missed == verdict.startswith('missed')
 
@@ -50,7 +48,7 @@ def test_a_bar_tells_by_what_factor_it_is_missed(
         ([MISSED, ABSENT], 'missed: 1 of 2 bars, 1 not measured', True),
     ],
 )
-def test_the_last_line_is_the_verdict(
+def test_last_line_is_verdict(
     capsys: pytest.CaptureFixture[str], bars: list[Bar], last: str, missed: bool
 ) -> None:
     def question(tick: Tick) -> Answer:
@@ -67,7 +65,7 @@ def test_the_last_line_is_the_verdict(
 
 
 @pytest.mark.parametrize(('bar', 'status'), [(MET, 0), (MISSED, 1)])
-def test_the_command_writes_the_page_and_ends_with_the_verdict(
+def test_command_writes_report_and_returns_verdict(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -99,12 +97,12 @@ def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert measure.number(value) == text
 
 
-def test_a_tool_that_is_not_installed_is_named() -> None:
+def test_missing_tool_is_named() -> None:
     assert page.version('no-such-tool') == 'no-such-tool not installed'
     assert measure.optional('no_such_tool') is None
 
 
-def test_columns_of_a_table_are_aligned() -> None:
+def test_table_columns_are_aligned() -> None:
     lines = page.table(('a', 'long head'), [('wide cell', '1')]).splitlines()
     assert lines == [
         '| a         | long head |',
@@ -113,17 +111,17 @@ def test_columns_of_a_table_are_aligned() -> None:
     ]
 
 
-def test_settings_are_tried_from_loose_to_tight() -> None:
+def test_geometric_settings_are_ordered() -> None:
     assert_allclose(measure.geometric(1.0, 8.0, 2.0), [1.0, 2.0, 4.0, 8.0])
     assert_allclose(measure.geometric(1.0, 0.1, 0.5), [1.0, 0.5, 0.25, 0.125])
 
 
-def test_jobs_take_turns() -> None:
+def test_jobs_are_timed_alternately() -> None:
     calls: list[str] = []
     jobs: dict[str, Callable[[], object]] = {name: partial(calls.append, name) for name in 'ab'}
     times = measure.least_times(jobs, 2)
     assert set(times) == {'a', 'b'}
-    # Once each to warm up, then in turns, each repeated.
+    # A warm-up of each job, then alternating repetitions.
     assert calls[:2] == ['a', 'b']
     turns = [name for i, name in enumerate(calls[2:], 2) if i == 2 or calls[i - 1] != name]
     assert turns == ['a', 'b', 'a', 'b']

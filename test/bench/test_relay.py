@@ -28,7 +28,7 @@ COMMAND = Link('controller', 'plant', contract.WRENCH_COMMAND)
         (Fault(COMMAND, 20, 'drop', 0.0), False),
     ],
 )
-def test_an_insertion_with_a_fault_reaches_its_target(
+def test_insertion_with_message_fault_reaches_target(
     tmp_path: Path, fault: Fault, continuous: bool
 ) -> None:
     outcome = insert(fault, tmp_path, continuous=continuous)
@@ -36,8 +36,8 @@ def test_an_insertion_with_a_fault_reaches_its_target(
     assert outcome.struck
 
 
-def test_faults_are_chosen_among_all_links_and_messages() -> None:
-    """The same for a seed."""
+def test_random_faults_cover_all_links_and_messages() -> None:
+    """The choice is reproducible for a seed."""
     rng, again = np.random.default_rng(1), np.random.default_rng(1)
     counts = insert_counts()
     faults = [choose(counts, rng) for _ in range(300)]
@@ -48,14 +48,14 @@ def test_faults_are_chosen_among_all_links_and_messages() -> None:
 
 
 def insert_counts() -> dict[Link, int]:
-    """Return some numbers of messages."""
+    """Return a number of messages for each link."""
     return {link: 5 + k for k, link in enumerate(LINKS)}
 
 
-def test_a_clock_that_is_set_back_by_a_late_message_goes_on(
+def test_clock_continues_after_late_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An older one arrives last, while the plant waits for the answer to a newer sample."""
+    """An older clock message arrives while the plant waits for the answer to a newer sample."""
     clock, before = Link('plant', 'controller', contract.CLOCK), []
     take = Relay._take
 

@@ -1,4 +1,4 @@
-"""The faults of `needle bench safety`, and what they show."""
+"""Fault injection of `needle bench safety` and its results."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from needle_ros.errors import ParameterError
 import pytest
 
 
-def test_every_fault_meets_every_topic_at_every_moment() -> None:
-    """In 500 cells and more, none of them twice."""
+def test_cells_cover_faults_topics_and_moments() -> None:
+    """At least 500 cells without duplicates."""
     all_cells = cells()
     assert len(all_cells) == len(set(all_cells)) >= 500
     assert {cell.moment for cell in all_cells} == set(safety.MOMENTS)
@@ -27,8 +27,8 @@ def test_every_fault_meets_every_topic_at_every_moment() -> None:
         (Cell('wrench_command', 'a second commander', 'moving'), 'no force'),
     ],
 )
-def test_a_cell_is_measured(cell: Cell, outcome: str) -> None:
-    """What was done, and that the motion goes on afterwards; the same each time."""
+def test_cell_outcome_is_measured(cell: Cell, outcome: str) -> None:
+    """Outcome and recovery of the motion; reproducible."""
     found = measure(cell)
     assert found.outcome == outcome
     assert found.force <= 15.0
@@ -37,8 +37,8 @@ def test_a_cell_is_measured(cell: Cell, outcome: str) -> None:
     assert measure(cell) == found
 
 
-def test_one_fault_alone() -> None:
-    """A table for each topic that has it, and bars that are met; another name is refused."""
+def test_single_fault_is_selected() -> None:
+    """Tables of the topics with this fault, and bars that are met; an unknown name is rejected."""
     sections, bars = safety.compare(lambda _stage: None, fault='swapped')
     assert [section.title for section in sections][:4] == [
         '`base_wrench`', '`tip_deflection`', '`joint_states`', '`wrench_command`',

@@ -1,4 +1,4 @@
-"""The benchmark of studies computes what it says; times are not tested."""
+"""Benchmark of studies: reported metrics; times are not tested."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_insertion.cli import main
 import pytest
 import yaml
 
-#: Few short insertions, by a controller that takes no time.
+#: Few short insertions, with a fast controller.
 SMALL = {
     'protocol': 'steering',
     'samples': 1,
@@ -23,8 +23,8 @@ SMALL = {
 }
 
 
-def test_every_figure_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tables are equal, though workers and the study are killed."""
+def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables are equal, although workers and the study are killed."""
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(SMALL))
     monkeypatch.setattr(bench_study, 'STUDY', file)
@@ -35,7 +35,7 @@ def test_every_figure_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     for _, together, each in rates.rows:
         assert float(together) >= float(each) > 0.0
     assert [row[0] for row in memory.rows] == ['10', '20', '40']
-    # A process that has imported NumPy and Numba.
+    # Memory of a process with NumPy and Numba.
     assert all(50.0 < float(peak) < 2000.0 for row in memory.rows for peak in row[2:])
     assert len({row[1] for row in tables.rows}) == 1
     killed = 'a worker of Dask is killed half way'
@@ -48,8 +48,8 @@ def test_every_figure_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert 'the study is killed' in told
 
 
-def test_what_is_computed_twice_is_found(tmp_path: Path) -> None:
-    """In a part that is written anew, one that is gone, and one that has it, too."""
+def test_repeated_computation_is_counted(tmp_path: Path) -> None:
+    """In a rewritten part, a missing part, and an overlapping part."""
     for name in ('0000000000-0000000004.parquet', '0000000004-0000000010.parquet', 'x.tmp'):
         (tmp_path / name).write_text('')
     before = written(tmp_path)
@@ -61,7 +61,7 @@ def test_what_is_computed_twice_is_found(tmp_path: Path) -> None:
     assert again(before, {**before, (8, 20): 0}) == 2
 
 
-def test_every_environment_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_environment_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(environments, 'STEPS', {'single': 30, 'vector': 3})
     [section], bars = environments.compare(lambda _stage: None, 'quick')
     assert bars == []
@@ -70,10 +70,10 @@ def test_every_environment_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(float(rate) > 0.0 for row in section.rows for rate in row[1:])
 
 
-def test_what_is_not_installed_is_named(
+def test_missing_package_is_named(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In one line, before anything is measured."""
+    """In one line, before the measurements."""
 
     def missing(_name: str) -> ModuleType:
         raise ModuleNotFoundError("No module named 'pyarrow'", name='pyarrow')

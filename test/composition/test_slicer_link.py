@@ -1,4 +1,4 @@
-"""The connection: whoever comes, leaves, is silent or talks nonsense, it goes on."""
+"""OpenIGTLink connection: recovery from lost, silent, slow and invalid peers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MESSAGE = pyigtl.TransformMessage(np.eye(4), device_name=TARGET).pack()
 
 
 class Desk:
-    """A link, what it said and what came, and a clock that can be put forward."""
+    """Link with its log lines and received frames, and an adjustable clock."""
 
     def __init__(self, role: str = 'server', port: int | None = None) -> None:
         self.port = free_port() if port is None else port
@@ -38,10 +38,10 @@ class Desk:
         return monotonic() + self.ahead
 
     def poll(self) -> None:
-        """Call it as the node does."""
+        """Poll the link as the node."""
         begin = monotonic()
         self.frames += self.link.poll()
-        # Nothing waits in it; a machine that is busy may.
+        # No blocking calls; the bound allows for a busy machine.
         assert monotonic() - begin < 5.0
         self.lines += [line for _, line in self.journal.take()]
 
@@ -64,7 +64,7 @@ def stack() -> Iterator[ExitStack]:
 
 @pytest.fixture
 def desk(stack: ExitStack) -> Desk:
-    """Return a link that listens."""
+    """Return a listening link."""
     made = Desk()
     stack.callback(made.link.close)
     made.until(lambda: made.said('listens on'))
@@ -72,15 +72,15 @@ def desk(stack: ExitStack) -> Desk:
 
 
 def visitor(desk: Desk, stack: ExitStack) -> socket.socket:
-    """Connect, and wait until the link has noticed."""
+    """Connect, and wait until the link has accepted the connection."""
     before = desk.link.peer
     one = stack.enter_context(closing(socket.create_connection(('127.0.0.1', desk.port))))
     desk.until(lambda: desk.link.peer not in ('', before), 'the peer')
     return one
 
 
-def test_messages_go_both_ways(desk: Desk, stack: ExitStack) -> None:
-    """With the client of pyigtl; and the link has no thread."""
+def test_messages_are_exchanged_in_both_directions(desk: Desk, stack: ExitStack) -> None:
+    """With the client of pyigtl, and without a thread in the link."""
     threads = active_count()
     client = pyigtl.OpenIGTLinkClient(port=desk.port)
     stack.callback(client.stop)
@@ -95,10 +95,8 @@ def test_messages_go_both_ways(desk: Desk, stack: ExitStack) -> None:
 
 
 @pytest.mark.parametrize('size', [0, 30, 70])
-def test_a_peer_that_leaves_makes_room_for_the_next(
-    desk: Desk, stack: ExitStack, size: int
-) -> None:
-    """Also within a header or a body, after which pyigtl's own server would turn for ever."""
+def test_next_peer_is_accepted_after_disconnect(desk: Desk, stack: ExitStack, size: int) -> None:
+    """Also after a partial header or body, where the server of pyigtl loops forever."""
     for _ in range(3):
         one = visitor(desk, stack)
         one.sendall(MESSAGE[:size])
@@ -110,8 +108,8 @@ def test_a_peer_that_leaves_makes_room_for_the_next(
     desk.until(lambda: desk.frames, 'the message')
 
 
-def test_a_peer_that_is_killed_makes_room_for_the_next(desk: Desk, stack: ExitStack) -> None:
-    """Its system resets the connection, while something is on its way."""
+def test_next_peer_is_accepted_after_connection_reset(desk: Desk, stack: ExitStack) -> None:
+    """The connection is reset while data is queued."""
     one = visitor(desk, stack)
     one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
     desk.link.send(MESSAGE)
@@ -121,8 +119,8 @@ def test_a_peer_that_is_killed_makes_room_for_the_next(desk: Desk, stack: ExitSt
     visitor(desk, stack)
 
 
-def test_what_was_said_before_the_end_counts(desk: Desk, stack: ExitStack) -> None:
-    """A script may connect, send a target and leave."""
+def test_message_before_disconnect_is_received(desk: Desk, stack: ExitStack) -> None:
+    """A script may connect, send a target and disconnect."""
     with closing(socket.create_connection(('127.0.0.1', desk.port))) as one:
         one.sendall(MESSAGE)
     desk.until(lambda: desk.frames, 'the message')
@@ -140,10 +138,10 @@ def test_what_was_said_before_the_end_counts(desk: Desk, stack: ExitStack) -> No
     ],
     ids=['HTTP', 'a long image'],
 )
-def test_another_protocol_ends_the_connection(
+def test_other_protocol_closes_connection(
     desk: Desk, stack: ExitStack, words: bytes, line: str
 ) -> None:
-    """With one line a second, however often it comes."""
+    """With at most one log line per second."""
     for _ in range(5):
         visitor(desk, stack).sendall(words)
         desk.until(lambda: not desk.link.peer, 'the end')
@@ -152,8 +150,8 @@ def test_another_protocol_ends_the_connection(
     assert '\n' not in ''.join(desk.lines)
 
 
-def test_a_second_peer_is_turned_away(desk: Desk, stack: ExitStack) -> None:
-    """One commands; the first stays."""
+def test_second_peer_is_rejected(desk: Desk, stack: ExitStack) -> None:
+    """The first connection stays."""
     first = visitor(desk, stack)
     peer = desk.link.peer
     second = stack.enter_context(closing(socket.create_connection(('127.0.0.1', desk.port))))
@@ -165,16 +163,14 @@ def test_a_second_peer_is_turned_away(desk: Desk, stack: ExitStack) -> None:
     desk.until(lambda: desk.frames, 'the message')
 
 
-def test_it_listens_on_its_address_only(desk: Desk) -> None:
-    """Other addresses, of this machine here, find nobody."""
+def test_link_listens_on_configured_address_only(desk: Desk) -> None:
+    """Connections to other local addresses are refused."""
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(('127.0.0.2', desk.port))
 
 
-def test_a_peer_that_does_not_read_loses_messages_and_then_the_connection(
-    desk: Desk, stack: ExitStack
-) -> None:
-    """What waits is bounded, and nothing waits for it."""
+def test_peer_without_reads_is_disconnected(desk: Desk, stack: ExitStack) -> None:
+    """Messages are dropped first; the queue is bounded and never blocks."""
     visitor(desk, stack)
     sent = 0
     while desk.link.send(bytes(50_000)):
@@ -189,8 +185,8 @@ def test_a_peer_that_does_not_read_loses_messages_and_then_the_connection(
     visitor(desk, stack)
 
 
-def test_a_message_arrives_whole_or_not_at_all(desk: Desk, stack: ExitStack) -> None:
-    """A peer that reads in bursts can follow the stream from message to message."""
+def test_messages_are_sent_completely_or_dropped(desk: Desk, stack: ExitStack) -> None:
+    """A peer that reads in bursts receives whole messages."""
     one = visitor(desk, stack)
     one.settimeout(60.0)
     body = bytes(range(256)) * 100
@@ -206,8 +202,8 @@ def test_a_message_arrives_whole_or_not_at_all(desk: Desk, stack: ExitStack) -> 
     assert data == sent * message
 
 
-def test_a_port_that_is_in_use_is_said_and_tried_again(stack: ExitStack) -> None:
-    """As soon as it is free the link listens."""
+def test_port_in_use_is_reported_and_retried(stack: ExitStack) -> None:
+    """The link listens once the port is free."""
     other = stack.enter_context(closing(socket.create_server(('127.0.0.1', 0))))
     desk = Desk(port=other.getsockname()[1])
     stack.callback(desk.link.close)
@@ -225,8 +221,8 @@ def test_a_port_that_is_in_use_is_said_and_tried_again(stack: ExitStack) -> None
     visitor(desk, stack)
 
 
-def test_as_client_it_connects_whenever_there_is_a_server(stack: ExitStack) -> None:
-    """Before, after, and again when it has been away."""
+def test_client_reconnects_to_server(stack: ExitStack) -> None:
+    """Before, after, and again after an interruption."""
     desk = Desk(role='client')
     stack.callback(desk.link.close)
     desk.until(lambda: desk.said('cannot connect to'), 'the line')
@@ -246,8 +242,8 @@ def test_as_client_it_connects_whenever_there_is_a_server(stack: ExitStack) -> N
         desk.until(lambda: not desk.link.peer, 'the end')
 
 
-def test_after_the_end_it_can_be_opened_again(desk: Desk, stack: ExitStack) -> None:
-    """As a node that is deactivated and activated."""
+def test_closed_link_can_be_reopened(desk: Desk, stack: ExitStack) -> None:
+    """As after deactivation and activation of the node."""
     one = visitor(desk, stack)
     desk.link.close()
     one.settimeout(60.0)

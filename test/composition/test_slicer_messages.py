@@ -1,4 +1,4 @@
-"""Targets and needle as OpenIGTLink messages: there and back, and whatever else may come."""
+"""Targets and needle as OpenIGTLink messages: round trip, and invalid messages."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ registrations = st.builds(Registration, rotation=quaternions(), translation=vect
 
 
 def received(*messages: bytes) -> list[Any]:
-    """Return messages as pyigtl reads them."""
+    """Parse messages with pyigtl."""
     found = []
     for data in messages:
         fields = MessageBase.parse_header(data[: HEADER.size])
@@ -67,7 +67,7 @@ def received(*messages: bytes) -> list[Any]:
 
 
 def framed(data: bytes) -> Frame:
-    """Return the one frame of a message."""
+    """Return the frame of a message."""
     (frame,) = Frames(is_wanted, pytest.fail).take(data)
     return frame
 
@@ -77,7 +77,7 @@ def point(at: Any) -> Any:
 
 
 def planned(at: Any) -> Any:
-    """Return what SmartNeedle's module sends: a list of any name, with target and entry."""
+    """Return a point list as sent by SmartNeedle's module: any name, with target and entry."""
     both = np.array([at, [0.0, 0.0, 0.0]])
     return pyigtl.PointMessage(both, names=[TARGET, 'ENTRY'], device_name='PlanningZ')
 
@@ -95,14 +95,16 @@ def string(at: Any) -> Any:
 KINDS = [point, planned, transform, string]
 
 
-# The frame of the images.
+# Frame of the images.
 
 
 @given(registrations, st.lists(vectors, min_size=1, max_size=5))
-def test_to_the_images_and_back(registration: Registration, points: list[Any]) -> None:
-    """Points return where they were, and keep their distances, in mm."""
+def test_registration_is_invertible_and_isometric(
+    registration: Registration, points: list[Any]
+) -> None:
+    """Points return to their positions, and distances are conserved, in mm."""
     there = registration.to_image(points)
-    # 1e-12: a hundred times the rounding of coordinates of some 1 m.
+    # 1e-12: a hundred times the rounding of coordinates of about 1 m.
     np.testing.assert_allclose(registration.to_needle(there), points, atol=1e-12)
     distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
     seen = np.linalg.norm(np.diff(there, axis=0), axis=1)
@@ -110,7 +112,7 @@ def test_to_the_images_and_back(registration: Registration, points: list[Any]) -
 
 
 @given(quaternions(), quaternions(), vectors)
-def test_rotations_are_those_of_quaternions(first: Any, second: Any, vector: Any) -> None:
+def test_rotation_matrices_match_quaternions(first: Any, second: Any, vector: Any) -> None:
     """They are proper, and the product of quaternions is the product of matrices."""
     (a, b, c, d), (x, y, z, w) = first, second
     product = [
@@ -125,12 +127,12 @@ def test_rotations_are_those_of_quaternions(first: Any, second: Any, vector: Any
     np.testing.assert_allclose(rotation_matrix(product), one @ two, atol=1e-14)
 
 
-def test_the_axes_by_default_and_of_an_example() -> None:
-    """By default axes are parallel; the example of the page points into the patient's feet-up."""
+def test_default_and_example_registration_axes() -> None:
+    """Axes are parallel by default; the insertion axis of the example is superior."""
     np.testing.assert_allclose(Registration().to_image([1e-3, 2e-3, 3e-3]), [1.0, 2.0, 3.0])
     half = math.sqrt(0.5)
     perineum = Registration(rotation=(half, 0.0, 0.0, half), translation=(0.0, 0.0, -0.08))
-    # Into the tissue is superior, its z posterior.
+    # The insertion direction is superior, z posterior.
     np.testing.assert_allclose(
         perineum.to_image([[0.0, 0.1, 0.0], [0.0, 0.0, 0.01]]),
         [[0.0, 0.0, 20.0], [0.0, -10.0, -80.0]],
@@ -149,8 +151,8 @@ def test_the_axes_by_default_and_of_an_example() -> None:
         ({'translation': (0.0,)}, 'translation must have 3 numbers'),
     ],
 )
-def test_an_invalid_registration_is_refused(given_: dict[str, Any], complaint: str) -> None:
-    """One line says what is wrong; a quaternion that is rounded to three digits is none."""
+def test_invalid_registration_is_rejected(given_: dict[str, Any], complaint: str) -> None:
+    """With one line; a quaternion rounded to three digits is valid."""
     with pytest.raises(ParameterError) as caught:
         Registration(**given_)
     assert complaint in str(caught.value)
@@ -167,7 +169,7 @@ def test_an_invalid_registration_is_refused(given_: dict[str, Any], complaint: s
         ({'port': 80.5}, 'port must be a whole number'),
     ],
 )
-def test_an_invalid_place_is_refused(given_: dict[str, Any], complaint: str) -> None:
+def test_invalid_link_settings_are_rejected(given_: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
         LinkSettings(**given_)
 
@@ -176,10 +178,10 @@ def test_an_invalid_place_is_refused(given_: dict[str, Any], complaint: str) -> 
 
 
 @given(registrations, targets, st.sampled_from(KINDS))
-def test_a_target_arrives_where_it_is(
+def test_target_is_converted_to_needle_frame(
     registration: Registration, at: Any, kind: Callable[[Any], Any]
 ) -> None:
-    """Whatever message tells it, and wherever the images are."""
+    """From any message type and with any registration."""
     message = kind(registration.to_image(at)).pack()
     found = Interpreter(registration, REACH).target(framed(message))
     # Messages have 24 bits: 6e-8 of a meter at most, in each of three coordinates.
@@ -197,10 +199,10 @@ def test_a_target_arrives_where_it_is(
         ([0.0, -20.0, 0.0], '20 mm outside of the tissue'),
     ],
 )
-def test_targets_without_sense_are_refused(
+def test_implausible_targets_are_rejected(
     kind: Callable[[Any], Any], at: list[float], complaint: str
 ) -> None:
-    """Each with one line that says why."""
+    """Each with one line that gives the reason."""
     with pytest.raises(MessageError, match=complaint) as caught:
         Interpreter(Registration(), REACH).target(framed(kind(at).pack()))
     assert '\n' not in str(caught.value)
@@ -218,13 +220,13 @@ def test_targets_without_sense_are_refused(
         ),
     ],
 )
-def test_targets_that_are_not_one_are_refused(message: Any, complaint: str) -> None:
+def test_messages_without_single_target_are_rejected(message: Any, complaint: str) -> None:
     with pytest.raises(MessageError, match=complaint):
         Interpreter(Registration(), REACH).target(framed(message.pack()))
 
 
-def test_other_points_are_no_target() -> None:
-    """Markups that somebody else is told come on the same connection."""
+def test_points_with_other_names_are_ignored() -> None:
+    """Markups for other receivers use the same connection."""
     message = pyigtl.PointMessage(np.ones((3, 3)), names=['a', 'b', 'ENTRY'], device_name='F')
     assert Interpreter(Registration(), REACH).target(framed(message.pack())) is None
 
@@ -234,8 +236,8 @@ def test_other_points_are_no_target() -> None:
     st.binary(max_size=300),
     st.sampled_from([1, 2]),
 )
-def test_any_body_is_read_or_refused(kind: str, body: bytes, version: int) -> None:
-    """Nothing but a MessageError comes of it, whatever a body with a right checksum has."""
+def test_any_body_is_parsed_or_rejected(kind: str, body: bytes, version: int) -> None:
+    """Any body with a valid checksum raises MessageError only."""
     header = HEADER.pack(version, kind.encode(), b'TARGET', 0, 0, len(body), CRC64(body))
     try:
         found = Interpreter(Registration(), REACH).target(framed(header + body))
@@ -245,37 +247,37 @@ def test_any_body_is_read_or_refused(kind: str, body: bytes, version: int) -> No
 
 
 @given(targets, st.integers(0, 8 * 48 - 1))
-def test_a_flipped_bit_is_noticed(at: Any, bit: int) -> None:
-    """Pyigtl does not compare checksums: a target that is damaged would be another target."""
+def test_checksum_detects_flipped_bit(at: Any, bit: int) -> None:
+    """Pyigtl does not verify checksums: a damaged target would be another target."""
     data = bytearray(transform(1e3 * np.array(at)).pack())
     data[HEADER.size + bit // 8] ^= 1 << bit % 8
     with pytest.raises(MessageError, match='damaged'):
         Interpreter(Registration(), REACH).target(framed(bytes(data)))
 
 
-# The needle.
+# Needle.
 
 
 @given(registrations, st.lists(vectors, min_size=2, max_size=60), quaternions(), st.booleans())
-def test_the_needle_is_told(
+def test_shape_and_tip_are_encoded(
     registration: Registration, points: list[Any], turn: Any, line: bool
 ) -> None:
-    """Points in their order, in mm, with a line about them; the tip is the last one, turned."""
+    """Points in order, in mm, with a header; the tip is the last point with orientation."""
     shape = Shape(12_345_678_901, np.array(points), np.array(turn), LINE if line else MEASURED)
     interpreter = Interpreter(registration, REACH)
     told, header = received(*interpreter.shape(shape, 7))
     assert (told.device_name, header.device_name) == (SHAPE, SHAPE_HEADER)
     assert told.names == [f'NeedleShapeZ{k}' for k in range(len(points))]
     seen = registration.to_image(points)
-    # Rounded to 24 bits: some 1e-4 mm in 1 m.
+    # Rounded to 24 bits: about 1e-4 mm in 1 m.
     np.testing.assert_allclose(told.positions, seen, atol=2e-4)
     about = f'1970-01-01 00:00:12.345;7;{len(points)};image;{shape.source}'
     assert header.string == about
     (tip,) = received(interpreter.tip(shape))
-    # A time is in parts of 2^-32 s, 2.3e-10 s, and pyigtl has it as a float.
+    # Times have a resolution of 2^-32 s, 2.3e-10 s, and are floats in pyigtl.
     assert (tip.device_name, tip.timestamp) == (TIP, pytest.approx(12.345678901, abs=1e-8))
     np.testing.assert_allclose(tip.matrix[:3, 3], seen[-1], atol=2e-4)
-    # y of the tip is along the needle: a step along it in the needle's frame.
+    # y of the tip is along the needle: a step in this direction in the needle's frame.
     ahead = registration.to_image(points[-1] + rotation_matrix(turn)[:, 1])
     np.testing.assert_allclose(1e3 * tip.matrix[:3, 1], ahead - seen[-1], atol=2e-3)
     (expected,) = received(interpreter.tip_expected(Pose(5, np.array(points[0]), shape.turn)))
@@ -283,16 +285,16 @@ def test_the_needle_is_told(
     np.testing.assert_allclose(expected.matrix[:3, 3], seen[0], atol=2e-4)
 
 
-def test_the_largest_shape_is_within_what_we_take() -> None:
-    """What we send could be sent to us."""
+def test_largest_shape_is_within_size_limit() -> None:
+    """Transmitted shapes are within the limit for received messages."""
     shape = Shape(0, np.zeros((MOST_POINTS, 3)), np.array([0.0, 0.0, 0.0, 1.0]), MEASURED)
     points, _ = Interpreter(Registration(), REACH).shape(shape, 0)
     assert len(points) - HEADER.size <= LARGEST
 
 
 @given(st.lists(st.text(max_size=3000), max_size=30), st.integers(-(2**31), 2**62))
-def test_any_words_of_the_nodes_are_told(lines: list[str], stamp: int) -> None:
-    """Also what is no ASCII, which pyigtl cannot write, and far more than anybody reads."""
+def test_any_node_state_is_encoded(lines: list[str], stamp: int) -> None:
+    """Also non-ASCII text, which pyigtl cannot encode, and very long text."""
     (told,) = received(Interpreter(Registration(), REACH).state(stamp, lines))
     assert told.device_name == STATE
     assert told.string.isascii()
@@ -300,8 +302,8 @@ def test_any_words_of_the_nodes_are_told(lines: list[str], stamp: int) -> None:
 
 
 @given(vectors, st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)))
-def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: tuple[float, float]) -> None:
-    """From the guide to the tip, with y along it; what is old is not shown."""
+def test_shape_without_measurement_is_marked_line(tip: Any, guide: tuple[float, float]) -> None:
+    """From the guide to the tip, with y along it; outdated measurements are not used."""
     view = NeedleView()
     assert view.shape(0.0) is None
     view.take_tip(5, tip, 0.0)
@@ -314,7 +316,7 @@ def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: tuple[float, 
     length = np.linalg.norm(way)
     np.testing.assert_allclose(length * rotation_matrix(shape.turn)[:, 1], way, atol=1e-7)
     assert view.shape(1.1) is None
-    # A shape that comes counts, as long as it comes.
+    # A measured shape has priority until its timeout.
     view.take_poses(6, [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]], [0.0, 0.0, 0.0, 1.0], 1.0)
     assert view.shape(1.1).source == MEASURED
     view.take_tip(7, tip, 3.0)
@@ -333,8 +335,8 @@ def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: tuple[float, 
         ([[0.0, 0.1, 0.0]] * 2, [0.0, 0.0, 0.0, 0.0], 'of norm 0'),
     ],
 )
-def test_what_is_no_needle_is_refused(points: Any, turn: Any, complaint: str) -> None:
-    """And what was there before stays."""
+def test_invalid_needle_poses_are_rejected(points: Any, turn: Any, complaint: str) -> None:
+    """The previous state is kept."""
     view = NeedleView()
     with pytest.raises(MessageError, match=complaint):
         view.take_poses(0, points, turn, 0.0)
@@ -349,7 +351,7 @@ def test_what_is_no_needle_is_refused(points: Any, turn: Any, complaint: str) ->
     assert view.expected is None
 
 
-# Bytes.
+# Stream.
 
 STREAM = b''.join(
     one.pack()
@@ -365,8 +367,8 @@ STREAM = b''.join(
 
 
 @given(st.lists(st.integers(0, len(STREAM)), max_size=20))
-def test_a_stream_may_come_in_any_pieces(cuts: list[int]) -> None:
-    """The same messages come out, and those that nobody wants do not."""
+def test_stream_is_split_independently_of_chunks(cuts: list[int]) -> None:
+    """All wanted messages are returned, and unwanted messages are skipped."""
     frames = Frames(is_wanted, pytest.fail)
     ends = [0, *sorted(cuts), len(STREAM)]
     found = [one for a, b in pairwise(ends) for one in frames.take(STREAM[a:b])]
@@ -376,14 +378,14 @@ def test_a_stream_may_come_in_any_pieces(cuts: list[int]) -> None:
 
 
 @given(st.binary(min_size=HEADER.size, max_size=500))
-def test_what_is_not_openigtlink_is_refused_or_passed_over(data: bytes) -> None:
-    """Random bytes end the connection, or are a message that nobody wants."""
+def test_random_bytes_are_rejected_or_skipped(data: bytes) -> None:
+    """Random bytes are an error or an unwanted message."""
     with suppress(MessageError):
         assert Frames(is_wanted, pytest.fail).take(data) == []
 
 
-def test_what_is_too_large_is_never_stored() -> None:
-    """A target of a gigabyte is refused by its header and passed over; more is no message."""
+def test_oversized_messages_are_skipped_without_storage() -> None:
+    """A target of a gigabyte is rejected by its header and skipped; a larger size is an error."""
     complaints: list[str] = []
     frames = Frames(is_wanted, complaints.append)
     large = HEADER.pack(1, b'POINT', b'TARGET', 0, 0, 1 << 30, 0)
@@ -403,8 +405,8 @@ def test_what_is_too_large_is_never_stored() -> None:
     st.integers(0, 5) | st.integers(0, 65535),
     st.binary(min_size=12, max_size=12) | st.sampled_from([b'POINT' + bytes(7), b'STATUS' * 2]),
 )
-def test_names_of_types_are_words(version: int, kind: bytes) -> None:
-    """A header of another protocol is not followed."""
+def test_message_type_names_are_printable(version: int, kind: bytes) -> None:
+    """A header of another protocol is rejected."""
     header = struct.pack('>H12s', version, kind) + bytes(HEADER.size - 14)
     name = kind.rstrip(b' \0')
     if version in (1, 2, 3) and name.isascii() and name.decode('latin1').isprintable():
@@ -415,8 +417,8 @@ def test_names_of_types_are_words(version: int, kind: bytes) -> None:
             Frames(is_wanted, pytest.fail).take(header)
 
 
-def test_only_the_node_needs_ros_and_only_messages_need_pyigtl() -> None:
-    """The rest can be used and tested without them."""
+def test_only_node_requires_ros_and_only_messages_require_pyigtl() -> None:
+    """The other modules import without them."""
     script = (
         'import sys; sys.modules.update(rclpy=None, pyigtl=None)\n'
         'from needle_insertion.slicer import frames, link, needle, registration, settings\n'

@@ -1,4 +1,4 @@
-"""The page of `needle watch`: what is seen, of a bag too, and who is let in."""
+"""Page of `needle watch`: frames, recordings, and access control."""
 
 from __future__ import annotations
 
@@ -58,15 +58,15 @@ def numbers(*values: float) -> Reading:
 
 
 def told(view: View, *names: str) -> None:
-    """Let a view have the configurations of nodes."""
+    """Store the configurations of nodes in a view."""
     for name in names:
         view.configuration(name, parameters_of(CONFIGURATIONS[name]))
 
 
-# What is seen.
+# Frames.
 
 
-def test_a_frame_has_what_has_come() -> None:
+def test_frame_contains_received_measurements() -> None:
     """Depth, velocity, force of the sensor, reference, error, tip and guide, in SI units."""
     view = View()
     view.reading(
@@ -93,8 +93,10 @@ any_number = st.floats(allow_nan=True, allow_infinity=True)
 
 
 @given(st.lists(any_number, min_size=3, max_size=3), st.integers(0, 3), st.floats(0.0, 1e150))
-def test_whatever_comes_a_frame_is_json(values: list[float], count: int, deviation: float) -> None:
-    """Numbers that are not finite, and joints without numbers, are None: JSON has no other."""
+def test_frame_of_any_measurement_is_json(
+    values: list[float], count: int, deviation: float
+) -> None:
+    """Numbers that are not finite, and joints without numbers, are None, as JSON requires."""
     view = View()
     view.reading('joint_states', joints(('insertion',) * count, tuple(values), (), ()), 0.0)
     view.reading('tip_deflection', numbers(*values), 0.0)
@@ -106,8 +108,8 @@ def test_whatever_comes_a_frame_is_json(values: list[float], count: int, deviati
         assert shown is None if not abs(value) < inf else shown == round(value, 7)
 
 
-def test_the_shape_is_that_of_the_plant_or_straight() -> None:
-    """Without a shape, or with one that is old, a straight needle is drawn, and is called so."""
+def test_shape_is_simulated_or_straight_line() -> None:
+    """Without a recent shape a straight needle is drawn, and labeled."""
     view = View()
     assert view.frame(0.0)['shape'] is None
     told(view, 'plant')
@@ -116,7 +118,7 @@ def test_the_shape_is_that_of_the_plant_or_straight() -> None:
     view.reading('tip_deflection', numbers(3e-3, 0.05, -1e-3), 0.0)
     straight = view.frame(0.0)
     assert straight['shape'] == 'straight'
-    # From the base over the guide, 4 cm before the skin, to the tip.
+    # From the base through the guide, 4 cm before the skin, to the tip.
     assert straight['needle'] == [[1e-3, 1e-3, 3e-3], [-0.15, -0.04, 0.05], [0.0, 0.0, -1e-3]]
     view.line('needle', shape(0.05), 0.5)
     view.line('path', shape(0.05)[20:], 0.5)
@@ -125,12 +127,12 @@ def test_the_shape_is_that_of_the_plant_or_straight() -> None:
     np.testing.assert_allclose(np.transpose(bent['needle']), shape(0.05), atol=1e-6)
     later = view.frame(2.0)
     assert later['shape'] == 'straight'
-    # What was cut stays.
+    # The cut path stays.
     assert later['path'] == bent['path']
 
 
-def test_a_long_line_keeps_its_ends() -> None:
-    """A line has 120 points at most, the first and the last among them."""
+def test_decimated_line_keeps_its_ends() -> None:
+    """A line has at most 120 points, including the first and the last point."""
     view = View()
     points = np.linspace([0.0, -0.04, 0.0], [1e-3, 0.1, 2e-3], 5000)
     view.line('path', points, 0.0)
@@ -139,8 +141,8 @@ def test_a_long_line_keeps_its_ends() -> None:
     np.testing.assert_allclose(seen[[0, -1]], points[[0, -1]], atol=1e-6)
 
 
-def test_who_is_silent_is_named() -> None:
-    """A stream after a second, a node after three; a target comes once and is no stream."""
+def test_silent_topics_and_nodes_are_reported() -> None:
+    """Timeouts: topics after 1 s, nodes after 3 s; a target has no timeout."""
     view = View()
     view.reading('joint_states', joints(('insertion',), (0.05,), (), ()), 0.0)
     view.reading('target', numbers(0.0, 0.1, 0.0), 0.0)
@@ -153,8 +155,8 @@ def test_who_is_silent_is_named() -> None:
     assert (plant['silent'], plant['age'], plant['words']) == (True, 4.0, 'active')
 
 
-def test_the_worst_node_comes_first() -> None:
-    """Each node once, with the newest that it has said; control characters are not shown."""
+def test_nodes_are_sorted_by_level() -> None:
+    """Each node once, with its newest status; control characters are replaced."""
     view = View()
     view.status(status('/a', 'active'), 0.0)
     view.status(status('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
@@ -166,8 +168,8 @@ def test_the_worst_node_comes_first() -> None:
     assert nodes[1]['words'] == 'no joint_states?[2J'
 
 
-def test_the_target_is_the_one_that_was_taken() -> None:
-    """As the nodes say; one on the topic counts only where no node of ours says anything."""
+def test_target_is_accepted_target_of_diagnostics() -> None:
+    """The topic is used only without nodes of this package."""
     view = View()
     view.reading('target', numbers(1e-3, 0.2, 0.0), 0.0)
     assert view.frame(0.0)['target'] == [1e-3, 0.2, 0.0]
@@ -184,8 +186,8 @@ def test_the_target_is_the_one_that_was_taken() -> None:
     assert view.frame(0.0)['target'] is None
 
 
-def test_what_is_expected_has_an_interval_of_95_percent() -> None:
-    """1.96 standard deviations on each side; without finite numbers there is none."""
+def test_predicted_tip_has_95_percent_interval() -> None:
+    """1.96 standard deviations on each side; no prediction without finite numbers."""
     view = View()
     view.expected(expected(1e-3, 2e-3, deviation=1e-3))
     assert view.frame(0.0)['expected'] == {
@@ -197,7 +199,7 @@ def test_what_is_expected_has_an_interval_of_95_percent() -> None:
     assert view.frame(0.0)['invalid'] == 1
 
 
-def test_tissue_and_limits_are_those_of_the_configurations() -> None:
+def test_tissue_and_limits_follow_from_configurations() -> None:
     """Layers, membranes and free length of the plant; limits and depths of the controller."""
     found = scene({name: parameters_of(text) for name, text in CONFIGURATIONS.items()})
     assert found == {
@@ -217,8 +219,8 @@ def test_tissue_and_limits_are_those_of_the_configurations() -> None:
 @pytest.mark.parametrize(
     'text', ['', '- 1', 'a: b', 'a: {ros__parameters: 3}', '{', 'a: &x [*x]', 'a: {}\nb: {}']
 )
-def test_a_configuration_that_is_none_is_left_out(text: str) -> None:
-    """It counts as a message that could not be read."""
+def test_invalid_configuration_is_ignored(text: str) -> None:
+    """It is counted as an unreadable message."""
     view = View()
     view.configuration('plant', parameters_of(text))
     assert view.scene['tissue'] is None
@@ -231,13 +233,13 @@ def test_a_configuration_that_is_none_is_left_out(text: str) -> None:
         st.one_of(st.none(), st.text(), st.booleans(), any_number, st.lists(any_number)),
     )
 )
-def test_whatever_a_configuration_says_a_scene_is_json(parameters: dict[str, Any]) -> None:
-    """What is no finite number is left out."""
+def test_scene_of_any_configuration_is_json(parameters: dict[str, Any]) -> None:
+    """Numbers that are not finite are left out."""
     json.dumps(scene({'plant': parameters, 'controller': parameters}), allow_nan=False)
 
 
-def test_a_line_is_read_from_its_bytes() -> None:
-    """Name and points of a marker; bytes that end before that are refused."""
+def test_line_is_parsed_from_bytes() -> None:
+    """Name and points of a marker; truncated bytes are rejected."""
     data = encode(marker('path', shape(0.05)))
     name, points = read_line(data)
     assert name == 'path'
@@ -247,20 +249,20 @@ def test_a_line_is_read_from_its_bytes() -> None:
             read_line(data[:end])
 
 
-# Of a bag.
+# Recordings.
 
 
 @pytest.fixture(scope='module')
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a bag with everything that is shown."""
+    """Return a bag with all shown topics."""
     path = tmp_path_factory.mktemp('watched') / 'bag'
     write_watched(path)
     return path
 
 
 @pytest.mark.parametrize('space', ['', '/robot'])
-def test_a_bag_shows_what_was_at_each_time(tmp_path: Path, space: str) -> None:
-    """Also one of a graph in a namespace."""
+def test_bag_shows_measurements_at_any_time(tmp_path: Path, space: str) -> None:
+    """Also of nodes in a namespace."""
     write_watched(tmp_path / 'bag', space)
     bag = Recording(tmp_path / 'bag')
     assert bag.duration == DURATION
@@ -285,7 +287,7 @@ def test_a_bag_shows_what_was_at_each_time(tmp_path: Path, space: str) -> None:
     np.testing.assert_allclose(history[1:, 1], 0.02 * history[1:, 0], atol=1e-3)
 
 
-def test_a_bag_of_a_robot_has_no_shape(tmp_path: Path) -> None:
+def test_bag_of_robot_has_straight_shape(tmp_path: Path) -> None:
     """Depth and force are shown, and the needle is straight."""
     write_bag(tmp_path / 'bag', simulated())
     bag = Recording(tmp_path / 'bag')
@@ -294,8 +296,8 @@ def test_a_bag_of_a_robot_has_no_shape(tmp_path: Path) -> None:
     assert seen['depth'] > 0.02
 
 
-def test_a_long_recording_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of more messages than are kept every other one goes, from its beginning to its end."""
+def test_long_recording_is_decimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages above the limit are decimated by two, over the whole recording."""
     monkeypatch.setattr(recorded, '_MOST', 100)
     kept = recorded._Kept[int](1.0 / 30.0)
     for k in range(100_000):
@@ -315,8 +317,8 @@ def file_of(bag: Path) -> Path:
     return file
 
 
-def test_of_a_damaged_bag_the_rest_is_shown(watched: Path, tmp_path: Path) -> None:
-    """What was lost is said."""
+def test_readable_part_of_damaged_bag_is_shown(watched: Path, tmp_path: Path) -> None:
+    """Losses are reported."""
     file = tmp_path / 'cut.mcap'
     data = file_of(watched).read_bytes()
     file.write_bytes(data[: 2 * len(data) // 3])
@@ -327,7 +329,7 @@ def test_of_a_damaged_bag_the_rest_is_shown(watched: Path, tmp_path: Path) -> No
 
 
 def unusable(folder: Path, what: str) -> Path:
-    """Make a bag that has nothing to show."""
+    """Write a bag without content for the page."""
     path = folder / 'bag'
     if what == 'damaged':
         (folder / 'bag.mcap').write_bytes(bytes(range(256)) * 40)
@@ -355,10 +357,10 @@ def unusable(folder: Path, what: str) -> Path:
 
 
 @pytest.mark.parametrize('what', ['damaged', 'empty', 'of others', 'invalid', 'missing'])
-def test_a_bag_with_nothing_to_show_is_refused(
+def test_bag_without_content_is_rejected(
     tmp_path: Path, what: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One line that names it, and status 2."""
+    """One line with its name, and status 2."""
     path = unusable(tmp_path, what)
     with pytest.raises(RecordingError):
         Recording(path)
@@ -370,8 +372,8 @@ def test_a_bag_with_nothing_to_show_is_refused(
     assert path.name in line
 
 
-def test_a_recording_is_played() -> None:
-    """Its time goes on by its speed, up to the end; a jump is told."""
+def test_playback_follows_speed_and_jumps() -> None:
+    """Time advances with the speed, up to the end; jumps are reported."""
     now = 100.0
     play = Playback(10.0, lambda: now)
     assert play.playing
@@ -388,7 +390,7 @@ def test_a_recording_is_played() -> None:
     assert not play.take({'play': True})
     now += 5.0
     assert (play.at, play.playing) == (10.0, False)
-    # From the end it begins anew.
+    # At the end it restarts.
     assert play.take({'play': True})
     assert play.at == 0.0
     assert play.take({'at': 1e9})
@@ -399,17 +401,17 @@ def test_a_recording_is_played() -> None:
     'message',
     [{}, {'at': '1'}, {'at': True}, {'play': 1}, {'speed': 0}, {'speed': 1e3}, {'at': 1, 'b': 2}],
 )
-def test_what_a_recording_does_not_know_is_refused(message: dict[str, Any]) -> None:
-    """With what it takes."""
-    with pytest.raises(ParameterError, match='a recording takes'):
+def test_invalid_playback_message_is_rejected(message: dict[str, Any]) -> None:
+    """The error lists the valid messages."""
+    with pytest.raises(ParameterError, match='a recording accepts'):
         Playback(10.0).take(message)
 
 
-# The server.
+# Server.
 
 
 class Counting:
-    """Frames that are numbers: a new one whenever a reader asks."""
+    """Source of numbered frames: a new frame per request."""
 
     def __init__(self) -> None:
         self.number = 0
@@ -427,7 +429,7 @@ class Counting:
 
 
 class Buttons:
-    """What the buttons do: notes it. A retreat ends when it is let."""
+    """Control that records requests; a retraction ends on release."""
 
     def __init__(self) -> None:
         self.done: list[Any] = []
@@ -435,7 +437,7 @@ class Buttons:
 
     async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
         if y > 1.0:
-            raise JobError('no node takes targets')
+            raise JobError('no node subscribes to target')
         self.done.append((x, y, z))
         return True, 'steering: target accepted'
 
@@ -447,7 +449,7 @@ class Buttons:
 
 
 class Page:
-    """A served page, and a browser at it."""
+    """Server with a client session."""
 
     def __init__(self, server: Server, session: ClientSession, made: list[Counting]) -> None:
         self.server, self.session, self.made = server, session, made
@@ -455,17 +457,17 @@ class Page:
         self.port = self.url.rstrip('/').rpartition(':')[2]
 
     async def open(self, **headers: str) -> ClientWebSocketResponse:
-        """Open the stream of frames."""
+        """Open the WebSocket of frames."""
         return await self.session.ws_connect(f'{self.url}frames', headers=headers)
 
     async def tell(self, stream: ClientWebSocketResponse, message: object) -> dict[str, Any]:
-        """Send a message, and return its answer."""
+        """Send a message and return its answer."""
         await stream.send_str(message if isinstance(message, str) else json.dumps(message))
         return await answer(stream)
 
 
 async def answer(stream: ClientWebSocketResponse) -> dict[str, Any]:
-    """Return the next answer; frames in between are seen."""
+    """Return the next answer; acknowledge frames in between."""
     while True:
         said = await asyncio.wait_for(stream.receive_json(), 60.0)
         if 'answer' in said:
@@ -475,7 +477,7 @@ async def answer(stream: ClientWebSocketResponse) -> dict[str, Any]:
 
 @asynccontextmanager
 async def served(control: Buttons | None = None, **options: Any) -> AsyncIterator[Page]:
-    """Serve numbers."""
+    """Serve numbered frames."""
     made: list[Counting] = []
 
     def reader() -> Counting:
@@ -492,7 +494,7 @@ async def served(control: Buttons | None = None, **options: Any) -> AsyncIterato
 
 
 def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
-    """Run a test in a loop of its own."""
+    """Run an asynchronous test in an event loop."""
 
     def run() -> None:
         asyncio.run(asyncio.wait_for(test(), 300.0))
@@ -502,8 +504,8 @@ def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]
 
 
 @in_loop
-async def test_the_page_needs_nothing_from_elsewhere() -> None:
-    """No file of it names another server, and the browser is told to ask none."""
+async def test_page_has_no_external_content() -> None:
+    """No file names another server, and the policy forbids other origins."""
     async with served() as page:
         for name in ('', 'watch.css', 'watch.js', 'needle.js'):
             async with page.session.get(page.url + name) as reply:
@@ -520,8 +522,8 @@ async def test_the_page_needs_nothing_from_elsewhere() -> None:
 
 
 @in_loop
-async def test_a_name_that_leads_here_is_refused() -> None:
-    """DNS rebinding: a page of somebody else whose name leads to 127.0.0.1 gets nothing."""
+async def test_foreign_host_header_is_rejected() -> None:
+    """DNS rebinding: a foreign name that resolves to 127.0.0.1 is rejected."""
     async with served() as page:
         for host in (
             f'evil.example:{page.port}', 'evil.example', '127.0.0.1', '127.0.0.1:1', '',
@@ -539,8 +541,8 @@ async def test_a_name_that_leads_here_is_refused() -> None:
 
 
 @in_loop
-async def test_a_page_of_somebody_else_is_refused() -> None:
-    """Cross-site requests: a WebSocket that another page opens gets nothing."""
+async def test_foreign_origin_is_rejected() -> None:
+    """Cross-site requests: the WebSocket of a foreign page is rejected."""
     async with served(Buttons()) as page:
         for origin in ('http://evil.example', 'null', 'https://127.0.0.1', 'http://127.0.0.1:1'):
             with pytest.raises(WSServerHandshakeError, match='403'):
@@ -550,8 +552,8 @@ async def test_a_page_of_somebody_else_is_refused() -> None:
 
 
 @in_loop
-async def test_commands_need_the_token_of_the_process() -> None:
-    """Without it, or with another, nothing is done, and the answer says where it is."""
+async def test_commands_require_token() -> None:
+    """A missing or wrong token has no effect, and the answer explains the source of the token."""
     buttons = Buttons()
     async with served(buttons) as page:
         token = page.server.token
@@ -562,7 +564,7 @@ async def test_commands_need_the_token_of_the_process() -> None:
             message = {'ask': 'stop'} if wrong is None else {'ask': 'stop', 'token': wrong}
             said = await page.tell(stream, message)
             assert said['success'] is False
-            assert 'open the URL that needle watch has printed' in said['words']
+            assert 'open the URL printed by needle watch' in said['words']
         assert buttons.done == []
         said = await page.tell(stream, {'ask': 'stop', 'token': token})
         assert said == {'asked': 'stop', 'success': True, 'words': 'stop it is'}
@@ -576,8 +578,8 @@ async def test_commands_need_the_token_of_the_process() -> None:
 
 
 @in_loop
-async def test_without_control_nothing_can_be_commanded() -> None:
-    """There is no token, and none helps."""
+async def test_page_without_control_rejects_commands() -> None:
+    """There is no token, and any token is rejected."""
     async with served() as page:
         assert page.server.token == ''
         assert '#' not in page.server.address
@@ -585,12 +587,12 @@ async def test_without_control_nothing_can_be_commanded() -> None:
         for token in ('', 'x'):
             said = await page.tell(stream, {'ask': 'stop', 'token': token})
             assert said['success'] is False
-            assert said['words'] == 'this page is for looking only: needle watch --control'
+            assert said['words'] == 'this page is read-only: use needle watch --control'
 
 
 @in_loop
-async def test_a_command_that_is_none_is_refused() -> None:
-    """With what would be valid; nothing is done."""
+async def test_invalid_command_is_rejected() -> None:
+    """The answer lists valid commands, without any effect."""
     buttons = Buttons()
     async with served(buttons) as page:
         stream, token = await page.open(), page.server.token
@@ -603,7 +605,7 @@ async def test_a_command_that_is_none_is_refused() -> None:
             ({'ask': 'target', 'at': [0, '0.1', 0]}, 'a target is'),
             ({'ask': 'target', 'at': [0, True, 0]}, 'a target is'),
             ({'ask': 'target', 'at': [0, 10**400, 0]}, 'a target is'),
-            ({'ask': 'target', 'at': [0, 2.0, 0]}, 'no node takes targets'),
+            ({'ask': 'target', 'at': [0, 2.0, 0]}, 'no node subscribes to target'),
         ):  # fmt: skip
             said = await page.tell(stream, {**message, 'token': token})
             assert said['success'] is False
@@ -615,8 +617,8 @@ async def test_a_command_that_is_none_is_refused() -> None:
 
 
 @in_loop
-async def test_a_stop_does_not_wait_for_what_was_asked_before() -> None:
-    """While a retreat is under way, a stop is done and answered."""
+async def test_stop_is_executed_during_other_command() -> None:
+    """A stop is executed and answered during a retraction."""
     buttons = Buttons()
     async with served(buttons) as page:
         stream, token = await page.open(), page.server.token
@@ -626,13 +628,13 @@ async def test_a_stop_does_not_wait_for_what_was_asked_before() -> None:
         for _ in range(20):
             await stream.send_json({'ask': 'retract', 'token': token})
         said = await answer(stream)
-        assert said['words'] == '8 commands are under way already'
+        assert said['words'] == '8 commands are already in progress'
         buttons.free.set()
 
 
 @in_loop
-async def test_messages_that_are_none_do_no_harm() -> None:
-    """Each gets an answer, and the frames go on; too long a message ends its connection only."""
+async def test_invalid_messages_are_answered() -> None:
+    """Frames continue; a message that is too long ends its connection only."""
     async with served() as page:
         stream = await page.open()
         for text in ('', '{', '[]', '3', 'null', '"x"', '[' * 4000, '{"seen": "all"}', '{"b": 1}'):
@@ -657,23 +659,23 @@ async def test_messages_that_are_none_do_no_harm() -> None:
 
 
 @in_loop
-async def test_a_slow_reader_misses_frames_and_gets_no_old_ones() -> None:
-    """It gets two; the next only after it has seen one, and nothing is kept for it meanwhile."""
+async def test_slow_reader_skips_frames() -> None:
+    """It receives two frames, and further frames only after acknowledgement; none are queued."""
     async with served() as page:
         slow, quick = await page.open(), await page.open()
         assert [(await slow.receive_json())['frame'] for _ in range(2)] == [1, 2]
         for _ in range(100):
             await quick.receive_json()
             await quick.send_json({'seen': 1})
-        # The third is being made when the second has left; it has not been asked for.
+        # The third frame is not requested before an acknowledgement.
         assert page.made[0].number == 2
         with pytest.raises(asyncio.TimeoutError):
             await slow.receive(0.05)
 
 
 @in_loop
-async def test_what_is_live_is_the_newest() -> None:
-    """A slow reader gets the newest frame; a new reader gets the history."""
+async def test_live_reader_receives_newest_frame() -> None:
+    """A slow reader receives the newest frame, a new reader the history."""
     view = View()
     live = Live(view, lambda _: None, control=False)
     running = asyncio.create_task(live.run())
@@ -698,8 +700,8 @@ async def test_what_is_live_is_the_newest() -> None:
         running.cancel()
 
 
-def test_what_is_recorded_is_shown_as_its_reader_asks(watched: Path) -> None:
-    """Frames of the time that was asked for, with what was before; two readers are apart."""
+def test_recorded_reader_controls_playback(watched: Path) -> None:
+    """Frames of the requested time with history; readers are independent."""
     bag = Recording(watched)
 
     async def look() -> None:
@@ -715,7 +717,7 @@ def test_what_is_recorded_is_shown_as_its_reader_asks(watched: Path) -> None:
             seen = json.loads(await reader.next())
             assert seen['frame']['time'] == at
             assert len(seen['history']) == round(10 * at)
-        # One that is paused has nothing new.
+        # No new frame during a pause.
         waiting = asyncio.ensure_future(one.next())
         await asyncio.sleep(0.2)
         assert not waiting.done()
@@ -726,13 +728,13 @@ def test_what_is_recorded_is_shown_as_its_reader_asks(watched: Path) -> None:
 
 
 @in_loop
-async def test_readers_come_and_go() -> None:
-    """One that breaks off leaves nothing behind; more than may be at a time are refused."""
+async def test_readers_disconnect_without_leak() -> None:
+    """An aborted connection is removed; readers above the limit are rejected."""
     async with served() as page:
         for _ in range(2 * MOST_READERS):
             stream = await page.open()
             await stream.receive_json()
-            # Without a word, as a browser that crashes.
+            # Abort without close, as in a crash of the browser.
             assert stream._response.connection is not None
             stream._response.connection.transport.abort()
         for _ in range(600):
@@ -747,8 +749,8 @@ async def test_readers_come_and_go() -> None:
 
 
 @in_loop
-async def test_a_port_in_use_is_named() -> None:
-    """With what would be valid."""
+async def test_port_in_use_is_reported() -> None:
+    """The error proposes another port."""
     with socket.socket() as taken:
         taken.bind(('127.0.0.1', 0))
         taken.listen()
@@ -761,8 +763,8 @@ async def test_a_port_in_use_is_named() -> None:
     )
 
 
-def test_it_is_open_for_looking_only() -> None:
-    """Control and other machines exclude each other; an address must be one."""
+def test_control_is_restricted_to_loopback() -> None:
+    """Control and other machines exclude each other; the host must be an address."""
     with pytest.raises(ParameterError, match='--control works on this machine only'):
         Server(Counting, '0.0.0.0', control=Buttons())  # noqa: S104
     with pytest.raises(ParameterError, match='--host must be an address'):
@@ -772,11 +774,11 @@ def test_it_is_open_for_looking_only() -> None:
 
 
 @in_loop
-async def test_an_open_page_is_found_by_address_only() -> None:
-    """And its first lines say that others may look."""
+async def test_open_page_requires_address_as_host() -> None:
+    """The first lines report the read access of other machines."""
     async with served(host='0.0.0.0') as page:  # noqa: S104
         said = page.server.words
-        assert 'other machines may look' in said[1]
+        assert 'read access for other machines' in said[1]
         for host, code in ((f'192.0.2.1:{page.port}', 200), (f'evil.example:{page.port}', 403)):
             async with page.session.get(page.url, headers={'Host': host}) as reply:
                 assert reply.status == code
@@ -786,8 +788,8 @@ async def test_an_open_page_is_found_by_address_only() -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_with_status_0(watched: Path, number: signal.Signals) -> None:
-    """Also while somebody looks."""
+def test_signal_exits_with_status_0(watched: Path, number: signal.Signals) -> None:
+    """Also with a connected reader."""
     running = subprocess.Popen(
         [sys.executable, '-m', 'needle_insertion.cli', 'watch', str(watched), '--port', '0'],
         env={**os.environ, 'PYTHONPATH': str(ROOT)},
@@ -817,9 +819,7 @@ def test_a_signal_ends_it_with_status_0(watched: Path, number: signal.Signals) -
         running.communicate()
 
 
-def test_options_that_exclude_each_other_are_refused(
-    watched: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A recording cannot be commanded."""
+def test_exclusive_options_are_rejected(watched: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A recording has no control."""
     assert cli.main(['watch', str(watched), '--control']) == 2
     assert 'error: --control needs a live insertion' in capsys.readouterr().err

@@ -151,7 +151,7 @@ def test_buttons_command_the_needle(ros_graph: RosGraph) -> None:
             await reader.until(lambda frame: frame['depth'] < 0.025, 'the retreat')
 
     with watching(ros_graph.environment, '--control') as (running, url):
-        assert running.stdout.readline().startswith('whoever has this address may move')
+        assert running.stdout.readline().startswith('this address permits motion')
         asyncio.run(look(url))
         running.send_signal(signal.SIGINT)
         assert running.wait(60.0) == 0
@@ -168,7 +168,7 @@ def test_read_only_page_rejects_commands(ros_graph: RosGraph) -> None:
             for what in ('target', 'stop'):
                 said = await reader.ask(what, at=[0.0, 0.03, 0.0])
                 assert said['success'] is False
-                assert 'for looking only' in said['words']
+                assert 'this page is read-only' in said['words']
             plant.kill()
             await reader.until(lambda frame: 'joint_states' in frame['silent'], 'silence')
             await reader.until(lambda _: reader.level('/plant') is None, 'silence of the node')
@@ -202,7 +202,7 @@ def test_button_without_nodes_is_reported(ros_graph: RosGraph) -> None:
         async with reading(url) as reader:
             await reader.until(lambda frame: frame['shape'] is None, 'a frame')
             said = await reader.ask('target', at=[0.0, 0.1, 0.0])
-            assert said['words'].startswith('no node takes targets')
+            assert said['words'].startswith('no node subscribes to target')
             said = await reader.ask('stop')
             assert said == {
                 'asked': 'stop', 'success': False,
@@ -265,7 +265,7 @@ def test_browser_shows_live_data(ros_graph: RosGraph, tmp_path: Path, width: int
             seen = await shown(tab, url, width, tmp_path / 'page.png')
             assert seen['overflow'] == 0
             assert seen['blank'] == []
-            for words in ('Inserted depth', 'limit ±100', 'commanded ±15', 'Stop', 'plant'):
+            for words in ('Insertion depth', 'limit ±100', 'commanded ±15', 'Stop', 'plant'):
                 assert words in seen['text']
             count = await tab.run('needleWatch.drawn')
             begun = asyncio.get_running_loop().time()

@@ -1,11 +1,11 @@
 'use strict';
 
-/* The page of `needle watch`: takes frames, draws the newest, and says when it has drawn it. */
+/* Page of `needle watch`: receives frames, draws the newest frame, and acknowledges it. */
 
 const find = (id) => document.getElementById(id);
 const mm = (value) => (value === null ? null : 1e3 * value);
 
-/* Of the strip charts [s]; between two changes of words and numbers [ms]. */
+/* Duration of the strip charts [s]; period of text and numbers [ms]. */
 const SPAN = 20, WORDS = 120;
 const LEVELS = ['fine', 'warning', 'error', 'silent'];
 const SIGNS = {fine: '●', warning: '▲', error: '■', silent: '○', none: '○'};
@@ -15,7 +15,7 @@ const token = new URLSearchParams(location.hash.slice(1)).get('token') || '';
 const calm = matchMedia('(prefers-reduced-motion: reduce)');
 const drawing = new needleDrawing.Drawing(find('needle'));
 
-/* What tests and the curious may look at. */
+/* State for tests. */
 const seen = {frames: 0, drawn: 0, connected: false};
 window.needleWatch = seen;
 
@@ -23,7 +23,7 @@ let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting =
 let frame = null, playback = null, history = [], waiting = false, worded = 0, drawnAt = 0;
 let dragging = false, unseen = 0, saying = 0;
 
-/* Words. */
+/* Text. */
 
 const fixed = (value, digits) =>
   (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
@@ -46,7 +46,7 @@ function make(tag, text = '', kind = '') {
 /* Numbers with their limits. */
 
 const QUANTITIES = [
-  {name: 'Inserted depth', unit: 'mm', digits: 2, of: (f) => mm(f.depth), stream: 'joint_states',
+  {name: 'Insertion depth', unit: 'mm', digits: 2, of: (f) => mm(f.depth), stream: 'joint_states',
     range: (l) => ('low' in l && 'high' in l ? [mm(l.low), mm(l.high)] : null)},
   {name: 'Velocity', unit: 'mm/s', digits: 1, of: (f) => mm(f.velocity), stream: 'joint_states',
     range: (l) => ('speed' in l ? [-mm(l.speed), mm(l.speed)] : null)},
@@ -83,7 +83,7 @@ function show(one) {
   put(one.value, fixed(value, one.digits));
   one.meter.hidden = range === null;
   if (range === null) {
-    put(one.limit, age === undefined ? 'limit not known' : `silent for ${fixed(age, 0)} s`);
+    put(one.limit, age === undefined ? 'limit unknown' : `silent for ${fixed(age, 0)} s`);
     level(one.box, age === undefined ? 'fine' : 'silent');
     return;
   }
@@ -101,7 +101,7 @@ function show(one) {
   marks.forEach((mark, k) => { one.meter.children[k + 1].style.left = `${share(mark)}%`; });
   let words = low === -high ? `limit ±${fixed(high, 0)}` : `${fixed(low, 0)} to ${fixed(high, 0)}`;
   words += one.more ? one.more(scene.limits) : '';
-  /* The range of depths may be used up; the others are limits that stop the needle. */
+  /* No warning near the ends of the depth range; the other limits stop the needle. */
   const used = value === null || low !== -high ? 0 : Math.abs(value) / high;
   let state = 'fine';
   if (value !== null && (value < low || value > high)) {
@@ -190,7 +190,7 @@ function chart({canvas, factor, least, lines, limit}) {
   }
 }
 
-/* What the nodes say. */
+/* Status of the nodes. */
 
 function tell(node) {
   const name = node.silent ? 'silent' : LEVELS[node.level] || 'silent';
@@ -221,7 +221,7 @@ function tellNodes() {
   }, {name: frame.nodes.length ? 'fine' : 'none', node: null});
   const of = worst.node ? worst.node.name.replace(/^\//, '') : '';
   const words = {
-    fine: 'nodes are fine', none: 'no node has said anything', silent: `${of} is silent`,
+    fine: 'all nodes OK', none: 'no status received', silent: `${of} is silent`,
     warning: `warning: ${of}`, error: `error: ${of}`,
   }[worst.name];
   level(find('state'), worst.name);
@@ -236,23 +236,23 @@ function tellAim() {
   const parts = [`Target x ${fixed(mm(target[0]), 2)}, y ${fixed(mm(target[1]), 1)}, z ${fixed(mm(target[2]), 2)} mm.`];
   if (frame.expected) {
     const {at, half} = frame.expected;
-    parts.push(`Expected there: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
+    parts.push(`Predicted tip: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
   }
   const chance = frame.nodes.map((node) => node.values['chance to come within 1 mm']).find(Boolean);
-  if (chance) parts.push(`Chance to come within 1 mm: ${chance}.`);
+  if (chance) parts.push(`Probability of a hit within 1 mm: ${chance}.`);
   put(find('reach'), parts.join(' '));
 }
 
 function tellShape() {
-  const of = scene.tissue ? ` Tissue as the node ${scene.tissue.of} has it.` : ' No node has told of needle and tissue.';
+  const of = scene.tissue ? ` Tissue from the configuration of the node ${scene.tissue.of}.` : ' No configuration of needle and tissue received.';
   const words = frame.shape === 'straight'
     ? `The shape of the needle is not measured: the dashed line is straight from the guide to the tip.${of}`
-    : frame.shape === null ? 'The needle is not seen: no joint_states.' : '';
+    : frame.shape === null ? 'Needle position unknown: no joint_states received.' : '';
   find('shape').hidden = words === '';
   put(find('shape'), words);
 }
 
-/* Words and numbers: not so often that nobody could read them. */
+/* Text and numbers, at a readable rate. */
 function say() {
   clearTimeout(saying);
   saying = 0;
@@ -273,7 +273,7 @@ function draw(now) {
   drawing.draw(scene, frame);
   CHARTS.forEach(chart);
   if (now - worded > WORDS) say();
-  /* The last of several frames is told, too. */
+  /* Text of the last frame, too. */
   else if (!saying) saying = setTimeout(say, WORDS);
   seen.drawn += 1;
   if (unseen) send({seen: unseen});
@@ -283,7 +283,7 @@ function draw(now) {
 function later() {
   if (waiting) return;
   waiting = true;
-  /* Who wants less motion gets two pictures a second. */
+  /* Two frames per second with prefers-reduced-motion. */
   const pause = calm.matches ? Math.max(0, 500 - (performance.now() - drawnAt)) : 0;
   if (pause) setTimeout(() => requestAnimationFrame(draw), pause);
   else requestAnimationFrame(draw);
@@ -324,7 +324,7 @@ function settle(given) {
   put(find('losses'), setting.recording.losses.join('; '));
 }
 
-/* Playing a recording. */
+/* Playback. */
 
 function tellPlayback() {
   put(find('play'), playback.playing ? 'Pause' : 'Play');
@@ -362,7 +362,7 @@ find('target').addEventListener('submit', (event) => {
   send({ask: 'target', at: [x, y, z].map((input) => Number(input.value) / 1e3), token});
 });
 
-/* The connection. */
+/* Connection. */
 
 function send(message) {
   const open = socket !== null && socket.readyState === WebSocket.OPEN;
@@ -382,7 +382,7 @@ function connect() {
     seen.connected = false;
     document.body.classList.add('lost');
     level(find('state'), 'error');
-    put(find('state'), '■ not connected: needle watch has ended or cannot be reached');
+    put(find('state'), '■ not connected: needle watch has ended or is not reachable');
     setTimeout(connect, 1000);
   });
 }
