@@ -22,9 +22,7 @@ class Answer(Protocol):
 
 
 class Application:
-    """
-    Parameters sent to other nodes, and the responses of these nodes (None: no such node), by name.
-    """
+    """Parameters sent to other nodes, and their responses (None: no such node), by name."""
 
     def __init__(
         self, values: Mapping[str, float | str], answers: Mapping[str, Answer | None]

@@ -149,7 +149,7 @@ def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
     assert read.losses == (
         '1 lines not readable, left out',
         'columns by their names: time=time, depth=depth, force=force',
-        '1 rows with a value that is no number, left out',
+        '1 rows with a value that is not a number, left out',
         '1 rows out of order, sorted by time',
         '1 rows with the time of another, left out',
     )
