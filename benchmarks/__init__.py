@@ -1,1 +1,1 @@
-"""Benchmarks: what it costs, beside what a user would otherwise use."""
+"""Benchmarks: cost and accuracy compared with common alternatives."""

@@ -1,8 +1,8 @@
 """
-Time from a trajectory to the answer of the controller, accepted or rejected.
+Time from a trajectory to the status "accepted" or "rejected" of the controller.
 
-The controller and a plant are processes; the answer is read from ``/diagnostics``. Run it
-by ``python -m benchmarks.answers --count 300``.
+Controller and plant are separate processes; the status is read from ``/diagnostics``. Run it by
+``python -m benchmarks.answers --count 300``.
 """
 
 from __future__ import annotations
@@ -26,48 +26,29 @@ from needle_ros.timing import nanoseconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Longest time to an answer that is permitted [s].
+#: Longest permitted response time [s].
 LONGEST: Final = 0.2
 
-#: Insertion depths [m]: where the needle is, and beyond its range.
+#: Insertion depths [m]: current depth, and a depth outside the range.
 _DEPTHS: Final = {Verdict.ACCEPTED: 0.02, Verdict.REJECTED: 5.0}
 
-#: Longest pause between two trajectories [s]: shorter and longer than between two statuses.
+#: Longest pause between two trajectories [s]; pauses are shorter and longer than the status
+#: period.
 _PAUSE: Final = 0.15
 
 
 class Countdown:
-    """A time [s] from now."""
+    """Timeout [s] from now."""
 
     def __init__(self, duration: float) -> None:
         self._end = monotonic() + duration
 
     def over(self) -> bool:
-        """Return whether it is over."""
         return monotonic() > self._end
 
 
 def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, list[float]]:
-    """
-    Send trajectories, of which every second one is invalid.
-
-    Parameters
-    ----------
-    count : int
-        Number of trajectories.
-    seed : int
-        Seed of the pauses.
-    rate : float
-        Rate of plant and controller [Hz].
-    logs : Path
-        Folder for logs.
-
-    Returns
-    -------
-    dict of Verdict to list of float
-        Times to the answers [s].
-
-    """
+    """Send valid and invalid trajectories in turn; return the response times [s] by verdict."""
     rng = np.random.default_rng(seed)
     times: dict[Verdict, list[float]] = {verdict: [] for verdict in _DEPTHS}
     with Graph(logs) as graph:

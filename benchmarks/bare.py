@@ -1,8 +1,8 @@
 """
-Bare rclpy nodes to compare with: they send the messages of our nodes, and do nothing else.
+Bare rclpy nodes for comparison: they publish the same messages without any computation.
 
-Run as ``python -m benchmarks.bare ROLE EXECUTOR``. None of our packages is imported, so that
-neither their memory nor their garbage slows these nodes down.
+Run as ``python -m benchmarks.bare ROLE EXECUTOR``. No package of the suite is imported, so that
+its memory and garbage collection do not slow down these nodes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
-#: Quality of service of our topics.
+#: Quality of service of the topics of the suite.
 SENSOR: Final = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED: Final = QoSProfile(
@@ -34,7 +34,7 @@ LATCHED: Final = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
-#: What the plant sends at each sample, in order.
+#: Messages of the plant for each sample, in order.
 STREAMS: Final = {
     'base_wrench': WrenchStamped,
     'tip_deflection': PointStamped,
@@ -46,27 +46,19 @@ STREAMS: Final = {
 RATE: Final = 1000
 PERIOD: Final = 1_000_000_000 // RATE
 
-#: Largest number of late samples that are made up at one tick.
+#: Largest number of late samples per timer tick.
 _BURST: Final = 10
 
 _PR_SET_PDEATHSIG = 1
 
 
 def _time_message(stamp: int) -> Time:
-    """Return a time [ns] as a message."""
+    """Convert a time [ns] to a message."""
     return Time(sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
 
 
 class Sender:
-    """
-    Publishes samples of the plant, filled from numbers each time as the plant does.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Node that publishes.
-
-    """
+    """Publishes samples of the plant with new numbers in each message, as the plant does."""
 
     def __init__(self, node: Node) -> None:
         self._publishers = [node.create_publisher(t, n, SENSOR) for n, t in STREAMS.items()]
@@ -76,46 +68,18 @@ class Sender:
         self._joints = JointState(name=['insertion', 'rotation'])
 
     def destroy(self, node: Node) -> None:
-        """
-        Destroy the publishers.
-
-        Parameters
-        ----------
-        node : rclpy.node.Node
-            Node that publishes.
-
-        """
         for publisher in self._publishers:
             node.destroy_publisher(publisher)
 
     def has_readers(self) -> bool:
-        """
-        Return whether every topic has a subscription.
-
-        Returns
-        -------
-        bool
-            True if so.
-
-        """
+        """Return whether each topic has a subscription."""
         return all(publisher.get_subscription_count() for publisher in self._publishers)
 
     def send(self, stamp: int, depth: float = 0.05) -> int:
         """
-        Send a sample.
+        Send a sample with a stamp [ns] and an insertion depth [m].
 
-        Parameters
-        ----------
-        stamp : int
-            Time stamp [ns].
-        depth : float
-            Insertion depth [m].
-
-        Returns
-        -------
-        int
-            Time just before ``joint_states``, the last message, was sent [ns].
-
+        Returns the time just before the last message, ``joint_states``, was sent [ns].
         """
         wrench, tip, truth, joints = self._wrench, self._tip, self._truth, self._joints
         stamped = _time_message(stamp)
@@ -136,17 +100,7 @@ class Sender:
 
 
 class Clocked(Node, ABC):
-    """
-    Does something in every period while the topic ``run`` says so, and makes up missed periods.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    **options
-        For `rclpy.node.Node`.
-
-    """
+    """Runs periodically while the topic ``run`` is true, and catches up missed periods."""
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -169,19 +123,11 @@ class Clocked(Node, ABC):
 
     @abstractmethod
     def sample(self, stamp: int) -> None:
-        """
-        Do what is due in a period.
-
-        Parameters
-        ----------
-        stamp : int
-            Time [ns].
-
-        """
+        """Process one period with its time stamp [ns]."""
 
 
 class BarePlant(Clocked):
-    """Sends the messages of the plant and takes its command."""
+    """Publishes the messages of the plant and subscribes to its command."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('bare_plant', **options)
@@ -190,15 +136,6 @@ class BarePlant(Clocked):
         self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
 
     def sample(self, stamp: int) -> None:
-        """
-        Send a sample.
-
-        Parameters
-        ----------
-        stamp : int
-            Time [ns].
-
-        """
         self._sender.send(stamp)
 
     def _on_command(self, message: WrenchStamped) -> None:
@@ -206,7 +143,7 @@ class BarePlant(Clocked):
 
 
 class BareEcho(Node):
-    """Answers each ``joint_states`` with the messages of the controller, the command first."""
+    """Responds to each ``joint_states`` with the messages of the controller, the command first."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('bare_echo', **options)
@@ -243,11 +180,11 @@ class BareEcho(Node):
 
 class BareSource(Clocked):
     """
-    Sends numbered messages to a recorder: the four topics of the plant and the command.
+    Sends numbered messages of the four plant topics and the command to a recorder.
 
-    The time stamp is the number of the sample, in periods. The first sample is sent when every
-    topic has a subscription. When ``run`` becomes false, the node prints how many samples it has
-    sent, and in how many seconds.
+    The time stamp is the sample number, in periods. The first sample is sent when each topic has a
+    subscription. When ``run`` becomes false, the node prints the number of samples and the
+    duration [s].
     """
 
     def __init__(self, **options: Any) -> None:
@@ -264,15 +201,7 @@ class BareSource(Clocked):
             sys.stdout.flush()
 
     def sample(self, _stamp: int) -> None:
-        """
-        Send the next number on each topic, once all have a subscription.
-
-        Parameters
-        ----------
-        _stamp : int
-            Not used.
-
-        """
+        """Send the next number on each topic, once all have a subscription."""
         if self._sent or (self._sender.has_readers() and self._command.get_subscription_count()):
             if not self._sent:
                 self._begin = time.monotonic()
@@ -287,17 +216,7 @@ EXECUTORS: Final = {'events': EventsExecutor, 'single': SingleThreadedExecutor}
 
 
 def main(role: str, executor_name: str) -> None:
-    """
-    Run one node until the process is killed, or the process that started it ends.
-
-    Parameters
-    ----------
-    role : str
-        A key of `ROLES`.
-    executor_name : str
-        A key of `EXECUTORS`.
-
-    """
+    """Run a node of `ROLES` on an executor of `EXECUTORS` until it or its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     executor: Executor = EXECUTORS[executor_name]()

@@ -1,8 +1,8 @@
 """
-Many insertions at once: the gain over one after the other and by a second thread, and the memory.
+Batches of insertions: gain over single runs and by a second thread, and memory.
 
-The speed-up depends on what else the machine does. A loop of sums and products, which shares
-nothing between its threads, is measured beside it as the upper limit.
+The speed-up depends on other load of the machine. Its upper limit is measured at the same time
+with a loop of sums and products without data shared between threads.
 """
 
 from __future__ import annotations
@@ -29,28 +29,20 @@ import numpy as np
 #: Number of insertions.
 RUNS: Final = 2000
 
-#: Step [s] from which the steps grow.
+#: Initial step [s]; steps grow with depth.
 _STEP: Final = 1.4e-5
 
-#: Interval of the runs whose memory is measured [s].
+#: Sampling interval of the memory measurement [s].
 _INTERVAL: Final = DURATION / 300
 
-#: Rounds of the loop in all threads together: it lasts about as long as the insertions.
+#: Rounds of the loop over all threads, for about the duration of the insertions.
 _ROUNDS: Final = 100_000_000
 
 _REPEATS: Final = 30
 
 
 class Batches:
-    """
-    The open-loop run with friction from 0.5 to 1.5 times that of the paper.
-
-    Parameters
-    ----------
-    runs : int
-        Number of insertions.
-
-    """
+    """Open-loop runs with friction from 0.5 to 1.5 times the value of the paper."""
 
     def __init__(self, runs: int = RUNS) -> None:
         preset = NeedleParameters.preset('paper_si')
@@ -68,24 +60,7 @@ class Batches:
         interval: float = DURATION,
         keep: bool = False,
     ) -> Batch:
-        """
-        Simulate all insertions.
-
-        Parameters
-        ----------
-        workers : int
-            Number of threads.
-        duration, interval : float
-            Simulated time, and time between the samples [s].
-        keep : bool
-            Whether all samples are kept, or the final states only.
-
-        Returns
-        -------
-        Batch
-            Result.
-
-        """
+        """Simulate all insertions; keep all samples or only the final states."""
         return simulate_batch(
             self._parameters,
             self._start,
@@ -99,15 +74,7 @@ class Batches:
         )
 
     def one_by_one(self) -> FloatArray:
-        """
-        Simulate all insertions one after the other, as `Integrator` does, in compiled code.
-
-        Returns
-        -------
-        ndarray, shape (runs, 8)
-            States at the end.
-
-        """
+        """Simulate the insertions one after the other; return final states, (runs, 8)."""
         ends = np.tile(self._start, (len(self._parameters), 1))
         force, torque = np.array([FORCE]), np.zeros(1)
         for p, end in zip(self._parameters, ends, strict=True):
@@ -115,22 +82,7 @@ class Batches:
         return ends
 
     def peak_memory(self, part: float, *, keep: bool) -> int:
-        """
-        Return the peak memory of a run.
-
-        Parameters
-        ----------
-        part : float
-            Simulated time over `DURATION`.
-        keep : bool
-            Whether all samples are kept.
-
-        Returns
-        -------
-        int
-            Memory [bytes].
-
-        """
+        """Return the peak memory [bytes] of a run over a fraction of `DURATION`."""
         job = partial(self.run, 2, duration=part * DURATION, interval=_INTERVAL, keep=keep)
         job()
         tracemalloc.start()
@@ -142,28 +94,13 @@ class Batches:
 
 
 def _spin(threads: int) -> None:
-    """Share the rounds of the loop among threads."""
+    """Distribute the rounds of the loop over threads."""
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(partial(chains, 0.7, 0.6), [_ROUNDS // threads] * threads))
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Measure batches of insertions on one and two threads.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections : list of Section
-        Times on one thread and on two, and peak memory.
-    bars : list of Bar
-        Gain by the second thread, and growth of memory with the simulated time.
-
-    """
+    """Measure batches of insertions on one and two threads, and their memory."""
     batches = Batches()
     tick('batches, one thread and two')
     times = least_times(
@@ -200,7 +137,7 @@ def compare(tick: Tick) -> Answer:
         'Batches',
         ('what', '1 thread [ms]', '2 threads [ms]', 'speed-up', 'per second'),
         rows,
-        f'{RUNS} open-loop runs of {DURATION * 1e3:g} ms. Friction is 0.5 to 1.5 times that of '
+        f'{RUNS} open-loop runs of {DURATION * 1e3:g} ms. Friction is 0.5 to 1.5 times '
         f'the preset. The steps begin at {_STEP * 1e6:g} us and grow with depth. The final states '
         f'are kept.\n\n'
         f'- Identical bits on 1 and 2 threads: {"yes" if np.array_equal(one, two) else "NO"}.\n'

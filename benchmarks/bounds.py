@@ -1,8 +1,8 @@
 """
 True parameters of simulated recordings, and the Cramer-Rao bound of their estimates.
 
-The bound takes the noise of the readings as it is in the simulation: white at the rate of the
-sensor, then filtered, then sampled at the rate of the recording.
+The bound uses the noise model of the simulation: white at the rate of the sensor, then filtered,
+then sampled at the rate of the recording.
 """
 
 from __future__ import annotations
@@ -28,28 +28,15 @@ from scipy.signal import butter, sosfilt
 #: Samples per second of the recordings [Hz].
 RATE: Final = 250.0
 
-#: Readings this many samples apart have independent noise.
+#: Number of samples after which readings have independent noise.
 _REACH: Final = 24
 
-#: True value and Cramer-Rao bound of the variance by parameter; NaN where there is no bound.
+#: True value and Cramer-Rao bound of the variance by parameter; NaN without a bound.
 Truth: TypeAlias = Mapping[str, tuple[float, float]]
 
 
 def sensor_lag(parameters: ForceSensorParameters) -> float:
-    """
-    Return the delay of a slow force by the filters of a sensor.
-
-    Parameters
-    ----------
-    parameters : ForceSensorParameters
-        Sensor.
-
-    Returns
-    -------
-    float
-        Delay [s].
-
-    """
+    """Return the delay [s] of a slowly varying force by the filters of a sensor."""
     late = 0.0
     for cutoff in parameters.cutoffs:
         b, a = butter(2, cutoff, fs=parameters.rate)
@@ -60,22 +47,10 @@ def sensor_lag(parameters: ForceSensorParameters) -> float:
 
 def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
     """
-    Return the covariance of the noise of two readings.
+    Return the autocovariance [N^2] of readings 0, 1, 2, ... samples apart, shape (_REACH,).
 
     White noise at the rate of the sensor passes its filters, is sampled at `RATE`, and rounded.
-
-    Parameters
-    ----------
-    parameters : ForceSensorParameters
-        Sensor.
-    axis : int
-        Force x y z, torque x y z.
-
-    Returns
-    -------
-    ndarray, shape (_REACH,)
-        Covariance of readings that are 0, 1, 2, ... samples apart [N^2].
-
+    The axes are force x y z, torque x y z.
     """
     every = round(parameters.rate / RATE)
     response = np.zeros(2 * _REACH * every)
@@ -90,22 +65,10 @@ def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
 
 def information(regressors: FloatArray, noise: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
     """
-    Return the Fisher information on the coefficients of regressors.
+    Return the Fisher information (k, k) on the coefficients of equidistant regressors (n, k).
 
-    Parameters
-    ----------
-    regressors : ndarray, shape (n, k)
-        Regressors, equally spaced in time.
-    noise : ndarray, shape (m,)
-        Covariance of the noise of two samples by their distance; zero beyond.
-    used : ndarray of bool, shape (n,)
-        Samples that are used.
-
-    Returns
-    -------
-    ndarray, shape (k, k)
-        Information. Its inverse is the Cramer-Rao bound for normal noise.
-
+    `noise` is the autocovariance of the noise by lag, (m,), zero beyond. The inverse is the
+    Cramer-Rao bound for normal noise.
     """
     at = np.flatnonzero(used)
     banded = np.zeros((len(noise), len(at)))
@@ -125,28 +88,11 @@ def friction_truth(
     settings: FrictionSettings,
 ) -> Truth:
     """
-    Return the true parameters of a recording of friction, and their Cramer-Rao bounds.
+    Return the true parameters of a friction recording, and their Cramer-Rao bounds.
 
-    The bound uses every reading while the needle moves, with the filtered noise of the sensor.
-    Only the coefficients of the terms are unknown: it does not include what an estimator loses
-    by starts, stops and an unknown lag.
-
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle.
-    sensor : ForceSensorParameters
-        Force sensor.
-    time, speed : ndarray, shape (n,)
-        Motion [s], [m/s].
-    settings : FrictionSettings
-        Terms of the friction force.
-
-    Returns
-    -------
-    Truth
-        By parameter.
-
+    The bound uses each reading while the needle moves, with the filtered noise of the sensor. Only
+    the coefficients of the terms are unknown: losses by starts, stops and an unknown lag are not
+    included.
     """
     coulomb, viscous = needle.coulomb_friction, needle.viscous_friction
     breakaway = needle.breakaway_friction if needle.friction_law == 'stribeck' else 1.0
@@ -172,7 +118,7 @@ def friction_truth(
         np.abs(speed) > settings.moving_speed,
     )
     bound = dict(zip(names, np.diag(np.linalg.inv(known)).tolist(), strict=True))
-    # A mass cannot be told from an unknown lag.
+    # A mass is not distinguishable from an unknown lag.
     bound.pop('moving_mass', None)
     return {name: (value, bound.get(name, np.nan)) for name, value in true.items()}
 
@@ -183,25 +129,8 @@ def stiffness_truth(
     """
     Return the true parameters of one force level, and their Cramer-Rao bounds.
 
-    The bound uses all readings of force and position of all holds, with their noise. The zeros
-    of both are known.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (2, 2)
-        Stiffness [N/m].
-    force : float
-        Force level [N].
-    sensor : ForceSensorParameters
-        Force sensor.
-    tissue : IndenterParameters
-        Noise of the position.
-
-    Returns
-    -------
-    Truth
-        By parameter.
-
+    The bound uses all readings of force and position of all holds, with their noise. The zeros of
+    both are known.
     """
     angles = 2.0 * pi / DIRECTIONS * np.arange(DIRECTIONS)
     forces = force * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -213,7 +142,7 @@ def stiffness_truth(
     noise = of_force * np.eye(2) + of_position * matrix @ matrix.T
     covariance = np.kron(noise, np.linalg.inv(displacement.T @ displacement))
     true = _parts(matrix)
-    # Differences along each entry give the gradients, exact to the step squared.
+    # Gradients by central differences, with an error of second order.
     step = 1e-3
     changes = []
     for entry in np.eye(4).reshape(4, 2, 2):

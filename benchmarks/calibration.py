@@ -2,10 +2,9 @@
 Coverage of the confidence intervals, and efficiency of the estimates.
 
 Many recordings are simulated without ROS: the plant or the indenter with its force sensor follows
-a protocol of `needle experiment`. Every recording has its own true parameters. All estimates are
-compared with these: the share of the 95 % intervals that hold the true value, and the mean
-squared error over the Cramer-Rao bound (`benchmarks.bounds`), which no unbiased estimator can
-beat.
+a protocol of `needle experiment`. Each recording has its own true parameters. The estimates are
+compared with these: the fraction of the 95 % intervals that contain the true value, and the mean
+squared error over the Cramer-Rao bound (`benchmarks.bounds`), the limit of any unbiased estimator.
 """
 
 from __future__ import annotations
@@ -60,13 +59,13 @@ import numpy as np
 COVERAGE: Final = (0.93, 0.97)
 EFFICIENCY: Final = 1.3
 
-#: Draws of one hypercube: what `needle experiment` draws by default.
+#: Samples of one Latin hypercube, the default of `needle experiment`.
 _DRAWN: Final = 20
 
-#: Longest step of the integrator [s]: a straight needle is exact at any.
+#: Longest step of the integrator [s]; a straight needle is exact for any step.
 _STEP: Final = 1e-3
 
-#: Cases beside the default ones are identified in every so many recordings.
+#: Additional cases are identified in every n-th recording.
 _SIDE: Final = 2
 
 _MOST_RECORDINGS: Final = 100_000
@@ -77,7 +76,7 @@ _Result = TypeVar('_Result')
 
 
 class Found(NamedTuple):
-    """One parameter from one recording beside the truth."""
+    """Estimate of one parameter from one recording, with the true value."""
 
     case: str
     name: str
@@ -102,13 +101,13 @@ class Row:
     name, unit : str
         Parameter.
     count, undetermined : int
-        Number of estimates, and how many of them are reported as undetermined.
+        Number of estimates, and number reported as undetermined.
     coverage : float
-        Share of the 95 % intervals that hold the true value.
+        Fraction of the 95 % intervals that contain the true value.
     deviation, error, bias : float
         Root mean square of the errors, root mean square of the standard errors, mean error.
     efficiency : float or None
-        Mean squared error over the Cramer-Rao bound; None where there is no bound.
+        Mean squared error over the Cramer-Rao bound; None without a bound.
 
     """
 
@@ -131,15 +130,6 @@ class Row:
         )
 
     def cells(self) -> tuple[str, ...]:
-        """
-        Return the cells of a table row.
-
-        Returns
-        -------
-        tuple of str
-            Cells.
-
-        """
         return (
             self.case,
             f'{self.name} [{self.unit}]',
@@ -160,7 +150,7 @@ class Row:
 
 
 class _Felt(ForceSensor):
-    """Keeps the true wrenches, so that several sensors can read them."""
+    """True wrenches of an insertion, to be read by several sensors."""
 
     def __init__(self) -> None:
         super().__init__(ForceSensorParameters(rate=RATE), RATE, 0)
@@ -171,23 +161,13 @@ class _Felt(ForceSensor):
         return wrench
 
     def read(self, parameters: ForceSensorParameters, seed: int) -> FloatArray:
-        """Return the insertion force that a sensor reads, shape (n,)."""
+        """Return the insertion force read by a sensor, shape (n,)."""
         sensor = ForceSensor(parameters, RATE, seed)
         return np.array([sensor.measure(wrench, **how)[1] for wrench, how in self.wrenches])
 
 
 class Motion(NamedTuple):
-    """
-    An insertion in robot mode.
-
-    Attributes
-    ----------
-    time, depth, speed : ndarray, shape (n,)
-        Time and measured motion [s], [m], [m/s].
-    felt : _Felt
-        True wrenches.
-
-    """
+    """Time [s], measured depth [m] and velocity [m/s], (n,), and true wrenches of an insertion."""
 
     time: FloatArray
     depth: FloatArray
@@ -196,20 +176,7 @@ class Motion(NamedTuple):
 
 
 def insertion(parameters: NeedleParameters) -> Motion:
-    """
-    Run the friction protocol on the plant in robot mode.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle.
-
-    Returns
-    -------
-    Motion
-        Recording without the readings of a force sensor.
-
-    """
+    """Run the friction protocol on a plant in robot mode."""
     protocol = PROTOCOLS['friction']
     base = BaseMotion(BaseParameters(), START_DEPTH, (parameters.minimum_depth, parameters.length))
     start = NeedleModel(parameters).state_at(START_DEPTH, 0.0)
@@ -242,7 +209,7 @@ def _command(machine: Plant | Indenter, protocol: Protocol) -> None:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionCase:
     """
-    A kind of recording, and how friction is identified from it.
+    A kind of friction recording, and the settings of its identification.
 
     Attributes
     ----------
@@ -255,9 +222,9 @@ class FrictionCase:
     speed : bool
         False if the recording has positions only.
     late : bool
-        Whether the force is late, or early, by an unknown part of a sample period.
+        Whether the force has an unknown delay (of either sign) of a fraction of a sample period.
     speed_noise : float
-        Standard deviation of white noise of the speed [m/s].
+        Standard deviation of white noise of the velocity [m/s].
 
     """
 
@@ -287,20 +254,7 @@ FRICTION_CASES: Final[Mapping[str, FrictionCase]] = {
 
 
 def friction(seed: int, number: int) -> list[Found]:
-    """
-    Identify one recording of friction, every so many in all cases.
-
-    Parameters
-    ----------
-    seed, number : int
-        Seed of the study and number of the recording; together they seed all that is random.
-
-    Returns
-    -------
-    list of Found
-        Every parameter of every case.
-
-    """
+    """Identify a friction recording, every n-th in all cases; seed and number define all noise."""
     drawn = draw_friction(_DRAWN, seed + number // _DRAWN)[number % _DRAWN]
     rng = np.random.default_rng([seed, number])
     cases = dict(list(FRICTION_CASES.items())[: None if number % _SIDE == 0 else 1])
@@ -317,7 +271,7 @@ def friction(seed: int, number: int) -> list[Found]:
     }
     motions['biased'] = motions['unfiltered'] = motions['plain']
     bias = float(rng.uniform(-0.5, 0.5))
-    # Stamps are trusted to one sample, no better, where a mass is asked for.
+    # With a mass term, stamps have an uncertainty of one sample.
     late = float(rng.uniform(-1.0, 1.0)) / RATE
     sensors = dict.fromkeys(motions, ForceSensorParameters())
     sensors['biased'] = ForceSensorParameters(force_bias=bias)
@@ -345,7 +299,7 @@ def friction(seed: int, number: int) -> list[Found]:
         estimate = identify_friction(recording, settings)
         truth = friction_truth(needle, sensor, motion.time, motion.speed, settings)
         if case.speed_noise:
-            # The bound takes the speed for known.
+            # The bound assumes a known velocity.
             truth = {parameter: (value, np.nan) for parameter, (value, _) in truth.items()}
         found += [
             _compared(name, parameter, truth)
@@ -362,20 +316,7 @@ def _compared(case: str, found: ParameterEstimate, truth: Truth) -> Found:
 
 
 def stiffness(seed: int, number: int) -> list[Found]:
-    """
-    Identify one recording of stiffness, every so many by all estimators.
-
-    Parameters
-    ----------
-    seed, number : int
-        Seed of the study and number of the recording; together they seed all that is random.
-
-    Returns
-    -------
-    list of Found
-        Every parameter of every level, by estimator.
-
-    """
+    """Identify a stiffness recording, every n-th by all estimators; see `friction`."""
     drawn = draw_stiffness(_DRAWN, seed + number // _DRAWN)[number % _DRAWN]
     entropy = int(np.random.default_rng([seed, number]).integers(2**32))
     protocol = PROTOCOLS['stiffness']
@@ -414,20 +355,7 @@ def stiffness(seed: int, number: int) -> list[Found]:
 
 
 def summarized(found: Iterable[Found]) -> list[Row]:
-    """
-    Put the estimates of each parameter in each case together.
-
-    Parameters
-    ----------
-    found : iterable of Found
-        Estimates, those of a parameter in a case in any order.
-
-    Returns
-    -------
-    list of Row
-        Case by case, in the order in which they first come.
-
-    """
+    """Combine the estimates of each parameter in each case, in order of first appearance."""
     groups: dict[tuple[str, str], list[Found]] = {}
     for one in found:
         groups.setdefault((one.case, one.name), []).append(one)
@@ -441,7 +369,7 @@ def _row(group: list[Found]) -> Row:
     known = np.isfinite(value)
     wrong = value - truth
     if first.unit == 'rad':
-        # Directions of a line: half a turn makes no difference.
+        # Directions of a line: modulo half a turn.
         turn = pi * np.round(wrong / pi)
         wrong, low, high = wrong - turn, low - turn, high - turn
     held = (low <= truth) & (truth <= high)
@@ -479,29 +407,12 @@ DEFAULT_CASES: Final = ('(15)', 'K, ordinary')
 def studied(
     study: Callable[[int, int], list[_Result]], recordings: int, seed: int, workers: int
 ) -> Iterator[list[_Result]]:
-    """
-    Identify many recordings on all cores.
-
-    Parameters
-    ----------
-    study : callable
-        Such as `friction` or `stiffness`.
-    recordings, seed : int
-        How many, and the seed of the study: the same seed gives the same recordings.
-    workers : int
-        Processes; 1 for none beside this one.
-
-    Yields
-    ------
-    list
-        What each recording gave, in order.
-
-    """
+    """Yield the results of a study (seed, number) for many recordings, computed in processes."""
     job = partial(study, seed)
     if workers == 1:
         yield from map(job, range(recordings))
         return
-    # Processes share the cores already.
+    # The processes use all cores.
     with (
         mock.patch.dict(os.environ, OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1'),
         processes(workers) as pool,
@@ -510,31 +421,7 @@ def studied(
 
 
 def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
-    """
-    Compare the estimates from many recordings with the true values.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    recordings : int
-        Number of recordings of each kind.
-    seed : int
-        Seed of the true values and the noise.
-
-    Returns
-    -------
-    sections : list of Section
-        One row for each parameter in each case.
-    bars : list of Bar
-        Coverage and efficiency of the parameters that have a bound, in the default cases.
-
-    Raises
-    ------
-    ParameterError
-        If a number is out of range.
-
-    """
+    """Compare the estimates from many recordings with the true values."""
     if not 2 <= recordings <= _MOST_RECORDINGS:
         raise ParameterError(f'--recordings must be in [2, {_MOST_RECORDINGS}], got {recordings}')
     if seed < 0:
@@ -549,7 +436,7 @@ def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
         rows += summarized(found)
     wrong = sum(not row.holds for row in rows)
     section = Section(
-        'Estimates beside the true values',
+        'Estimates and true values',
         (
             'case',
             'parameter',
@@ -562,7 +449,7 @@ def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
             'holds',
         ),
         [row.cells() for row in rows],
-        f'{recordings} recordings of each kind, one in {_SIDE} for cases beside the default ones, '
+        f'{recordings} recordings of each kind, one in {_SIDE} for additional cases, '
         f'seed {seed}. {len(rows) - wrong} of {len(rows)} rows hold: coverage of the 95 % '
         f'intervals from {COVERAGE[0]:.0%} to {COVERAGE[1]:.0%}, mean squared error at most '
         f'{EFFICIENCY:g} times the Cramer-Rao bound. The bars are on the rows of the default '

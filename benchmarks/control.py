@@ -26,12 +26,12 @@ from needle_controller import (
 from needle_dynamics import FloatArray, NeedleParameters
 import numpy as np
 
-#: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].
+#: Sample period [s], delay in periods, and the bar for a law with the observer [s].
 PERIOD: Final = 1e-3
 DELAY: Final = 1
 BUDGET: Final = 20e-6
 
-#: Calls in a job: one is too short for the clock.
+#: Calls per job: a single call is too short for the clock.
 _CALLS: Final = 100
 _ROUNDS: Final = 15
 
@@ -42,17 +42,9 @@ _LIMIT: Final = 15.0
 
 class NumpyInverseDynamics:
     """
-    Inverse dynamics as in the paper with a delay, written plainly with NumPy, for comparison.
+    Inverse dynamics of the paper with a delay, in plain NumPy, for comparison.
 
-    It does less than `InverseDynamics`: it has no feedback of deviations from the model.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle.
-    gains : InverseDynamicsGains
-        Gains.
-
+    In contrast to `InverseDynamics`, it has no feedback of deviations from the model.
     """
 
     def __init__(self, parameters: NeedleParameters, gains: InverseDynamicsGains) -> None:
@@ -60,22 +52,7 @@ class NumpyInverseDynamics:
         self.last = 0.0
 
     def command(self, position: float, speed: float, target: FloatArray) -> float:
-        """
-        Return the force for a measurement of a needle that moves inward.
-
-        Parameters
-        ----------
-        position, speed : float
-            Measured insertion depth [m] and speed [m/s].
-        target : ndarray, shape (3,)
-            Target depth, speed and acceleration.
-
-        Returns
-        -------
-        float
-            Force [N].
-
-        """
+        """Return the force [N] for measured depth and velocity and a target of shape (3,)."""
         p, g, h = self.p, self.gains, PERIOD
         rate = p.viscous_friction / p.moving_mass
         fall = exp(-rate * h)
@@ -94,15 +71,7 @@ class NumpyInverseDynamics:
 
 
 def jobs() -> dict[str, Callable[[], object]]:
-    """
-    Return the control steps that are measured, on a needle that moves.
-
-    Returns
-    -------
-    dict[str, callable]
-        One control step each, by name.
-
-    """
+    """Return the measured control steps by name, for a moving needle."""
     parameters = NeedleParameters.preset('phantom')
     goal, still = Setpoint(_DEPTH + _SPEED * PERIOD, _SPEED), Setpoint(0.0)
     observer = Observer(parameters, ObserverSettings(), PERIOD)
@@ -111,7 +80,7 @@ def jobs() -> dict[str, Callable[[], object]]:
 
     def observe() -> float:
         clock[0] += PERIOD
-        # Back and forth within the tissue, so that it never runs out of needle.
+        # Oscillation within the tissue, with an unlimited duration.
         phase = clock[0] % 10.0
         depth = _DEPTH + _SPEED * min(phase, 10.0 - phase)
         observer.update(clock[0], depth, _SPEED if phase < 5.0 else -_SPEED, next(samples))
@@ -140,7 +109,7 @@ def jobs() -> dict[str, Callable[[], object]]:
 
 
 def _observed(physical: Callable[..., float], observe: Callable[[], float]) -> Callable[[], float]:
-    """Return the step of a law with the load from the observer."""
+    """Return the control step of a law with the load from the observer."""
     return lambda: physical(load=observe())
 
 
@@ -156,22 +125,7 @@ def _laws(axis: Axis, pid: PidGains) -> dict[str, Law]:
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Measure the control step.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections : list of Section
-        Costs, shares of the period, and what NumPy takes.
-    bars : list of Bar
-        Whole laws with the observer.
-
-    """
+    """Measure the cost of a control step."""
 
     def several(job: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:

@@ -1,8 +1,8 @@
 """
-Damaged recordings: what identification makes of them.
+Identification from damaged recordings.
 
-Small recordings in every form that is read are damaged in many ways. Each must end in an error of
-one line, in the result of the undamaged recording, or in another one with a warning.
+Small recordings in all supported formats are damaged in many ways. Each must result in a one-line
+error, in the result of the undamaged recording, or in a different result with a warning.
 """
 
 from __future__ import annotations
@@ -44,20 +44,7 @@ MEMORY, PATIENCE = 1000.0, 20.0
 
 
 def forms(folder: Path) -> dict[str, Path]:
-    """
-    Write one recording in every form.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write.
-
-    Returns
-    -------
-    dict
-        Files by form.
-
-    """
+    """Write a recording to a folder in all formats; return the files by format."""
     time_, depth, speed, force = _strokes()
     rows = list(zip(time_, depth, speed, force, strict=True))
     messages = [_messages(_START + round(1e9 * t), s, v, f) for t, s, v, f in rows]
@@ -158,7 +145,7 @@ def _cut(data: bytearray, rng: np.random.Generator) -> None:
 
 
 def _lengths(data: bytearray, rng: np.random.Generator) -> None:
-    """Overwrite what may be the length of something."""
+    """Overwrite a possible length field."""
     size = int(rng.choice([4, 8]))
     at = int(rng.integers(max(1, len(data) - size)))
     number = int(rng.choice([0, 1, 2**31 - 1, 2**32 - 1, int(rng.integers(2**31))]))
@@ -181,7 +168,7 @@ def _remove(data: bytearray, rng: np.random.Generator) -> None:
     del data[at : at + size]
 
 
-#: Ways to damage a file, by name.
+#: Kinds of damage by name.
 DAMAGES: Final[Mapping[str, Callable[[bytearray, np.random.Generator], None]]] = {
     'flipped bits': _flip,
     'cut': _cut,
@@ -192,22 +179,7 @@ DAMAGES: Final[Mapping[str, Callable[[bytearray, np.random.Generator], None]]] =
 
 
 def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
-    """
-    Identify damaged recordings, all in this process.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    files, seed : int
-        How many, and the seed of the damage.
-
-    Returns
-    -------
-    sections, bars
-        A table of what became of them, and bars.
-
-    """
+    """Identify damaged recordings in this process, and count the outcomes."""
     with TemporaryDirectory() as place:
         whole = forms(Path(place))
         cases = [(form, damage) for form in whole for damage in DAMAGES]
@@ -247,7 +219,7 @@ def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
         rows,
         f'{files} files, seed {seed}, in one process. Refused: an error of one line. The same: '
         'mu_s and mu_v within the interval of the undamaged recording. Shorter: of its beginning, '
-        'as if it had been ended then: a table that is cut between two lines tells nothing else. '
+        'as for an earlier end: a table cut between two lines is not detectable. '
         f'Warned: another value, with a warning. The slowest took {longest:.2g} s ({worst}). '
         + (f'To mend: {"; ".join(silent[:20])}' if silent else ''),
     )
@@ -274,7 +246,7 @@ def _is_beginning(part: Recording, whole: Recording) -> bool:
 
 
 def _fate(file: Path, whole: tuple[Recording, FrictionEstimate]) -> str:
-    """Tell what became of a damaged file."""
+    """Return the outcome of a damaged file."""
     try:
         recording, found = _identified(file)
     except (NeedleError, OSError) as error:

@@ -1,4 +1,4 @@
-"""What the recorder loses at a high rate, and how the memory of the nodes grows."""
+"""Message losses of the recorder at a high rate, and memory growth of the nodes."""
 
 from __future__ import annotations
 
@@ -21,38 +21,21 @@ import numpy as np
 #: Bar on the growth of the memory of a node [MB].
 GROWTH: Final = 2.0
 
-#: Time at the start of a recording, and of the watch of the memory, that does not count [s].
+#: Warm-up time of a recording, and of the memory measurement [s].
 _FIRST: Final = 1.0
 _WARM_UP: Final = 60.0
 
 #: Time between changes of the target [s].
 _TARGET_PERIOD: Final = 2.0
 
-#: Times at which the memory is shown, as shares of the watch.
+#: Times at which the memory is reported, as fractions of the measurement.
 _SHOWN: Final = (0.1, 0.25, 0.5, 0.75, 1.0)
 
 _TOPICS: Final = (*STREAMS, 'wrench_command')
 
 
 def record(folder: Path, duration: float) -> Answer:
-    """
-    Record numbered messages, and count those that are missing in the bag.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder for the bag.
-    duration : float
-        Time [s]; the first second does not count.
-
-    Returns
-    -------
-    sections : list of Section
-        Messages sent and lost.
-    bars : list of Bar
-        Number of lost messages.
-
-    """
+    """Record numbered messages for a duration [s], and count the messages missing in the bag."""
     with Graph(folder / 'logs') as graph, ExitStack() as stack:
         watch = Pair(PAIRS[1], graph)
         stack.callback(watch.end)
@@ -92,22 +75,7 @@ def record(folder: Path, duration: float) -> Answer:
 
 
 def losses(numbers: Mapping[str, Any], sent: int) -> dict[str, int]:
-    """
-    Count the samples that are missing after the first second.
-
-    Parameters
-    ----------
-    numbers : Mapping[str, ndarray]
-        Numbers of the samples in the bag, by topic; the first sample has the number 1.
-    sent : int
-        Number of the last sample.
-
-    Returns
-    -------
-    dict[str, int]
-        Missing samples by topic.
-
-    """
+    """Count the missing samples after the first second, by topic; numbers start at 1."""
     first = round(_FIRST * RATE)
     return {
         topic: sent - first - len(np.unique(found[(found > first) & (found <= sent)]))
@@ -116,29 +84,11 @@ def losses(numbers: Mapping[str, Any], sent: int) -> dict[str, int]:
 
 
 def sample_numbers(path: Path) -> dict[str, Any]:
-    """
-    Read the sample numbers from the time stamps in a bag.
-
-    Parameters
-    ----------
-    path : Path
-        Bag.
-
-    Returns
-    -------
-    dict[str, ndarray]
-        Numbers by topic.
-
-    Raises
-    ------
-    GraphError
-        If the bag is damaged.
-
-    """
+    """Read the sample numbers from the time stamps in a bag, by topic."""
     numbers: dict[str, list[Any]] = {topic: [] for topic in _TOPICS}
     bag = Bag(path)
     for batch in bag.batches(lambda topic: topic.name.lstrip('/') in numbers):
-        # The time stamp follows the four bytes that tell the encoding.
+        # The time stamp follows the four bytes of the encoding.
         stamps = batch.data[batch.begin[:, np.newaxis] + np.arange(4, 12)].view('<i4')
         found = (stamps[:, 0].astype(np.int64) * 1_000_000_000 + stamps[:, 1]) // PERIOD
         numbers[batch.topic.name.lstrip('/')].append(found)
@@ -148,44 +98,16 @@ def sample_numbers(path: Path) -> dict[str, Any]:
 
 
 def resident_memory(process: int) -> int:
-    """
-    Return the memory of a process that is in RAM.
-
-    Parameters
-    ----------
-    process : int
-        Process id.
-
-    Returns
-    -------
-    int
-        Memory [bytes].
-
-    """
+    """Return the resident memory of a process [bytes]."""
     pages = int(Path(f'/proc/{process}/statm').read_text('ascii').split()[1])
     return pages * os.sysconf('SC_PAGE_SIZE')
 
 
 def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     """
-    Run plant, controller and recorder, and watch their memory.
+    Run plant, controller and recorder for a duration [s], and measure their memory.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder for the bag.
-    duration : float
-        Time [s]; the first tenth of it, at most a minute, is warm-up.
-    tick : callable
-        Called with the progress.
-
-    Returns
-    -------
-    sections : list of Section
-        Memory of each node over time.
-    bars : list of Bar
-        Largest growth after the warm-up.
-
+    The first tenth, at most a minute, is warm-up.
     """
     names = ('plant', 'controller', 'recorder')
     rows: list[tuple[float, list[int]]] = []
@@ -211,7 +133,7 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     tenth = max(1, len(memory) // 10)
 
     def around(share: float) -> Any:
-        """Return the median over a tenth that ends at a share of the time after the warm-up."""
+        """Return the median over a tenth that ends at a fraction of the time after the warm-up."""
         end = tenth + round(share * (len(memory) - tenth))
         return np.median(memory[end - tenth : end], axis=0)
 

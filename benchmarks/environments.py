@@ -1,4 +1,4 @@
-"""Environments of Gymnasium: steps per second, beside two that come with it."""
+"""Steps per second of the Gymnasium environments, compared with two built-in environments."""
 
 from __future__ import annotations
 
@@ -10,33 +10,23 @@ from benchmarks.measure import least_times, number
 from benchmarks.page import Answer, Section, Tick
 import gymnasium
 
-#: Ours, and two of classic control.
+#: Environments of the suite, and two of classic control.
 NAMES: Final = (
     'needle_insertion.gym:NeedleInsertion-v0', 'needle_insertion.gym:NeedleSteering-v0',
     'CartPole-v1', 'Pendulum-v1',
 )  # fmt: skip
 
-#: How many at once.
+#: Size of a vector environment.
 MANY: Final = 64
 
-#: Steps of a turn, of one environment and of all at once: some episodes.
+#: Steps per turn, of a single and of a vector environment: several episodes.
 STEPS: Final = {'single': 1000, 'vector': 100}
 
 _REPEATS: Final = {'default': 10, 'full': 10, 'quick': 1}
 
 
 def steps(environment: Any, actions: list[Any]) -> None:
-    """
-    Take steps; where an episode is over, the next one begins.
-
-    Parameters
-    ----------
-    environment : gymnasium.Env
-        Environment.
-    actions : list
-        Action of each step.
-
-    """
+    """Take steps in an environment, with a reset after each episode."""
     environment.reset()
     for action in actions:
         _, _, over, late, _ = environment.step(action)
@@ -45,39 +35,14 @@ def steps(environment: Any, actions: list[Any]) -> None:
 
 
 def vector_steps(environments: Any, actions: list[Any]) -> None:
-    """
-    Take steps of many environments at once; the next episodes begin by themselves.
-
-    Parameters
-    ----------
-    environments : gymnasium.vector.VectorEnv
-        Environments.
-    actions : list
-        Actions of each step.
-
-    """
+    """Take steps in a vector environment, which resets automatically."""
     environments.reset()
     for action in actions:
         environments.step(action)
 
 
 def compare(tick: Tick, plan: str = 'default') -> Answer:
-    """
-    Take random actions in each environment, alone and many at once.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    plan : str
-        How long: a key of the plans of `benchmarks.study`.
-
-    Returns
-    -------
-    sections, bars
-        A page; no bar.
-
-    """
+    """Take random actions in single and vector environments."""
     tick('environments')
     jobs: dict[str, Callable[[], object]] = {}
     for name in NAMES:

@@ -1,14 +1,14 @@
 """
-What the nodes cost beside bare rclpy nodes that send the same messages at the same rate.
+Cost of the nodes compared with bare rclpy nodes with the same messages and rates.
 
-Four pairs of a plant and a controller take turns, each on a domain of its own: the nodes of this
-package; bare nodes on the events executor, which this package uses too; bare nodes on the default
-executor of rclpy; and ours with a needle that bends. First the plants publish without commands,
-then the loops are closed, then the controllers answer a probe in this process that takes the place
-of the plant. A ratio is the median over the rounds of the ratios within a round, so that other
-work on the machine affects all alike.
+Four pairs of a plant and a controller take turns, each on its own domain: the nodes of this
+package; bare nodes on the events executor, as used by this package; bare nodes on the default
+executor of rclpy; and the nodes of this package with a flexible needle. First the plants publish
+without commands, then the loops are closed, then the controllers respond to a probe in this
+process instead of the plant. A ratio is the median over the rounds of the ratios within a round,
+so that other load of the machine affects all alike.
 
-After that the recorder takes numbered messages, and the memory of the nodes is watched.
+Then the recorder records numbered messages, and the memory of the nodes is measured.
 """
 
 from __future__ import annotations
@@ -35,24 +35,14 @@ from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 from sensor_msgs.msg import JointState
 
-#: Bars: p50 and p99 of the times, and CPU of the plant, over those of bare nodes.
+#: Bars: p50 and p99 of the times, and CPU of the plant, relative to bare nodes.
 TIMES: Final = {'p50': 1.3, 'p99': 1.5}
 PLANT_CPU: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """
-    Duration of the measurements.
-
-    Attributes
-    ----------
-    rounds : int
-        Turns of each pair in each of the three comparisons.
-    turn, recording, memory : float
-        Time of a turn, of the recording and of the watch of the memory [s].
-
-    """
+    """Rounds, and duration of a turn, of the recording and of the memory measurement [s]."""
 
     rounds: int = 8
     turn: float = 2.0
@@ -68,26 +58,9 @@ PLANS: Final = {
 
 
 def compare(tick: Tick, plan: str = 'default') -> Answer:
-    """
-    Measure the nodes of this package beside bare ones.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    plan : str
-        Duration of the measurements: a key of `PLANS`.
-
-    Returns
-    -------
-    sections : list of Section
-        Times and CPU of the nodes, messages in the bag, memory.
-    bars : list of Bar
-        Round trip, CPU of the plant, losses of the recorder, growth of memory.
-
-    """
+    """Measure the nodes of this package and bare nodes; `plan` is a key of `PLANS`."""
     durations = PLANS[plan]
-    # Keep what is loaded out of the garbage collections while messages are timed.
+    # Exclude loaded objects from garbage collection during the timing.
     gc.collect()
     gc.freeze()
     try:
@@ -104,24 +77,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
 
 
 def compare_pairs(folder: Path, plan: Plan, tick: Tick) -> dict[str, list[Figures]]:
-    """
-    Start the pairs and let them take turns.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder for what the nodes print.
-    plan : Plan
-        Duration of the measurements.
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    dict[str, list of Figures]
-        Figures of each round, by pair.
-
-    """
+    """Start the pairs, let them take turns, and return the metrics of each round by pair."""
     with ExitStack() as stack:
         pairs = {}
         for name in PAIRS:
@@ -139,7 +95,7 @@ def compare_pairs(folder: Path, plan: Plan, tick: Tick) -> dict[str, list[Figure
             pair.ready('controller')
         rounds.append(_take_turns('loop', pairs, _close_loop, plan, tick))
         for pair in pairs.values():
-            # Two sources of measurements are none.
+            # Two publishers of measurements are rejected.
             pair.kill('plant')
         rounds.append(_take_turns('round trip', pairs, _answer_probe, plan, tick))
     return {
@@ -158,7 +114,7 @@ def _take_turns(
     plan: Plan,
     tick: Tick,
 ) -> dict[str, list[Figures]]:
-    """Return the figures of the rounds by pair; another pair begins each round."""
+    """Return the metrics of the rounds by pair; the first pair rotates between rounds."""
     found: dict[str, list[Figures]] = {name: [] for name in pairs}
     for k in range(plan.rounds):
         tick(f'{stage}, round {k + 1} of {plan.rounds}')
@@ -168,7 +124,7 @@ def _take_turns(
 
 
 def _publish(pair: Pair, turn: float) -> Figures:
-    """Let the plant publish without commands; this process reads all its topics."""
+    """Run the plant without commands; this process subscribes to all its topics."""
     topics = {topic: (kind, SENSOR) for topic, kind in STREAMS.items()}
     with pair.watching(topics) as seen, pair.running():
         found = pair.measure(turn, seen)
@@ -176,7 +132,7 @@ def _publish(pair: Pair, turn: float) -> Figures:
 
 
 def _close_loop(pair: Pair, turn: float) -> Figures:
-    """Let plant and controller close the loop."""
+    """Run plant and controller in closed loop."""
     topics = {
         'joint_states': (JointState, SENSOR),
         'wrench_command': (WrenchStamped, COMMAND),
@@ -198,13 +154,13 @@ def _close_loop(pair: Pair, turn: float) -> Figures:
 
 
 def _answer_probe(pair: Pair, turn: float) -> Figures:
-    """Send what a plant sends, and time the commands that answer."""
+    """Publish the messages of a plant, and time the commands in response."""
     left: dict[int, int] = {}
     sender, start, sent, over = Sender(pair.node), time.time_ns(), 0, False
 
     def tick() -> None:
         nonlocal sent
-        # One sample at a time: what is late is left out. A tick may be under way at the end.
+        # One sample at a time; late samples are discarded. A tick may be in progress at the end.
         if not over and (due := (time.time_ns() - start) // PERIOD) > sent:
             sent = due
             left[start + sent * PERIOD] = sender.send(start + sent * PERIOD, TARGETS[0])
@@ -222,7 +178,7 @@ def _answer_probe(pair: Pair, turn: float) -> Figures:
 
 
 def _quantiles(what: str, times: Sequence[float], worst: bool = False) -> Figures:
-    """Return the median, the 99 % quantile and, if asked for, the maximum of times [ns] in us."""
+    """Return the median, the 99 % quantile and optionally the maximum of times [ns], in us."""
     if not times:
         raise GraphError(f'no messages to measure the {what}')
     p50, p99, maximum = np.quantile(times, [0.5, 0.99, 1.0]) * 1e-3
@@ -232,20 +188,9 @@ def _quantiles(what: str, times: Sequence[float], worst: bool = False) -> Figure
 
 def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> float:
     """
-    Return the median of the ratios within the rounds.
+    Return the median of the ratios of a metric within the rounds.
 
-    Parameters
-    ----------
-    ours, theirs : sequence of Figures
-        Figures of two pairs, round by round.
-    what : str
-        Name of the figure.
-
-    Returns
-    -------
-    float
-        Ratio; NaN for a worst value, and where every figure of the other pair is zero.
-
+    NaN for a maximum, and if all values of the other pair are zero.
     """
     if 'worst' in what:
         return float('nan')
@@ -255,24 +200,7 @@ def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> floa
 
 
 def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Section, list[Bar]]:
-    """
-    Put the figures of the pairs side by side.
-
-    Parameters
-    ----------
-    found : Mapping[str, list of Figures]
-        From `compare_pairs`.
-    plan : Plan
-        Duration of the measurements.
-
-    Returns
-    -------
-    section : Section
-        Medians, and ratios of ours to the others.
-    bars : list of Bar
-        Round trip, sample to command, and CPU of the plants.
-
-    """
+    """Return a table of the metrics of the pairs with ratios, and the bars."""
     ours, bare, usual, steered = (found[name] for name in PAIRS)
 
     def median(figures: Sequence[Figures], what: str) -> str:
@@ -316,7 +244,7 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
         )
     )
     section = Section(
-        'Nodes beside bare nodes',
+        'Nodes and bare nodes',
         (f'{RATE} Hz', PAIRS[0], PAIRS[1], 'ratio', PAIRS[2], 'ratio', PAIRS[3], 'over bare'),
         rows,
         f'{plan.rounds} rounds of {plan.turn:g} s. Each figure is the median over the rounds, '

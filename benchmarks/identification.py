@@ -1,9 +1,9 @@
 """
-Time and memory from a bag to a result, beside other readers of bags.
+Time and memory from a bag to a result, compared with other bag readers.
 
 Friction is identified from a bag. Other Python libraries read the same bag into message objects
-and take the same numbers from these. Bags of ten and thirty times the length show how the memory
-grows. Every measurement has its own process, and so its own peak memory.
+and extract the same numbers. Bags of ten and thirty times the length show the growth of memory.
+Each measurement has its own process, and therefore its own peak memory.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
 
-#: Messages of each of the two topics in the shortest bag, and how much longer the others are.
+#: Messages per topic in the shortest bag, and relative lengths of the other bags.
 MESSAGES: Final = 2**17
 LONGER: Final = (1, 10, 30)
 
@@ -42,34 +42,24 @@ LONGER: Final = (1, 10, 30)
 _RATE: Final = 250.0
 _STROKE: Final = 4.0
 
-#: Repeats with the shortest bag, of which the least time counts.
+#: Repeats with the shortest bag; the least time is used.
 _REPEATS: Final = 3
 
-#: Time one reading may take [s].
+#: Timeout of one reading [s].
 _PATIENCE: Final = 600.0
 
 _WRENCH: Final = 'geometry_msgs/msg/WrenchStamped'
 _MOTION: Final = 'sensor_msgs/msg/JointState'
 _TOPICS: Final = {'/base_wrench': _WRENCH, '/joint_states': _MOTION}
 
-#: Number in a message that is replaced later.
+#: Placeholder number in a message.
 _MARK: Final = struct.unpack('<d', b'needle!!')[0]
 
 _START: Final = 1_700_000_000
 
 
 def write_bag(path: Path, messages: int) -> None:
-    """
-    Write a bag with force and motion of strokes in and out at five speeds.
-
-    Parameters
-    ----------
-    path : Path
-        Folder to make.
-    messages : int
-        Messages of each topic.
-
-    """
+    """Write a bag with force and motion of strokes in both directions at five speeds."""
     header = message_type('std_msgs/msg/Header')(
         message_type('builtin_interfaces/msg/Time')(_START, 0), 'needle_base'
     )
@@ -111,10 +101,10 @@ def _strokes(time: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
 def _patched(
     message: bytes, stamps: np.ndarray[Any, Any], values: list[np.ndarray[Any, Any]]
 ) -> Iterator[bytes]:
-    """Yield copies of a message with other stamps, and with values in place of the mark."""
+    """Yield copies of a message with new stamps, and with values in place of the mark."""
     size = len(message)
     copies = np.tile(np.frombuffer(message, dtype=np.uint8), (len(stamps), 1))
-    # The time stamp follows the four bytes that tell the encoding.
+    # The time stamp follows the four bytes of the encoding.
     time = np.column_stack([_START + stamps // 10**9, stamps % 10**9]).astype('<i4')
     copies[:, 4:12] = time.view(np.uint8)
     at = -1
@@ -126,33 +116,12 @@ def _patched(
 
 
 def ours(path: Path) -> FrictionEstimate:
-    """
-    Read a bag and identify friction from it.
-
-    Parameters
-    ----------
-    path : Path
-        Bag.
-
-    Returns
-    -------
-    FrictionEstimate
-        Result.
-
-    """
+    """Read a bag and identify friction."""
     return identify_friction(read_friction_recording(path))
 
 
 def any_reader(path: Path) -> None:
-    """
-    Read the same numbers with rosbags.
-
-    Parameters
-    ----------
-    path : Path
-        Bag.
-
-    """
+    """Read the same numbers with rosbags."""
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         wanted = [connection for connection in reader.connections if connection.topic in rows]
@@ -163,15 +132,7 @@ def any_reader(path: Path) -> None:
 
 
 def mcap_ros2(path: Path) -> None:
-    """
-    Read the same numbers with mcap-ros2-support.
-
-    Parameters
-    ----------
-    path : Path
-        Bag.
-
-    """
+    """Read the same numbers with mcap-ros2-support."""
     reader = optional('mcap_ros2.reader')
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
     [file] = path.glob('*.mcap')
@@ -192,7 +153,7 @@ def _arrays(rows: Mapping[str, list[tuple[float, ...]]]) -> list[np.ndarray[Any,
     return [np.array(values) for values in rows.values()]
 
 
-#: Names of our whole task, and of its first part.
+#: Names of the complete task, and of its first part.
 OURS: Final = 'needle_identification'
 OUR_READING: Final = 'needle_identification, reading'
 
@@ -207,24 +168,10 @@ READERS: Final[Mapping[str, Callable[[Path], object]]] = {
 
 def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
     """
-    Read a bag in this process.
+    Read a bag repeatedly in this process, after a short bag for warm-up.
 
-    Parameters
-    ----------
-    reader : str
-        One of `READERS`.
-    warm : Path
-        A short bag to read beforehand, so that everything is compiled.
-    path : Path
-        Bag.
-    repeats : int
-        How often the bag is read.
-
-    Returns
-    -------
-    dict
-        Least time ``seconds`` [s], peak ``memory`` [bytes], and that ``before`` reading [bytes].
-
+    Returns the least time ``seconds`` [s], the peak ``memory`` [bytes], and the memory ``before``
+    reading [bytes].
     """
     read = READERS[reader]
     read(warm)
@@ -238,20 +185,7 @@ def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, floa
 
 
 def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
-    """
-    Call `measure` in another process.
-
-    Parameters
-    ----------
-    reader, warm, path, repeats
-        As for `measure`.
-
-    Returns
-    -------
-    dict
-        As from `measure`.
-
-    """
+    """Call `measure` in another process."""
     done = subprocess.run(
         [sys.executable, '-m', __name__, reader, str(warm), str(path), str(repeats)],
         capture_output=True,
@@ -263,24 +197,7 @@ def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, flo
 
 
 def compare(tick: Tick, messages: int = MESSAGES) -> Answer:
-    """
-    Measure reading and identifying beside reading alone.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    messages : int
-        Messages of each topic in the shortest bag.
-
-    Returns
-    -------
-    sections : list of Section
-        Time and memory of each reader, and of ours over the length of the bag.
-    bars : list of Bar
-        Speed beside that of the faster of the others, and growth of memory.
-
-    """
+    """Measure reading and identification, compared with reading only."""
     with TemporaryDirectory() as folder:
         warm = Path(folder) / 'warm'
         write_bag(warm, min(messages, 5000))
@@ -362,7 +279,9 @@ def _told(
     longer, longest = LONGER[-2:]
     growth = lengths[longest]['memory'] / lengths[longer]['memory']
     bars = [
-        Bar('bag to result beside the faster reader', min(others) / best, 1.0, 'x', at_least=True),
+        Bar(
+            'bag to result against the faster reader', min(others) / best, 1.0, 'x', at_least=True
+        ),
         Bar(f'peak memory, {longest} times the length over {longer} times', growth, 1.2, 'x'),
     ]
     return sections, bars

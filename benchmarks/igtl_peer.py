@@ -1,4 +1,4 @@
-"""A peer as 3D Slicer is one, by pyigtl and in a process of its own: it can be killed."""
+"""OpenIGTLink peer in place of 3D Slicer, by pyigtl in a separate process that can be killed."""
 
 from __future__ import annotations
 
@@ -19,20 +19,12 @@ import pyigtl
 #: Time between two targets of a peer [s].
 PERIOD: Final = 0.1
 
-#: Stands for the device in what a peer tells of the targets that it has sent.
+#: Device name of sent targets in the log.
 SENT: Final = 'sent'
 
 
 def free_port() -> int:
-    """
-    Find a port of this machine that nobody uses.
-
-    Returns
-    -------
-    int
-        The port.
-
-    """
+    """Return a free port of this machine."""
     with closing(socket.socket()) as one:
         one.bind(('127.0.0.1', 0))
         return int(one.getsockname()[1])
@@ -40,16 +32,16 @@ def free_port() -> int:
 
 class Told(NamedTuple):
     """
-    A message that has come to a peer, or that it has sent.
+    A message received or sent by a peer.
 
     Attributes
     ----------
     device : str
-        Name of its device, or `SENT`.
+        Name of the device, or `SENT`.
     time : float
-        Time of its header [s].
+        Time of the header [s].
     arrived : float
-        When it came, by the clock that never jumps [s].
+        Time of reception by the monotonic clock [s].
     content : Any
         Points [mm], matrix or text.
 
@@ -63,18 +55,18 @@ class Told(NamedTuple):
 
 class Peer:
     """
-    A process that connects to a port, tells what comes, and repeats a target.
+    Process that connects to a port, logs received messages, and sends a target periodically.
 
     Parameters
     ----------
     folder : Path
-        Folder for what it tells.
+        Folder of the log.
     port : int
         Port of this machine.
     target : sequence of float
-        The target [mm]; nothing is sent if it is empty.
+        Target [mm]; empty: nothing is sent.
     step : float
-        How much its x grows from one to the next [mm].
+        Increment of x from one target to the next [mm].
 
     """
 
@@ -82,7 +74,7 @@ class Peer:
         self, folder: Path, port: int, target: Sequence[float] = (), step: float = 0.0
     ) -> None:
         self._path = folder / f'peer{len(list(folder.glob("peer*")))}.jsonl'
-        #: What it has told so far, and where this ends in its file.
+        #: Messages read from the log, and the position in its file.
         self._told: list[Told] = []
         self._end = 0
         with self._path.open('wb') as output:
@@ -90,48 +82,35 @@ class Peer:
                 [sys.executable, __file__, *map(str, (port, step, *target))],
                 stdin=subprocess.PIPE,
                 stdout=output,
-                # pyigtl prints a traceback for each connection that is lost.
+                # pyigtl prints a traceback for each lost connection.
                 stderr=subprocess.DEVNULL,
             )
 
     def told(self, device: str) -> list[Told]:
-        """
-        Return what has come.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device, or `SENT`.
-
-        Returns
-        -------
-        list of Told
-            All messages of the device.
-
-        """
+        """Return all logged messages of a device, or of `SENT`."""
         with self._path.open('rb') as file:
             file.seek(self._end)
             data = file.read()
-        # The last line may not be whole.
+        # The last line may be incomplete.
         end = data.rfind(b'\n') + 1
         self._end += end
         self._told += [Told(*json.loads(line)) for line in data[:end].splitlines()]
         return [one for one in self._told if one.device == device]
 
     def kill(self) -> None:
-        """End it at once, as a crash does."""
+        """Kill the process, as in a crash."""
         self.process.kill()
         self.process.communicate()
 
 
 def _tell(told: Told) -> None:
-    # One call: two threads tell.
+    # A single call: two threads write.
     sys.stdout.write(f'{json.dumps(told)}\n')
     sys.stdout.flush()
 
 
 class _Devices(dict[str, Any]):
-    """Where pyigtl puts the newest message of each device: tells all of them."""
+    """Device table of pyigtl that logs each new message."""
 
     def __setitem__(self, device: str, message: Any) -> None:
         content: Any = None
@@ -145,22 +124,14 @@ class _Devices(dict[str, Any]):
 
 
 def main(port: str, step: str, *target: str) -> None:
-    """
-    Connect until the one who has started this ends.
-
-    Parameters
-    ----------
-    port, step, *target : str
-        As for `Peer`.
-
-    """
+    """Connect until the parent process ends; arguments as for `Peer`."""
     client = pyigtl.OpenIGTLinkClient(port=int(port), start_now=False)
     client.incoming_messages = _Devices()
     client.start()
     at = [float(one) for one in target]
     while not select.select([sys.stdin], [], [], PERIOD)[0]:
         if at and client.is_connected():
-            # As SmartNeedle's module of 3D Slicer sends it.
+            # Format of the SmartNeedle module of 3D Slicer.
             message = pyigtl.PointMessage(
                 np.array([at, [0.0, 0.0, 0.0]]), names=['TARGET', 'ENTRY'], device_name='PlanningZ'
             )

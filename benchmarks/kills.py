@@ -1,7 +1,7 @@
 """
-A study that is killed again and again: what was lost, computed twice, or left behind.
+Studies that are killed repeatedly: lost samples, repeated samples and remaining processes.
 
-The command is killed, or its workers are.
+Either the command or its workers are killed.
 """
 
 from __future__ import annotations
@@ -17,41 +17,41 @@ from needle_insertion.study.engine import TABLE
 import numpy as np
 import psutil
 
-#: Longest time until a study writes something [s], after which it is killed anyway.
+#: Timeout of a result [s], after which a study is killed.
 _PATIENCE: Final = 120.0
 
-#: A study is killed up to this time after it has written something [s].
+#: Longest delay of a kill after a result [s].
 _LATEST: Final = 0.3
 
-#: Time in which the processes of a study that was killed must end [s].
+#: Timeout of the processes of a killed study [s].
 _ORPHANED: Final = 5.0
 
 
-#: Age up to which a worker that replaces a killed one is killed [s]: Python starts in that time.
+#: Largest age of a replacement worker when it is killed [s], during the start of Python.
 _SPAWNED: Final = 0.2
 
-#: Kills without a result in between: one more would end the study (`needle_ros.process_pool`).
+#: Kills without a result in between: one more ends the study (`needle_ros.process_pool`).
 _MOST: Final = 9
 
-#: Probability that the worker that replaces a killed one is killed so, and how many in a row.
+#: Probability that a replacement worker is killed, and the largest number in sequence.
 _YOUNG, _ROW = 0.6, 3
 
 
 class Losses(NamedTuple):
     """
-    What became of a study whose workers were killed.
+    Outcome of a study whose workers were killed.
 
     Attributes
     ----------
     killed : int
-        Workers that were killed.
+        Number of killed workers.
     young : int
-        Those of them that had been started less than 0.2 s before.
+        Number of killed workers younger than 0.2 s.
     errors : int
-        How often the command ended with an error, and was started again.
+        Number of restarts after an error of the command.
     hangs : int
-        How often it wrote nothing for 120 s and ten times the longest time between kills, and was
-        ended.
+        Number of runs ended because nothing was written for 120 s and ten times the longest time
+        between kills.
 
     """
 
@@ -65,29 +65,10 @@ def kill_workers(
     words: Sequence[str], folder: Path, times: int, between: float, rng: np.random.Generator
 ) -> Losses:
     """
-    Compute a study, and kill its workers at random times.
+    Compute a study, and kill its workers at random times, at most `between` seconds apart.
 
-    Most workers that replace killed ones are killed while they are spawned. After nine kills the
-    next result is awaited.
-
-    Parameters
-    ----------
-    words : sequence of str
-        Command that begins the study, or continues it.
-    folder : Path
-        Folder of its results.
-    times : int
-        Largest number of kills.
-    between : float
-        Longest time between kills [s], except those of workers that are spawned.
-    rng : Generator
-        Random numbers.
-
-    Returns
-    -------
-    Losses
-        What became of it.
-
+    Most workers that replace killed workers are killed while they are spawned. After nine kills
+    the next result is awaited.
     """
     killed = young = errors = hangs = 0
     while not (folder / TABLE).exists() and hangs + errors <= times:
@@ -96,7 +77,7 @@ def kill_workers(
         row, before = 0, killed
         moment = time.monotonic() + rng.uniform(0.0, between)
         while process.poll() is None:
-            # The moment is random: no condition is waited for.
+            # Random time, without a condition.
             time.sleep(0.01)
             if progress.made():
                 before = killed
@@ -117,43 +98,26 @@ def kill_workers(
 
 
 class _Progress:
-    """The results that a study writes."""
+    """Monitors the results written by a study."""
 
     def __init__(self, parts: Path, patience: float) -> None:
         self._parts, self._patience = parts, patience
         self._seen, self._last = 0, time.monotonic()
 
     def made(self) -> bool:
-        """Whether something was written since the last call."""
+        """Whether a result was written since the last call."""
         before, self._seen = self._seen, len(written(self._parts))
         if self._seen != before:
             self._last = time.monotonic()
         return self._seen != before
 
     def stalled(self) -> bool:
-        """Whether nothing was written for too long."""
+        """Whether no result was written for too long."""
         return time.monotonic() - self._last > self._patience
 
 
 def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> float | None:
-    """
-    Kill a worker of a process.
-
-    Parameters
-    ----------
-    parent : int
-        The process.
-    rng : Generator
-        Random numbers.
-    youngest : bool
-        Kill the youngest worker, instead of a random one.
-
-    Returns
-    -------
-    float or None
-        Age of the worker [s]; None if there is no worker, or one has just ended.
-
-    """
+    """Kill the youngest or a random worker; return its age [s], None without a worker."""
     with suppress(psutil.NoSuchProcess):
         if found := workers(parent):
             one = found[-1 if youngest else rng.integers(len(found))]
@@ -164,20 +128,7 @@ def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> flo
 
 
 def workers(parent: int) -> list[psutil.Process]:
-    """
-    Return the workers of a process.
-
-    Parameters
-    ----------
-    parent : int
-        The process.
-
-    Returns
-    -------
-    list of Process
-        Its children that have not ended, the oldest first.
-
-    """
+    """Return the running children of a process, the oldest first."""
     found = [
         one
         for one in psutil.Process(parent).children()
@@ -189,16 +140,16 @@ def workers(parent: int) -> list[psutil.Process]:
 
 class Kills(NamedTuple):
     """
-    What became of a study.
+    Outcome of a study that was killed repeatedly.
 
     Attributes
     ----------
     killed : int
-        How often it was killed before it had ended.
+        Number of kills before its end.
     twice : int
-        Samples that were computed again though they had been written.
+        Number of samples computed again after they were written.
     left : int
-        Processes that were there still when the study was not. They are ended here.
+        Number of processes that outlived the study; they are terminated here.
 
     """
 
@@ -211,24 +162,9 @@ def kill_again_and_again(
     words: Sequence[str], folder: Path, times: int, rng: np.random.Generator
 ) -> Kills:
     """
-    Start a study some times, and kill it each time when it has written something more.
+    Start a study repeatedly, and kill it each time after it has written more results.
 
-    Parameters
-    ----------
-    words : sequence of str
-        Command that begins the study, or goes on with it.
-    folder : Path
-        Folder of its results.
-    times : int
-        How often.
-    rng : Generator
-        Gives the moments.
-
-    Returns
-    -------
-    Kills
-        What became of it; where it ended before it was killed the rest is not tried.
-
+    Further kills are omitted if the study ends first.
     """
     parts = folder / 'parts'
     killed = twice = left = 0
@@ -240,7 +176,7 @@ def kill_again_and_again(
             if len(written(parts)) > len(before):
                 break
             time.sleep(0.01)
-        # The moment is random: no condition is waited for.
+        # Random time, without a condition.
         time.sleep(rng.uniform(0.0, _LATEST))
         if process.poll() is not None:
             break
@@ -250,7 +186,7 @@ def kill_again_and_again(
         killed += 1
         left += _left(workers)
         if (folder / TABLE).exists():
-            # All was written, and the parts are removed.
+            # The study is complete, and its parts are removed.
             break
         now = written(parts)
         twice += again(before, now)
@@ -259,9 +195,9 @@ def kill_again_and_again(
 
 
 def _left(workers: Sequence[psutil.Process]) -> int:
-    """Return how many do not end by themselves; they are ended."""
+    """Terminate processes that do not end; return their number."""
     _, alive = psutil.wait_procs(workers, timeout=_ORPHANED)
-    # Nobody may take note of a child of a process that was killed.
+    # An orphan may remain a zombie.
     alive = [one for one in alive if one.status() != psutil.STATUS_ZOMBIE]
     for one in alive:
         one.kill()
@@ -269,22 +205,9 @@ def _left(workers: Sequence[psutil.Process]) -> int:
 
 
 def written(parts: Path) -> dict[tuple[int, int], int]:
-    """
-    Return what a study has written.
-
-    Parameters
-    ----------
-    parts : Path
-        Folder of its parts.
-
-    Returns
-    -------
-    dict of (int, int) to int
-        First and last + 1 of the samples of each part, and when it was written [ns].
-
-    """
+    """Return the first and last + 1 sample of each part in a folder, and its write time [ns]."""
     found = {}
-    # They go when all is written.
+    # Parts are removed at the end of the study.
     with suppress(FileNotFoundError):
         for path in parts.glob('*-*.parquet'):
             first, _, end = path.stem.partition('-')
@@ -293,20 +216,7 @@ def written(parts: Path) -> dict[tuple[int, int], int]:
 
 
 def again(before: dict[tuple[int, int], int], now: dict[tuple[int, int], int]) -> int:
-    """
-    Return how many samples were computed again though they had been written.
-
-    Parameters
-    ----------
-    before, now : dict
-        As `written` returns them.
-
-    Returns
-    -------
-    int
-        Samples of parts that are not there as they were, or that are in another part, too.
-
-    """
+    """Return the number of samples computed again after they were written (see `written`)."""
     kept = [one for one in before if now.get(one) == before[one]]
     changed = sum(end - first for first, end in before) - sum(end - first for first, end in kept)
     return changed + sum(

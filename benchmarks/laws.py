@@ -1,10 +1,10 @@
 """
-Control laws on needles, robots and tissues that they do not know.
+Control laws on needles, robots and tissues with unknown parameters.
 
-Every law believes in the preset `phantom` without a carriage. A cell of the study has its own
+Each law uses the nominal model `phantom` without a carriage. A cell of the study has its own
 delay, carriage and width of the uniform distributions of mu_s, mu_v and k_a, and a situation: an
-insertion, a withdrawal, a reversal, a membrane that gives way, tissue that holds more and more.
-The laws drive the same needles.
+insertion, a withdrawal, a reversal, a membrane puncture, tissue with increasing friction. All laws
+are tested on the same needles.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LIMIT: Final = 15.0
 _PRESET: Final = 'phantom'
 _DEFLECTION: Final = 5e-4
 
-#: Time after the end of the reference [s], and the end of it in which a needle shall rest.
+#: Time after the end of the reference [s], and its last part, in which a needle must rest.
 _REST: Final = 2.0
 _END: Final = 0.5
 
@@ -48,8 +48,8 @@ _DELAYS: Final = (0, 1, 2)
 _CARRIAGES: Final = (0.0, 0.5, 2.0)
 _WIDTHS: Final = (0.3, 0.5)
 
-#: A motion of the end beyond this, with reversals, is a limit cycle [m]; errors beyond that are
-#: called unstable [m].
+#: Smallest final motion with reversals that is a limit cycle [m], and smallest error that is
+#: unstable [m].
 _CYCLE: Final = 1e-5
 _LOST: Final = 5e-3
 
@@ -61,7 +61,7 @@ _OVERSHOOT: Final = 0.3
 
 @dataclass(frozen=True)
 class _ThereAndBack:
-    """A reference that goes to a target, and from there back to another."""
+    """Reference to a target and from there to a second target."""
 
     there: MinimumJerk
     back: MinimumJerk
@@ -78,20 +78,20 @@ class _ThereAndBack:
 @dataclass(frozen=True)
 class Situation:
     """
-    What the needle does, and what it meets.
+    Motion and disturbance of the needle.
 
     Attributes
     ----------
     name : str
-        Its name.
+        Name.
     start : float
-        Inserted length at the beginning [m].
+        Initial insertion depth [m].
     reference : Reference
-        The motion.
+        Motion.
     duration : float
         Duration of the motion [s].
     added : sequence of tuple
-        Friction along the way; see `run_batch`.
+        Additional friction by depth; see `run_batch`.
 
     """
 
@@ -107,15 +107,7 @@ def _moved(start: float, target: float) -> MinimumJerk:
 
 
 def situations() -> list[Situation]:
-    """
-    Return the situations of the study.
-
-    Returns
-    -------
-    list of Situation
-        Five motions of 2 cm and less than 6 s.
-
-    """
+    """Return the situations: five motions of 2 cm and less than 6 s."""
     into, out = _moved(0.02, 0.04), _moved(0.06, 0.04)
     turn = _ThereAndBack(_moved(0.04, 0.05), _moved(0.05, 0.042))
     steady = Trapezoid(Setpoint(0.02), 0.04, ReferenceLimits())
@@ -137,15 +129,7 @@ def situations() -> list[Situation]:
 
 
 def laws() -> dict[str, Law]:
-    """
-    Return the laws of the study.
-
-    Returns
-    -------
-    dict
-        Laws by name, the default first, with default gains unless the name says more.
-
-    """
+    """Return the laws by name, the default first, with default gains unless in the name."""
     axis = Axis.insertion(NeedleParameters.preset(_PRESET))
 
     def inverse(bandwidth: float) -> InverseDynamics:
@@ -165,16 +149,16 @@ def laws() -> dict[str, Law]:
 @dataclass(frozen=True)
 class Cell:
     """
-    What a law does in one cell.
+    Results of a law in one cell.
 
     Attributes
     ----------
     final, rms : ndarray, shape (needles,)
         Modulus of the final error, and rms error [m].
     beyond : ndarray, shape (needles,)
-        Largest overshoot beyond the reference, in its direction [m].
+        Largest overshoot over the reference, in its direction [m].
     cycles, lost : int
-        Needles that go on moving back and forth, and that were farther off than 5 mm.
+        Number of needles with a limit cycle, and with an error above 5 mm.
 
     """
 
@@ -186,24 +170,7 @@ class Cell:
 
     @classmethod
     def of(cls, batch: LoopBatch, goal: FloatArray, direction: float) -> Cell:
-        """
-        Judge the runs of a cell.
-
-        Parameters
-        ----------
-        batch : LoopBatch
-            The runs, with their depths.
-        goal : ndarray, shape (k + 1,)
-            The reference [m].
-        direction : float
-            Sign of the motion.
-
-        Returns
-        -------
-        Cell
-            What was found.
-
-        """
+        """Evaluate runs for a reference (k + 1,) [m] and the sign of its motion."""
         lost = (batch.completed < len(goal) - 1) | (batch.largest > _LOST)
         end = batch.depths[:, -round(_END / PERIOD) :]
         steps = np.sign(np.diff(end, axis=1))
@@ -218,7 +185,7 @@ class Cell:
         )
 
     def __str__(self) -> str:
-        """Return rms, median and 95 % of the final error [um], or how many do not come to rest."""
+        """Return rms, median and 95 % of the final error [um], or the number of limit cycles."""
         if self.lost or self.cycles:
             words = [(self.lost, 'lost'), (self.cycles, 'cycle')]
             return '**' + ', '.join(f'{count} {word}' for count, word in words if count) + '**'
@@ -232,30 +199,12 @@ def study(
     """
     Run one law in one cell.
 
-    Parameters
-    ----------
-    situation : Situation
-        What it does and meets.
-    law : Law
-        The law.
-    width : float
-        Largest relative deviation of mu_s, mu_v and k_a.
-    delay : int
-        Periods from measurement to effect.
-    carriage : float
-        Mass that the law does not know [kg].
-    needles : int
-        Number of needles.
-
-    Returns
-    -------
-    Cell
-        What was found.
-
+    `width` is the largest relative deviation of mu_s, mu_v and k_a, `delay` the periods from
+    measurement to effect, and `carriage` a mass unknown to the law [kg].
     """
     believed = NeedleParameters.preset(_PRESET)
     factors = np.random.default_rng(2014).uniform(1.0 - width, 1.0 + width, (needles, 3))
-    # The corners first: what is worst is often there.
+    # The corners first, which often contain the worst case.
     corners = 1.0 + width * np.array(np.meshgrid(*3 * [(-1.0, 1.0)])).reshape(3, -1).T
     factors[: len(corners)] = corners[:needles]
     plants = [
@@ -288,29 +237,7 @@ def study(
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:
-    """
-    Run all laws in all cells.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    needles : int
-        Needles in a cell.
-
-    Returns
-    -------
-    sections : list of Section
-        A map of the laws over delay and carriage, for each situation and width.
-    bars : list of Bar
-        Of the default law.
-
-    Raises
-    ------
-    ParameterError
-        If the number of needles is not positive.
-
-    """
+    """Run all laws in all cells, with a number of needles per cell."""
     if needles < 1:
         raise ParameterError(f'needles must be at least 1, got {needles!r}')
     grid = [(delay, carriage) for delay in _DELAYS for carriage in _CARRIAGES]
@@ -348,10 +275,10 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                 )
     sections[0] = replace(
         sections[0],
-        notes=f'Columns: delay in periods of 1 ms, and a carriage that no law knows. {needles} '
+        notes=f'Columns: delay in periods of 1 ms, and a carriage unknown to the laws. {needles} '
         'needles in each cell. Cells: median of the rms error; median / 95 % of the final error, '
-        'in micrometers. Bold: needles that were farther off than 5 mm (lost) or that move back '
-        'and forth at the end (cycle).',
+        'in micrometers. Bold: needles with an error above 5 mm (lost) or with a '
+        'limit cycle at the end (cycle).',
     )
     sections.append(Section('Largest overshoot after the puncture [mm]', heads, beyond))
     return sections, [

@@ -1,4 +1,4 @@
-"""Plant and supervisor over the bytes of the wire, without ROS: as the nodes, at any speed."""
+"""Plant and supervisor connected by serialized messages, without ROS, faster than real time."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reader
 
-#: When time begins [ns].
+#: Start time [ns].
 EPOCH: Final = 1_700_000_000 * NANOSECONDS
 
-#: What is measured, in the order in which it is sent.
+#: Measurements in the order of transmission.
 MEASURED: Final = (BASE_WRENCH.name, TIP_DEFLECTION.name, JOINT_STATES.name)
 
 
 class Sent(NamedTuple):
-    """A measurement on its way."""
+    """A measurement in transmission."""
 
     stamp: int
     values: Sequence[float]
@@ -39,7 +39,7 @@ class Sent(NamedTuple):
 
 
 class Commanded(NamedTuple):
-    """A command on its way."""
+    """A command in transmission."""
 
     stamp: int
     force: float
@@ -48,64 +48,29 @@ class Commanded(NamedTuple):
 
 
 class Fault:
-    """What happens to a topic; this one lets everything pass."""
+    """Fault of a topic; the base class transmits everything unchanged."""
 
     def measured(self, sent: Sent) -> Iterable[Sent]:
-        """
-        Return what arrives in place of a measurement.
-
-        Parameters
-        ----------
-        sent : Sent
-            The measurement.
-
-        Returns
-        -------
-        iterable of Sent
-            Any number.
-
-        """
+        """Return the measurements received in place of a measurement."""
         return (sent,)
 
     def commanded(self, command: Commanded) -> Iterable[Commanded]:
-        """
-        Return what arrives in place of a command.
-
-        Parameters
-        ----------
-        command : Commanded
-            The command.
-
-        Returns
-        -------
-        iterable of Commanded
-            Any number.
-
-        """
+        """Return the commands received in place of a command."""
         return (command,)
 
 
 class Loop:
     """
-    A plant and what commands it.
-
-    Parameters
-    ----------
-    law : str
-        Name of the law.
-    rate : float
-        Samples per second [Hz].
-    seed : int
-        Seed of the noise.
+    A plant and its controller.
 
     Attributes
     ----------
     now : int
         Time [ns].
     publishers : dict
-        How many nodes publish what may have one source only.
+        Number of publishers of topics with a single source.
     depth : float
-        True inserted length [m].
+        True insertion depth [m].
     acting : float
         Force that acts on the needle [N].
 
@@ -129,37 +94,19 @@ class Loop:
         self._ends = {
             name: (topic, Reader(topic.type_name).read) for name, topic in self.run.topics.items()
         }
-        #: Messages on their way: when they arrive, their order, and what they are.
+        #: Messages in transmission: time of arrival, order, and content.
         self._waiting: list[tuple[int, int, str | None, bytes | Commanded]] = []
         self._order = 0
 
     def target(self, depth: float) -> None:
-        """
-        Set a target.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length to reach [m].
-
-        """
+        """Set a target depth [m]."""
         self.supervisor.target(0, '', depth, 0.0, self.now)
 
     def step(self, topic: str = '', fault: Fault | None = None) -> None:
-        """
-        Take a sample, pass it on, and apply the answers.
-
-        Parameters
-        ----------
-        topic : str
-            Topic that suffers from the fault.
-        fault : Fault, optional
-            What happens to it.
-
-        """
+        """Take a sample, transmit it with a fault on a topic, and apply the commands."""
         self.now += self._period
         told = {name: values for name, _, values in self.run.take(self.now)}
-        # Lateral numbers of the tip are what the sensor of the tip says.
+        # Lateral tip coordinates are the reading of the tip sensor.
         for name in MEASURED:
             if name not in told:
                 continue

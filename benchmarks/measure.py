@@ -1,4 +1,4 @@
-"""Side-by-side timing: the least times of jobs that take turns, and bars on the results."""
+"""Measure the least times of jobs that take turns, and compare results with bars."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-#: Shown in place of the figures of a tool that is not installed.
+#: Text in place of the metrics of a tool that is not installed.
 NOT_INSTALLED: Final = "not installed: pip install -e '.[bench]'"
 
 #: Duration of one turn of a short job [s]. The previous job slows down the first runs of a turn.
@@ -23,20 +23,20 @@ _TURN: Final = 0.02
 @dataclass(frozen=True, slots=True)
 class Bar:
     """
-    A figure and the value that it must reach.
+    A metric and its limit.
 
     Attributes
     ----------
     figure : str
-        What is measured.
+        Name of the metric.
     found : float or None
-        Measured value; None if it could not be measured.
+        Measured value; None if not measurable.
     limit : float
-        Value that must be reached.
+        Value to reach.
     unit : str
         Unit of both.
     at_least : bool
-        True if the figure must be at least ``limit``, False if it must be at most ``limit``.
+        True for a lower limit, False for an upper limit.
 
     """
 
@@ -48,15 +48,15 @@ class Bar:
 
     @property
     def missed(self) -> bool:
-        """Whether the figure was measured and does not reach the limit."""
+        """Whether the metric was measured and misses the limit."""
         if self.found is None:
             return False
-        # NaN reaches no limit.
+        # NaN misses any limit.
         return not (self.found >= self.limit if self.at_least else self.found <= self.limit)
 
     @property
     def verdict(self) -> str:
-        """``met``, or by what factor the limit is missed."""
+        """``met``, or the factor by which the limit is missed."""
         if self.found is None:
             return NOT_INSTALLED
         if not self.missed:
@@ -65,15 +65,6 @@ class Bar:
         return f'missed by a factor {high / low:.2f}' if low > 0.0 else 'missed'
 
     def row(self) -> tuple[str, str, str, str]:
-        """
-        Return the cells of a table row.
-
-        Returns
-        -------
-        tuple of str
-            Figure, limit, measured value and verdict.
-
-        """
         unit = f' {self.unit}' if self.unit else ''
         wanted = f'{">=" if self.at_least else "<="} {self.limit:g}{unit}'
         found = '' if self.found is None else f'{number(self.found)}{unit}'
@@ -81,39 +72,13 @@ class Bar:
 
 
 def number(value: float) -> str:
-    """
-    Return a number with three significant digits.
-
-    Parameters
-    ----------
-    value : float
-        Number.
-
-    Returns
-    -------
-    str
-        With an exponent only below 1e-4 and from 1e9.
-
-    """
+    """Format a number with three digits, with an exponent only below 1e-4 and from 1e9."""
     rounded = float(f'{value:.3g}')
     return f'{rounded:.0f}' if 1e3 <= abs(rounded) < 1e9 else f'{rounded:.3g}'
 
 
 def seconds(job: Callable[[], object]) -> float:
-    """
-    Measure the wall time of one call.
-
-    Parameters
-    ----------
-    job : callable
-        Called without arguments.
-
-    Returns
-    -------
-    float
-        Wall time [s].
-
-    """
+    """Measure the wall time of one call [s]."""
     begin = time.perf_counter()
     job()
     return time.perf_counter() - begin
@@ -121,24 +86,11 @@ def seconds(job: Callable[[], object]) -> float:
 
 def least_times(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """
-    Measure the least wall time of each job; the jobs take turns.
+    Measure the least wall time [s] of each job over a number of rounds; the jobs take turns.
 
-    Other work on a shared machine only ever adds to a time, and comes in bursts. The least of
-    many times is therefore the best estimate, and jobs that take turns see the same bursts. Short
-    jobs are repeated within their turn.
-
-    Parameters
-    ----------
-    jobs : Mapping[str, callable]
-        Jobs by name. Each is run once more beforehand, to warm up.
-    repeats : int
-        Number of rounds.
-
-    Returns
-    -------
-    dict[str, float]
-        Least time [s] by name.
-
+    Other load on a shared machine only increases a time, and occurs in bursts. The least of many
+    times is therefore the best estimate, and jobs that take turns have the same bursts. Short jobs
+    are repeated within their turn. Each job is run once before, for warm-up.
     """
     for job in jobs.values():
         job()
@@ -154,41 +106,13 @@ def least_times(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[
 
 
 def geometric(first: float, last: float, ratio: float) -> list[float]:
-    """
-    Return a geometric sequence.
-
-    Parameters
-    ----------
-    first, last : float
-        First value, and the value that the sequence does not pass.
-    ratio : float
-        Ratio of neighbors: above 1 if ``last`` is above ``first``, else below 1.
-
-    Returns
-    -------
-    list of float
-        ``first``, ``first * ratio``, ...; includes ``last`` if the sequence meets it.
-
-    """
+    """Return ``first, first * ratio, ...`` up to ``last``, inclusive if reached."""
     count = int(np.floor(np.log(last / first) / np.log(ratio) + 1e-9))
     return [first * ratio**k for k in range(count + 1)]
 
 
 def optional(name: str) -> ModuleType | None:
-    """
-    Import a module of a tool to compare with.
-
-    Parameters
-    ----------
-    name : str
-        Module.
-
-    Returns
-    -------
-    module or None
-        None if it is not installed.
-
-    """
+    """Import a module for comparison; None if not installed."""
     try:
         return import_module(name)
     except ModuleNotFoundError:
@@ -196,15 +120,7 @@ def optional(name: str) -> ModuleType | None:
 
 
 def peak_memory() -> float:
-    """
-    Return the peak memory of this process.
-
-    Returns
-    -------
-    float
-        Memory [bytes].
-
-    """
+    """Return the peak memory of this process [bytes]."""
     status = Path('/proc/self/status')
     if status.exists():
         for line in status.read_text('ascii').splitlines():

@@ -1,10 +1,10 @@
 """
-Coverage and advice on recordings by another simulator, with noise of many kinds.
+Coverage and suggested terms for recordings of an independent simulator, with many kinds of noise.
 
-Nothing of the plant, its sensor or its protocol is used: strokes of random speed and length in and
-out with rests at some of the turns, a force that is Coulomb and viscous friction with further
-effects on request, and noise on force and motion. It shows how often the intervals hold the truth
-where noise has a memory, and whether what is advised is right.
+The plant, its sensor and its protocol are not used: strokes of random speed and length in both
+directions with rests at some of the reversals, Coulomb and viscous friction with optional effects,
+and noise on force and motion. Results are the coverage of the intervals for autocorrelated noise,
+and the correctness of the suggested terms.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from scipy.signal import lfilter
 #: Samples in the simulation of the motion per sample of the recording.
 _FINER: Final = 4
 
-#: Strokes begin and end at these accelerations [m/s^2], and last so long [s].
+#: Ranges of stroke acceleration [m/s^2] and duration [s].
 _ACCELERATIONS: Final = (0.04, 0.15)
 _STROKES: Final = (0.6, 1.8)
 
-#: Rests at a third of the turns [s].
+#: Duration of rests, at a third of the reversals [s].
 _RESTS: Final = (0.1, 0.5)
 _REST_SHARE: Final = 0.33
 
 
-#: Parameters whose intervals are judged.
+#: Parameters whose intervals are evaluated.
 _JUDGED: Final = ('coulomb_friction', 'viscous_friction')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """
-    A kind of recording: noise of force and motion, and what the truth holds beside (15).
+    A kind of recording: noise of force and motion, and true effects in addition to (15).
 
     Attributes
     ----------
@@ -50,19 +50,19 @@ class Kind:
         Standard deviation of white and of exponentially correlated noise of the force [N], of the
         steps of a random walk [N / sqrt(s)], and amplitude of a hum of 50 Hz [N].
     memory : float
-        Time over which colored noise is correlated [s].
+        Correlation time of colored noise [s].
     counts : float
-        Smallest step of the force [N].
+        Resolution of the force [N].
     rate, duration : float
         Samples per second, and length [s].
     speed_noise, position_noise, position_counts : float
-        White noise of the speed [m/s] and of the position [m], and the step of the position [m].
+        White noise of velocity [m/s] and position [m], and resolution of the position [m].
     positions_only : bool
-        Whether the recording has no speeds.
+        Whether the recording has no velocities.
     speeds : (float, float)
-        Speeds of the strokes [m/s], drawn evenly in their logarithm.
+        Range of stroke speeds [m/s], uniform in the logarithm.
     truth : mapping of str to float
-        Coefficients of further terms, by the names of the parameters.
+        Coefficients of additional terms by parameter name.
 
     """
 
@@ -85,26 +85,7 @@ class Kind:
 def recorded(
     kind: Kind, rng: np.random.Generator, name: str = ''
 ) -> tuple[Recording, Mapping[str, float]]:
-    """
-    Simulate a recording.
-
-    Parameters
-    ----------
-    kind : Kind
-        What it is like.
-    rng : Generator
-        Draws friction, strokes and noise.
-    name : str
-        Its name.
-
-    Returns
-    -------
-    recording : Recording
-        What a robot and its sensor would have recorded.
-    truth : mapping of str to float
-        Its true parameters by name.
-
-    """
+    """Simulate a recording, with its true parameters by name; `rng` draws strokes and noise."""
     truth = {
         'coulomb_friction': rng.uniform(0.3, 0.8),
         'viscous_friction': rng.uniform(200.0, 400.0),
@@ -133,7 +114,7 @@ def recorded(
 def _strokes(
     rng: np.random.Generator, duration: float, step: float, speeds_between: tuple[float, float]
 ) -> FloatArray:
-    """Return the speed of strokes in and out."""
+    """Return the velocity of strokes in both directions."""
     corners, speeds = [0.0, 0.5], [0.0, 0.0]
     sign = 1.0
     while corners[-1] < duration:
@@ -150,7 +131,7 @@ def _strokes(
 
 
 def _force(truth: Mapping[str, float], time: FloatArray, speed: FloatArray) -> FloatArray:
-    """Return the force; at rest it is what is left of the friction, a part of Coulomb's."""
+    """Return the force; at rest, the residual friction, a fraction of Coulomb friction."""
     sign = np.sign(speed)
     sign[speed == 0.0] = 0.3
     force = truth['coulomb_friction'] * sign + truth['viscous_friction'] * speed
@@ -182,16 +163,16 @@ def _counted(values: FloatArray, step: float) -> FloatArray:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
     """
-    A line of the table.
+    A row of the table.
 
     Attributes
     ----------
     kind : Kind
-        The recordings.
+        Kind of recording.
     terms : tuple of str
-        Terms beside Coulomb and viscous friction.
+        Terms in addition to Coulomb and viscous friction.
     effect : str
-        Term that the truth holds and the fit lacks; '' for none.
+        True term that is missing in the fit; '' for none.
     is_hard : bool
         Whether noise is so slow that intervals may be wide.
 
@@ -203,7 +184,7 @@ class Line:
     is_hard: bool = False
 
 
-#: Lines by name: first noises, then effects that no term explains yet.
+#: Rows by name: first kinds of noise, then effects without their term.
 LINES: Final[Mapping[str, Line]] = {
     'white': Line(kind=Kind()),
     'AR(1), 20 ms': Line(kind=Kind(white=0.005, colored=0.03, memory=0.02)),
@@ -231,24 +212,24 @@ LINES: Final[Mapping[str, Line]] = {
     ),
 }
 
-#: Least share of right advice, and largest of false advice where nothing is missing.
+#: Smallest fraction of correct suggestions, and largest fraction of false suggestions.
 RIGHT, FALSE = 0.90, 0.02
 
 
 class Outcome(NamedTuple):
     """
-    What one recording gave.
+    Result of one recording.
 
     Attributes
     ----------
     line : str
-        Line of the table.
+        Row of the table.
     errors, given, held : tuple
-        Of mu_s and mu_v: error made, error given, and whether the interval holds the truth.
+        For mu_s and mu_v: error, standard error, and whether the interval contains the true value.
     warned : bool
-        Whether a warning says that the noise has a memory.
+        Whether a warning reports autocorrelated noise.
     advised : str
-        Terms that are advised.
+        Suggested terms.
 
     """
 
@@ -261,20 +242,7 @@ class Outcome(NamedTuple):
 
 
 def outcomes(seed: int, number: int) -> list[Outcome]:
-    """
-    Identify one recording of each kind.
-
-    Parameters
-    ----------
-    seed, number : int
-        Seed of the study and number of the recording.
-
-    Returns
-    -------
-    list of Outcome
-        One for each line.
-
-    """
+    """Identify one recording of each kind; seed and number define the noise."""
     return [
         _outcome(name, line, np.random.default_rng([seed, number, k]))
         for k, (name, line) in enumerate(LINES.items())
@@ -300,22 +268,7 @@ def _outcome(name: str, line: Line, rng: np.random.Generator) -> Outcome:
 
 
 def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
-    """
-    Compare estimates and advice with the truth.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    recordings, seed : int
-        How many of each kind, and the seed of the study.
-
-    Returns
-    -------
-    sections, bars
-        Tables and bars.
-
-    """
+    """Compare estimates and suggested terms with the true parameters."""
     found: dict[str, list[Outcome]] = {name: [] for name in LINES}
     workers = os.cpu_count() or 1
     for number, part in enumerate(studied(outcomes, recordings, seed, workers), 1):

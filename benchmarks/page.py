@@ -1,4 +1,4 @@
-"""The result of a benchmark as one Markdown page, for the terminal and for a file."""
+"""Format the result of a benchmark as one Markdown page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 
 from benchmarks.measure import Bar
 
-#: Distributions whose versions every page names, and those of the tools of one benchmark.
+#: Distributions with versions on all pages, and on the page of one benchmark.
 _COMMON: Final = ('needle_insertion', 'numpy', 'scipy', 'numba')
 _TOOLS: Final = {
     'dynamics': ('mujoco', 'pyelastica'),
@@ -27,7 +27,7 @@ _TOOLS: Final = {
 @dataclass(frozen=True, slots=True)
 class Section:
     """
-    A part of a page: one table with its heading.
+    Part of a page: a table with its heading.
 
     Attributes
     ----------
@@ -48,35 +48,19 @@ class Section:
     notes: str = ''
 
     def __str__(self) -> str:
-        """Return the section as Markdown."""
         parts = [f'## {self.title}', table(self.heads, self.rows), self.notes]
         return '\n\n'.join(part for part in parts if part)
 
 
-#: Called with the name of each stage before it begins.
+#: Progress callback, called with the name of each stage before its start.
 Tick: TypeAlias = Callable[[str], None]
 
-#: What a benchmark returns: parts of the page, and its bars.
+#: Result of a benchmark: sections of the page, and bars.
 Answer: TypeAlias = tuple[list[Section], list[Bar]]
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """
-    Return a Markdown table, with aligned columns.
-
-    Parameters
-    ----------
-    heads : sequence of str
-        Column heads.
-    rows : sequence of sequence of str
-        Cells; ``|`` is not allowed in them.
-
-    Returns
-    -------
-    str
-        Lines without a final newline.
-
-    """
+    """Return a Markdown table with aligned columns; ``|`` is not allowed in cells."""
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = [heads, ['-' * width for width in widths], *rows]
     return '\n'.join(
@@ -86,20 +70,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def version(name: str) -> str:
-    """
-    Return the name and the version of a distribution.
-
-    Parameters
-    ----------
-    name : str
-        Distribution.
-
-    Returns
-    -------
-    str
-        For example ``numpy 2.0.0`` or ``mujoco not installed``.
-
-    """
+    """Return a distribution and its version, such as ``numpy 2.0.0``."""
     try:
         return f'{name} {metadata.version(name)}'
     except metadata.PackageNotFoundError:
@@ -107,22 +78,7 @@ def version(name: str) -> str:
 
 
 def header(name: str, command: str) -> str:
-    """
-    Return the head of a page: the command, the date, the machine and the versions.
-
-    Parameters
-    ----------
-    name : str
-        Name of the benchmark.
-    command : str
-        Command line that makes the page.
-
-    Returns
-    -------
-    str
-        Markdown.
-
-    """
+    """Return the head of a page: the command, the date, the machine and the versions."""
     processor = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
     if information.exists():
@@ -150,18 +106,7 @@ def conclusion(bars: Iterable[Bar], seconds: float) -> str:
     """
     Return the end of a page: the table of the bars and the verdict.
 
-    Parameters
-    ----------
-    bars : iterable of Bar
-        All bars of the benchmark.
-    seconds : float
-        Duration of the benchmark [s].
-
-    Returns
-    -------
-    str
-        Markdown. The first word of the last line is ``missed`` if a bar is missed, else ``met``.
-
+    The first word of the last line is ``missed`` if a bar is missed, else ``met``.
     """
     bars = list(bars)
     missed = sum(bar.missed for bar in bars)

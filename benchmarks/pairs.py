@@ -1,4 +1,4 @@
-"""A plant and a controller as processes, ours or bare, and the node that watches them."""
+"""Run a plant and a controller as processes, of this package or bare, and measure them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from needle_ros.timing import nanoseconds
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Bool
 
-#: Figures of one turn by name.
+#: Metrics of one turn by name.
 Figures: TypeAlias = dict[str, float]
 
 #: Time of arrival and time stamp of each message [ns], by topic.
@@ -27,7 +27,7 @@ Seen: TypeAlias = Mapping[str, list[tuple[int, int]]]
 #: Executors of the pairs of bare nodes, by name.
 _BARE: Final = {'bare': 'events', 'bare, usual executor': 'single'}
 
-#: Parameters of our plants, by name of the pair: the needle of the paper, and one that bends.
+#: Parameters of the plants by name of the pair: the needle of the paper, and a flexible needle.
 _OURS: Final[Mapping[str, dict[str, object]]] = {
     'needle': {},
     'needle, steered': {
@@ -37,53 +37,33 @@ _OURS: Final[Mapping[str, dict[str, object]]] = {
     },
 }
 
-#: Names of the pairs; the first is that of this package.
+#: Names of the pairs; the first is the pair of this package.
 PAIRS: Final = ('needle', *_BARE, 'needle, steered')
 
-#: Roles of the bare nodes that stand for a plant and a controller.
+#: Roles of the bare nodes in place of plant and controller.
 _ROLES: Final = {'plant': 'plant', 'controller': 'echo'}
 
-#: Target depths, which keep the needle moving [m].
+#: Target depths of continuous motion [m].
 TARGETS: Final = (0.06, 0.09)
 
-#: Time at the start of a turn that does not count [s].
+#: Settling time at the start of a turn [s].
 _SETTLE: Final = 0.5
 
 
 def cpu_seconds(process: int) -> float:
-    """
-    Return the CPU time of a process: all threads, user and system.
-
-    Parameters
-    ----------
-    process : int
-        Process id.
-
-    Returns
-    -------
-    float
-        CPU time [s].
-
-    """
+    """Return the CPU time of a process [s]: all threads, user and system."""
     # The clock of clock_getcpuclockid(3): /proc/PID/stat has a resolution of only 10 ms.
     return time.clock_gettime(~process << 3 | 2)
 
 
 class Pair:
     """
-    A plant and a controller as processes, and the node that watches them.
-
-    Parameters
-    ----------
-    name : str
-        One of `PAIRS`.
-    graph : Graph
-        Graph of the processes and the node.
+    A plant and a controller as processes, and a measuring node in this process.
 
     Attributes
     ----------
     node : rclpy.node.Node
-        Node in this process that watches.
+        Measuring node.
     pids : dict[str, int]
         Process ids of ``plant`` and ``controller``.
 
@@ -102,15 +82,7 @@ class Pair:
         self._targets = 0
 
     def start(self, what: str) -> None:
-        """
-        Start a process.
-
-        Parameters
-        ----------
-        what : str
-            ``plant`` or ``controller``.
-
-        """
+        """Start ``plant`` or ``controller``."""
         if self._executor is None:
             given = self._plant if what == 'plant' else {}
             node = self.graph.start(what, {'autostart': False, **given})
@@ -120,15 +92,7 @@ class Pair:
             self.pids[what], self._kill[what] = bare.pid, partial(self._kill_bare, bare)
 
     def kill(self, what: str) -> None:
-        """
-        Kill a process: it does not take part any more.
-
-        Parameters
-        ----------
-        what : str
-            ``plant`` or ``controller``.
-
-        """
+        """Kill ``plant`` or ``controller``."""
         self._kill.pop(what)()
         del self.pids[what]
 
@@ -138,20 +102,7 @@ class Pair:
         process.communicate()
 
     def start_bare(self, role: str, executor: str = 'events') -> subprocess.Popen[bytes]:
-        """
-        Start a bare node.
-
-        Parameters
-        ----------
-        role, executor : str
-            Arguments of `benchmarks.bare.main`.
-
-        Returns
-        -------
-        Popen
-            The process. What it prints can be read from its ``stdout``.
-
-        """
+        """Start a bare node by `benchmarks.bare.main`; its output is in ``stdout``."""
         process = subprocess.Popen(
             [sys.executable, '-m', 'benchmarks.bare', role, executor],
             env=self.graph.environment,
@@ -161,15 +112,7 @@ class Pair:
         return process
 
     def ready(self, what: str) -> None:
-        """
-        Wait until a process that was started is ready.
-
-        Parameters
-        ----------
-        what : str
-            ``plant`` or ``controller``.
-
-        """
+        """Wait until ``plant`` or ``controller`` is ready."""
         if self._executor is None:
             self.graph.change(self.node, what, CONFIGURE)
             if what == 'controller':
@@ -178,7 +121,7 @@ class Pair:
         self.until(lambda: self.node.count_publishers(topic), topic)
 
     def end(self) -> None:
-        """End the bare nodes; the graph ends the others."""
+        """Terminate the bare nodes; the graph terminates the others."""
         for process in self._bare:
             process.kill()
         for process in self._bare:
@@ -187,24 +130,7 @@ class Pair:
                 process.stdout.close()
 
     def until(self, condition: Callable[[], Any], what: str, timeout: float = 120.0) -> None:
-        """
-        Spin until a condition holds.
-
-        Parameters
-        ----------
-        condition : callable
-            Returns whether it holds.
-        what : str
-            What is waited for, for the message of the error.
-        timeout : float
-            Longest time to wait [s].
-
-        Raises
-        ------
-        GraphError
-            If the condition does not hold in time, or a process has ended.
-
-        """
+        """Spin until a condition holds; raise a GraphError after a timeout [s] or a crash."""
 
         def holds() -> Any:
             ended = [p.args for p in self._bare if p.poll() is not None]
@@ -215,28 +141,13 @@ class Pair:
         self.graph.spin_until(holds, what, timeout)
 
     def spin(self, duration: float) -> None:
-        """
-        Spin for some time.
-
-        Parameters
-        ----------
-        duration : float
-            Time [s].
-
-        """
+        """Spin for a duration [s]."""
         end = time.monotonic() + duration
         self.until(lambda: time.monotonic() >= end, 'the end', duration + 30.0)
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """
-        Let the plant run within a ``with`` statement.
-
-        Yields
-        ------
-        None
-
-        """
+        """Run the plant within a ``with`` statement."""
         if self._executor is None:
             self.graph.change(self.node, 'plant', ACTIVATE)
         else:
@@ -248,27 +159,11 @@ class Pair:
             self.run_bare(False)
 
     def run_bare(self, run: bool) -> None:
-        """
-        Let the bare nodes run or stop.
-
-        Parameters
-        ----------
-        run : bool
-            Whether they run.
-
-        """
+        """Start or stop the bare nodes."""
         self._run.publish(Bool(data=run))
 
     def aim(self, depth: float | None = None) -> None:
-        """
-        Send a target to the controller.
-
-        Parameters
-        ----------
-        depth : float, optional
-            Target depth [m]; the next of `TARGETS` if not given.
-
-        """
+        """Send a target depth [m] to the controller, by default the next of `TARGETS`."""
         target = PointStamped()
         target.point.y = TARGETS[self._targets % len(TARGETS)] if depth is None else depth
         self._targets += 1
@@ -276,20 +171,7 @@ class Pair:
 
     @contextmanager
     def watching(self, topics: Mapping[str, tuple[type, QoSProfile]]) -> Iterator[Seen]:
-        """
-        Note the messages of some topics within a ``with`` statement.
-
-        Parameters
-        ----------
-        topics : Mapping[str, tuple]
-            Type and quality of service by topic.
-
-        Yields
-        ------
-        Seen
-            Grows with each message.
-
-        """
+        """Record the messages of topics (type, QoS) within a ``with`` statement."""
         seen: Seen = {topic: [] for topic in topics}
 
         def note(rows: list[tuple[int, int]], message: Any) -> None:
@@ -305,20 +187,9 @@ class Pair:
 
     def measure(self, duration: float, seen: Seen) -> Figures:
         """
-        Measure the CPU time of the processes after half a second to settle.
+        Measure the CPU load of each process for a duration [s], in % of one core, after settling.
 
-        Parameters
-        ----------
-        duration : float
-            Time of the measurement [s].
-        seen : Seen
-            Messages from `watching`; only those of the measurement are left.
-
-        Returns
-        -------
-        Figures
-            Share of one core that each process takes [%].
-
+        Only messages of the measurement remain in `seen`.
         """
         self.until(lambda: all(seen.values()), f'{", ".join(seen)}')
         self.spin(_SETTLE)

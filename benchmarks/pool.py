@@ -1,4 +1,4 @@
-"""A study whose workers are killed at random times, also while they start, on a busy machine."""
+"""Studies with workers killed at random times, also during their start, on a busy machine."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ import yaml
 #: Insertions of a study, and kills of its workers.
 _SAMPLES, _KILLS = 3000, 100
 
-#: Processes that compute all the time.
+#: Number of processes for background load.
 _BUSY: Final = 2
 
-#: Short insertions, by a controller that takes no time.
+#: Short insertions, with a trivial controller.
 _STUDY: Final[dict[str, Any]] = {
     'protocol': 'steering',
     'seed': 3,
@@ -39,29 +39,7 @@ _STUDY: Final[dict[str, Any]] = {
 
 
 def compare(tick: Tick, kills: int = 500, samples: int = _SAMPLES) -> Answer:
-    """
-    Kill workers of studies, and compare the tables with the table of a study without kills.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    kills : int
-        Kills of workers, over all studies.
-    samples : int
-        Insertions of each study.
-
-    Returns
-    -------
-    sections, bars
-        A page.
-
-    Raises
-    ------
-    ParameterError
-        If a number is out of range.
-
-    """
+    """Kill workers of studies, and compare the tables with the table of an undisturbed study."""
     if kills < 1:
         raise ParameterError(f'--kills must be >= 1, got {kills}')
     rng, sums, found = np.random.default_rng(1), set[str](), list[Losses]()
@@ -100,7 +78,7 @@ def compare(tick: Tick, kills: int = 500, samples: int = _SAMPLES) -> Answer:
 def _study(
     parent: Path, rng: np.random.Generator, name: str, samples: int, kills: int, between: float
 ) -> tuple[str, Losses]:
-    """Compute a study; return the checksum of its table, and what became of its workers."""
+    """Compute a study; return the checksum of its table, and the outcome of its workers."""
     file, folder = parent / f'{name}.yaml', parent / name
     file.write_text(yaml.safe_dump({**_STUDY, 'samples': samples}), encoding='utf-8')
     command = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file)]
@@ -119,7 +97,7 @@ def _start() -> float:
 
 @contextmanager
 def _busy() -> Iterator[None]:
-    """Keep the processor busy."""
+    """Load the processor."""
     command = [sys.executable, '-c', 'while True: pass']
     others = [subprocess.Popen(command) for _ in range(_BUSY)]
     try:

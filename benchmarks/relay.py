@@ -2,8 +2,8 @@
 Steered insertions in which one message is dropped, delayed or duplicated by a relay between nodes.
 
 Plant, controller, steering and operator are real nodes over DDS, in lock-step. All their topics
-pass the relay, each link from one node to another separately. In each insertion one message of one
-link, at random, gets a fault. The insertion must then reach its target, or stop with one line
+pass through the relay, each link from one node to another separately. In each insertion one random
+message of one link has a fault. The insertion must then reach its target, or stop with a message
 within 5 s. Run it by ``python -m benchmarks.relay --count 200 --seed 1``.
 """
 
@@ -43,12 +43,12 @@ from tqdm import trange
 #: Faults of a message.
 KINDS: Final = ('drop', 'delay', 'duplicate')
 
-#: Longest delay, and time after a fault in which an insertion must stop if it does not reach its
-#: target, of simulated time [s].
+#: Longest delay, and longest time from a fault to a stop if the target is not reached, in
+#: simulated time [s].
 LONGEST_DELAY: Final = 1.0
 LONGEST_STOP: Final = 5.0
 
-#: Wall time after which an insertion hangs [s].
+#: Timeout of an insertion, in wall time [s].
 _HANGS: Final = 120.0
 
 #: Target x, y, z [m], and largest distance of the tip from it at the end [m].
@@ -94,17 +94,7 @@ _CONTROLLER: Final[dict[str, object]] = {
 
 
 class Link(NamedTuple):
-    """
-    A topic from one node to another.
-
-    Attributes
-    ----------
-    source, sink : str
-        Names of the nodes.
-    topic : Topic
-        The topic.
-
-    """
+    """A topic from one node (source) to another (sink)."""
 
     source: str
     sink: str
@@ -143,7 +133,7 @@ class Fault(NamedTuple):
     link : Link
         Link of the message.
     number : int
-        Number of the message on the link, from 1, since the target was sent.
+        Number of the message on the link since the target was sent, from 1.
     kind : str
         One of `KINDS`.
     delay : float
@@ -167,7 +157,7 @@ def _name(node: str, topic: Topic) -> str:
 
 
 def _remaps(node: str) -> list[str]:
-    """Return arguments that give a node its own names of all topics."""
+    """Return arguments that remap all topics of a node to its own names."""
     topics = {one.topic.name: one.topic for one in LINKS if node in one[:2]}
     rules = [f'{topic.name}:={_name(node, topic)}' for topic in topics.values()]
     return ['--ros-args', *(word for rule in rules for word in ('-r', rule))]
@@ -175,17 +165,12 @@ def _remaps(node: str) -> list[str]:
 
 class Relay(Node):
     """
-    Passes the messages of all links on, but for one fault.
-
-    Parameters
-    ----------
-    **node_options
-        As for `rclpy.node.Node`.
+    Forwards the messages of all links, with one fault.
 
     Attributes
     ----------
     fault : Fault or None
-        The fault.
+        Fault to insert.
     counts : Counter
         Number of messages of each link since the target was sent.
     now : float
@@ -202,7 +187,7 @@ class Relay(Node):
         self.armed = False
         self.now = 0.0
         self.struck: float | None = None
-        #: Messages that are held: simulated and wall time of delivery [s], and the delivery.
+        #: Delayed messages: simulated and wall time of delivery [s], and the delivery.
         self._held: list[tuple[float, float, Callable[[], None]]] = []
         for source, topic in {(one.source, one.topic) for one in LINKS}:
             kind, name = message_class(topic.type_name), _name(source, topic)
@@ -219,7 +204,7 @@ class Relay(Node):
             self._on_clock,
             profile(contract.CLOCK.qos, request=True),
         )
-        # Simulated time may stand still, waiting for a message that is held.
+        # Simulated time may wait for a delayed message.
         self.create_timer(_CHECK, self._deliver, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_clock(self, message: Any) -> None:
@@ -249,7 +234,7 @@ class Relay(Node):
 
 class Outcome(NamedTuple):
     """
-    The end of an insertion.
+    End of an insertion.
 
     Attributes
     ----------
@@ -257,13 +242,13 @@ class Outcome(NamedTuple):
         ``target``, ``stopped``, ``rejected``, ``missed`` (done, but not at the target), ``late``
         (stopped too late) or ``hangs``.
     line : str
-        Why it stopped, or its state.
+        Reason of the stop, or the state.
     after : float
         Simulated time from the fault to the end [s].
     counts : Counter
         Messages of each link.
     struck : bool
-        Whether the fault has happened.
+        Whether the fault occurred.
 
     """
 
@@ -280,24 +265,7 @@ class Outcome(NamedTuple):
 
 
 def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outcome:
-    """
-    Insert a needle with one fault.
-
-    Parameters
-    ----------
-    fault : Fault or None
-        The fault.
-    logs : Path
-        Folder for logs.
-    continuous : bool
-        Whether the needle is inserted without rests.
-
-    Returns
-    -------
-    Outcome
-        Its end.
-
-    """
+    """Insert a needle with one fault, in steps or continuously (without rests)."""
     with Graph(logs) as graph:
 
         def add(name: str, kind: Callable[..., Any], **parameters: object) -> Any:
@@ -333,7 +301,7 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
         try:
             graph.spin_until(ended, 'the end', _HANGS)
             end = relay.now
-            # A message that is held may still arrive, and must not move anything.
+            # A delayed message may still arrive, and must not cause motion.
             later = relay.now + LONGEST_DELAY + 0.5
             graph.spin_until(lambda: relay.now > later, 'the last message', _HANGS)
         except GraphError as error:
@@ -354,22 +322,7 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
 
 
 def choose(counts: Mapping[Link, int], rng: np.random.Generator) -> Fault:
-    """
-    Choose a link, one of its messages, and a fault.
-
-    Parameters
-    ----------
-    counts : Mapping of Link to int
-        Messages of each link in an insertion without a fault.
-    rng : Generator
-        Source of randomness.
-
-    Returns
-    -------
-    Fault
-        The fault.
-
-    """
+    """Draw a link, one of its messages, and a fault; `counts` is from an undisturbed insertion."""
     link = LINKS[int(rng.integers(len(LINKS)))]
     number = 1 + int(rng.integers(max(1, counts[link])))
     return Fault(link, number, str(rng.choice(KINDS)), float(rng.uniform(0.0, LONGEST_DELAY)))
@@ -381,14 +334,14 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument('--count', type=int, default=200, help='number of insertions')
     parser.add_argument('--seed', type=int, default=1, help='seed of the random choices')
     given = parser.parse_args(words)
-    # The outcomes are printed; a level holds for all nodes of that name in this process.
+    # Only outcomes are printed; the log level applies to all nodes with this name in the process.
     for name in ('plant', 'controller', 'steering'):
         set_logger_level(name, LoggingSeverity.FATAL)
     rng, begun = np.random.default_rng(given.seed), monotonic()
     rows: dict[str, Counter[str]] = {str(link): Counter() for link in LINKS}
     failed, struck = [], 0
     with TemporaryDirectory() as folder:
-        # Each with rests and without.
+        # Each link with and without rests.
         counts = []
         for continuous in (False, True):
             clean = insert(None, Path(folder), continuous=continuous)

@@ -1,10 +1,10 @@
 """
-A needle that vibrates with its base held: our integrator, MuJoCo and PyElastica.
+Vibration of a needle with fixed base: the integrator of this package, MuJoCo and PyElastica.
 
 For each tool, a search finds the discretization and the time step of least cost with a first
-frequency within 1 % of the exact one of its own equations. The rods of the other tools have no
-tissue. Half of their first element is inside the clamp: a chain of rigid or constant-strain
-elements that is clamped at the end of an element converges one order slower. None is damped.
+frequency within 1 % of the exact frequency of its own equations. The rods of the other tools have
+no tissue. Half of their first element is inside the clamp: a chain of rigid or constant-strain
+elements that is clamped at the end of an element converges one order slower. All are undamped.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
-#: Inserted length [m] that vibrates.
+#: Insertion depth of the vibrating needle [m].
 LENGTH: Final = 0.15
 
 #: Largest relative error of the first frequency.
 FREQUENCY_ERROR: Final = 0.01
 
-#: Our step has no limit from the frequency; this many steps show a period.
+#: Steps per period that resolve the frequency; our integrator has no stability limit.
 STEPS_PER_PERIOD: Final = 20
 
-#: Deflection of the tip at the start over the length: small, as the exact frequency is linear.
+#: Initial tip deflection over the length: small, for the linear exact frequency.
 _AMPLITUDE: Final = 1e-3
 
 #: Ratio of neighboring steps in a search.
@@ -58,24 +58,10 @@ def beam_frequency(
     length: float, bending_stiffness: float, linear_density: float, foundation: float = 0.0
 ) -> float:
     """
-    Return the first frequency of a clamped-free Euler-Bernoulli beam on an elastic foundation.
+    Return the first frequency [Hz] of a cantilever (Euler-Bernoulli) on an elastic foundation.
 
-    Parameters
-    ----------
-    length : float
-        Length [m].
-    bending_stiffness : float
-        E I [N m^2].
-    linear_density : float
-        rho A [kg/m].
-    foundation : float
-        Stiffness per length [N/m^2].
-
-    Returns
-    -------
-    float
-        Frequency [Hz].
-
+    Units: length [m], bending stiffness E I [N m^2], linear density rho A [kg/m], foundation
+    [N/m^2].
     """
     root = brentq(lambda x: cos(x) * cosh(x) + 1.0, 1.5, 2.5, xtol=1e-14)
     bending = bending_stiffness / linear_density * (root / length) ** 4
@@ -84,20 +70,9 @@ def beam_frequency(
 
 def measured_frequency(time: FloatArray, values: FloatArray, near: float) -> float:
     """
-    Return the frequency of the sinusoid that fits samples best, from 0.7 to 1.3 times a guess.
+    Return the frequency [Hz] of the best-fit sinusoid to samples (n,).
 
-    Parameters
-    ----------
-    time, values : ndarray, shape (n,)
-        Samples.
-    near : float
-        Guess [Hz].
-
-    Returns
-    -------
-    float
-        Frequency [Hz].
-
+    The search range is 0.7 to 1.3 times the guess `near` [Hz].
     """
 
     def misfit(frequency: float) -> float:
@@ -127,7 +102,7 @@ class Setting:
     step : float
         Time step [s].
     frequency, exact : float
-        First frequency of the simulation, and the exact one of the same equations [Hz].
+        First frequency of the simulation, and exact frequency of the same equations [Hz].
     job : callable
         Simulates for ``simulated`` seconds.
     simulated : float
@@ -145,26 +120,10 @@ class Setting:
 
     @property
     def error(self) -> float:
-        """Relative error of the first frequency."""
         return self.frequency / self.exact - 1.0
 
     def row(self, spent: float, ours: float) -> tuple[str, ...]:
-        """
-        Return the cells of a table row.
-
-        Parameters
-        ----------
-        spent : float
-            Least time of a job [s].
-        ours : float
-            Time of our integrator per simulated second [s].
-
-        Returns
-        -------
-        tuple of str
-            Cells.
-
-        """
+        """Return a table row; `spent` is the job time [s], `ours` per simulated second."""
         per_second = spent / self.simulated
         return (
             self.tool,
@@ -178,34 +137,13 @@ class Setting:
 
 
 def needle_exact() -> float:
-    """
-    Return the first frequency of the needle, clamped at the entry, in its tissue.
-
-    Returns
-    -------
-    float
-        Frequency [Hz].
-
-    """
+    """Return the first frequency [Hz] of the needle in its tissue, clamped at the entry."""
     p = NeedleParameters.preset('paper_si')
     return beam_frequency(LENGTH, p.bending_stiffness, p.linear_density, p.tissue_stiffness)
 
 
 def needle(step: float) -> Setting:
-    """
-    Return our integrator with the base held.
-
-    Parameters
-    ----------
-    step : float
-        Time step [s].
-
-    Returns
-    -------
-    Setting
-        Its first frequency is sampled at the steps, or every 1/20 of a period if they are finer.
-
-    """
+    """Return our integrator with fixed base, sampled at most 20 times per period."""
     p = NeedleParameters.preset('paper_si')
     model = NeedleModel(p)
     start = model.state_at(LENGTH, _AMPLITUDE * LENGTH)
@@ -275,7 +213,7 @@ _FLEX = """
 
 
 class _Cable:
-    """A cantilever of MuJoCo: an elastic cable (before 4.0), or a one-dimensional flex."""
+    """Cantilever in MuJoCo: an elastic cable (before 4.0), or a one-dimensional flex."""
 
     def __init__(self, mujoco: Any, *, plugin: bool, elements: int, how: str, step: float) -> None:
         self._mujoco = mujoco
@@ -292,7 +230,7 @@ class _Cable:
             )
             self.model = mujoco.MjModel.from_xml_string(text)
         else:
-            # Masses sit at the points: the last has half of the others'.
+            # Point masses: the last point has half of the mass.
             size = LENGTH / (elements - 0.5)
             text = _FLEX.format(
                 **common,
@@ -328,7 +266,6 @@ class _Cable:
                 d.qpos[third] = _AMPLITUDE * LENGTH * 0.5 * x * x * (3.0 - x)
 
     def advance(self, steps: int) -> None:
-        """Take steps in one call."""
         self._mujoco.mj_step(self.model, self.data, steps)
 
     def sample(self, duration: float) -> tuple[FloatArray, FloatArray] | None:
@@ -361,7 +298,7 @@ def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setti
                 found = measured_frequency(*samples, exact)
                 if abs(found / exact - 1.0) > FREQUENCY_ERROR:
                     if how != 'discrete':
-                        # Stable, and still off: the elements are too coarse, whatever the step.
+                        # Stable but inaccurate: the elements are too coarse for any step.
                         break
                     continue
                 rod, steps = make(step=step), round(1.0 / step)
@@ -381,29 +318,16 @@ def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setti
 
 
 def mujoco_cable(tick: Tick) -> Setting | None:
-    """
-    Search the setting of least cost of MuJoCo.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    Setting or None
-        None if MuJoCo is not installed.
-
-    """
+    """Find the setting of least cost of MuJoCo; None if not installed."""
     mujoco = optional('mujoco')
     if mujoco is None:
         return None
     tick('step of MuJoCo')
-    # Up to 3.x the cable is a plugin in the wheel; since then flexes of one dimension are.
+    # Up to 3.x, the cable is a plugin of the wheel; later, one-dimensional flexes.
     libraries = sorted((Path(str(mujoco.__file__)).parent / 'plugin').glob('*elasticity*'))
     for library in libraries:
         mujoco.mj_loadPluginLibrary(str(library))
-    # A step that is too large is part of the search, and none of its reports.
+    # The search includes unstable steps, which are not reported.
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _text: None)
     try:
@@ -414,7 +338,7 @@ def mujoco_cable(tick: Tick) -> Setting | None:
 
 
 class _Rod:
-    """A cantilever of PyElastica."""
+    """Cantilever in PyElastica."""
 
     def __init__(self, elastica: Any, stepper: str, elements: int, step: float) -> None:
         radius, density, modulus, _ = _section()
@@ -439,7 +363,7 @@ class _Rod:
             elastica.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
         )
         x = np.maximum(self.rod.position_collection[0], 0.0) / LENGTH
-        # At rest and straight, with the speed of a static shape: no other mode to speak of.
+        # Straight, with the velocity field of a static shape: other modes are negligible.
         speed = 2.0 * pi * _section()[-1] * _AMPLITUDE * LENGTH
         self.rod.velocity_collection[2] = speed * x * x * (6.0 - 4.0 * x + x * x) / 3.0
         self._simulator.finalize()
@@ -447,12 +371,11 @@ class _Rod:
         self._time = np.float64(0.0)
 
     def advance(self, steps: int) -> None:
-        """Take steps."""
         for _ in range(steps):
             self._time = self._stepper.step(self._simulator, self._time, self.step)
 
     def holds(self, steps: int) -> bool:
-        """Return whether the step is stable, with every mode excited."""
+        """Return whether the step is stable, with all modes excited."""
         random = np.random.default_rng(1)
         for rates in (self.rod.velocity_collection, self.rod.omega_collection):
             rates[:, 1:] += 1e-2 * random.standard_normal(rates[:, 1:].shape)
@@ -473,26 +396,13 @@ class _Rod:
 
 
 def pyelastica_rod(tick: Tick) -> Setting | None:
-    """
-    Search the setting of least cost of PyElastica.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    Setting or None
-        None if PyElastica is not installed.
-
-    """
+    """Find the setting of least cost of PyElastica; None if not installed."""
     elastica = optional('elastica')
     if elastica is None:
         return None
     exact = _section()[-1]
     longest = {'PositionVerlet': 5e-6, 'PEFRL': 5e-6}
-    # Its cost hardly depends on the elements: the coarsest that will do.
+    # The cost hardly depends on the elements: use the coarsest valid discretization.
     for elements in range(3, 21):
         choices = []
         for stepper, first in longest.items():
@@ -502,7 +412,7 @@ def pyelastica_rod(tick: Tick) -> Setting | None:
                 for h in geometric(first, 1e-9, _STEP_RATIO)
                 if _Rod(elastica, stepper, elements, h).holds(3000)
             )
-            # Its limit is the shear of the section, whatever the elements: look near it next.
+            # The stability limit is the shear of the section, for any elements: continue near it.
             longest[stepper] = 1.1 * step
             rod = _Rod(elastica, stepper, elements, step)
             rod.advance(100)
@@ -527,20 +437,7 @@ def pyelastica_rod(tick: Tick) -> Setting | None:
 
 
 def mode_error(modes: NeedleModel) -> float:
-    """
-    Return the error of the first frequency of the matrices of a model at `LENGTH`.
-
-    Parameters
-    ----------
-    modes : NeedleModel
-        Model with tissue.
-
-    Returns
-    -------
-    float
-        Relative error; positive, as of every Ritz value.
-
-    """
+    """Return the relative error of the first frequency of a model at `LENGTH` (positive, Ritz)."""
     p = modes.parameters
     mass = p.linear_density * mode_shapes(p.length).integrals(LENGTH).gram
     square = np.linalg.eigvals(np.linalg.solve(mass, modes.stiffness_matrix(LENGTH))).real.min()
@@ -548,22 +445,7 @@ def mode_error(modes: NeedleModel) -> float:
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Compare the cost of a simulated second of free vibration.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections : list of Section
-        Cost of each tool.
-    bars : list of Bar
-        Ratios to ours, and our own frequency.
-
-    """
+    """Compare the cost of a simulated second of free vibration."""
     exact = needle_exact()
     ours = needle(1.0 / (STEPS_PER_PERIOD * exact))
     default = needle(DEFAULT_STEP)

@@ -1,4 +1,4 @@
-"""Command `needle bench`: measures side by side, prints a page, and checks the bars."""
+"""Command `needle bench`: run benchmarks, print a page, and check the bars."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.page import Answer, conclusion, header, Tick
 from needle_ros.errors import ParameterError
 from tqdm import tqdm
 
-#: Measures something.
+#: A measurement.
 Question: TypeAlias = Callable[[Tick], Answer]
 
 #: Modules of each benchmark, each with a function `compare`; safety, graph and slicer need ROS.
@@ -39,22 +39,14 @@ MODULES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the names and the options of the benchmarks.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of ``needle bench``.
-
-    """
+    """Add the arguments of ``needle bench`` to a parser."""
     parser.description = 'Measure side by side. The last line begins with met or missed.'
     names = parser.add_subparsers(required=True, dest='name', metavar='NAME')
     output = argparse.ArgumentParser(add_help=False)
     output.add_argument('-o', '--output', type=Path, metavar='FILE', help='write the page, too')
     add = partial(names.add_parser, parents=[output])
-    add('dynamics', help='the integrator beside SciPy, MuJoCo and PyElastica')
-    add('identification', help='from a bag to a result, beside other readers')
+    add('dynamics', help='the integrator compared with SciPy, MuJoCo and PyElastica')
+    add('identification', help='time from a bag to a result, compared with other readers')
     calibration = add('calibration', help='coverage and efficiency of the estimates')
     calibration.add_argument(
         '--recordings', type=int, metavar='N', help='simulated recordings of each kind'
@@ -62,19 +54,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     calibration.add_argument(
         '--seed', type=int, metavar='N', help='seed of the true values and the noise'
     )
-    damage = add('damage', help='what identification makes of damaged recordings')
+    damage = add('damage', help='identification from damaged recordings')
     damage.add_argument('--files', type=int, metavar='N', help='damaged recordings')
     add('control', help='cost of a control step')
-    add('steering-model', help='a needle that cuts its path, beside NumPy and SciPy')
-    fit = add('steering-fit', help='how well recorded insertions tell how a needle bends')
+    add('steering-model', help='cost of the steered needle, compared with NumPy and SciPy')
+    fit = add('steering-fit', help='identification of the bending of a needle from insertions')
     fit.add_argument('--recordings', type=int, metavar='N', help='fits of each kind')
     steering = add('steering', help='controllers that steer the tip to a target')
     steering.add_argument('--needles', type=int, metavar='N', help='needles of each case')
-    laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
+    laws = add('laws', help='control laws on unknown needles, robots and tissues')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
-    safety = add('safety', help='what faults, strangers and kills do to a motion')
-    safety.add_argument('--fault', metavar='NAME', help='this one only, in simulated time')
-    graph = add('graph', help='the nodes beside bare rclpy nodes')
+    safety = add('safety', help='effect of faults, other nodes and kills on a motion')
+    safety.add_argument('--fault', metavar='NAME', help='only this fault, in simulated time')
+    graph = add('graph', help='cost of the nodes compared with bare rclpy nodes')
     plan = graph.add_mutually_exclusive_group()
     plan.add_argument(
         '--full',
@@ -109,25 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """
-    Run a benchmark and print its page.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        Exit status: 0 if no bar is missed, else 1.
-
-    Raises
-    ------
-    ParameterError
-        If a number is out of range, or what it needs is not installed.
-
-    """
+    """Run a benchmark and print its page; return 0 if no bar is missed, else 1."""
     given = {key: value for key, value in vars(options).items() if value is not None}
     name, output = given.pop('name'), given.pop('output', None)
     words = [f'--{value}' if key == 'plan' else f'--{key} {value}' for key, value in given.items()]
@@ -145,28 +119,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def ask(name: str, command: str, questions: Sequence[Question]) -> tuple[str, bool]:
-    """
-    Measure, and print the page as it grows.
-
-    Parameters
-    ----------
-    name, command : str
-        Name of the benchmark and its command line.
-    questions : sequence of callable
-        Called in turn.
-
-    Returns
-    -------
-    page : str
-        What was printed.
-    missed : bool
-        Whether a bar is missed.
-
-    """
+    """Run measurements, and print the page as it grows; return it and whether a bar is missed."""
     begin = time.perf_counter()
     page = ''
     bars: list[Bar] = []
-    # Progress goes to the terminal only.
+    # Progress is printed to a terminal only.
     with tqdm(disable=None, leave=False, unit=' stages') as progress:
 
         def tell(text: object) -> None:

@@ -1,8 +1,8 @@
 """
-What faults do to a motion: each kind, on each topic, at each moment.
+Effect of faults on a motion: each kind, on each topic, at each phase.
 
-Most cells are a plant and a supervisor over the bytes of the wire, in simulated time. The last
-ones are real nodes, with strangers and kills.
+Most cells are a plant and a supervisor connected by serialized messages, in simulated time. The
+last cells are real nodes, with other publishers and kills.
 """
 
 from __future__ import annotations
@@ -26,49 +26,38 @@ import numpy as np
 
 _RATE: Final = 200.0
 
-#: When targets are set [s], and the targets [m].
+#: Times of targets [s], and targets [m].
 _GO, _RETURN = 0.5, 3.5
 _TARGETS: Final = 0.04, 0.025
 
-#: Moments at which faults begin [s].
+#: Start times of faults [s].
 MOMENTS: Final = {'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.45, 'back': 4.2}
 
-#: How long a fault lasts, how long its consequences are watched, and the time to recover [s].
+#: Duration of a fault, of the observation after it, and of the recovery [s].
 _LASTS, _WATCHED, _PATIENCE = 0.5, 0.5, 10.0
 
-#: The same target after each fault, and how near to it is there [m]. Dry friction holds a needle
-#: on which no force acts.
+#: Target after each fault, and its tolerance [m]. Dry friction holds a needle without force.
 _AFTER, _NEAR = 0.03, 2e-4
 
-#: A needle that a force holds farther than this from its own way is not safe [m].
+#: Smallest unsafe distance of a needle held away from its own motion by a force [m].
 _ITS_OWN: Final = 1e-3
 
-#: What became of a motion.
+#: Outcomes of a motion.
 BORNE, LET_GO, STOPPED = 'borne', 'no force', 'stop'
 
-#: Largest force [N], motion beyond its own [m] (2 mm, and what it takes to brake), and time [s].
+#: Limits of force [N], distance from the motion [m] (2 mm plus braking distance), and time [s].
 _FORCE: Final = 15.0
 _BEYOND: Final = 0.004
 _UNSAFE: Final = 0.5
 
 
-#: From the number of the message since the fault began, the measurement, the first one of the
-#: fault, and a generator of random numbers, to what arrives.
+#: Maps the message number since the start of the fault, the measurement, the first measurement of
+#: the fault, and a random generator to the received measurements.
 _Alter: TypeAlias = Callable[[int, Sent, Sent, np.random.Generator], Iterable[Sent]]
 
 
 class Lies(Fault):
-    """
-    A sensor, or the way from it, that is not well.
-
-    Parameters
-    ----------
-    alter : callable
-        What arrives.
-    seed : int
-        Seed of the generator.
-
-    """
+    """Sensor fault; `alter` maps the measurement to the received measurements."""
 
     def __init__(
         self, alter: Callable[[int, Sent, Sent, np.random.Generator], Iterable[Sent]], seed: int
@@ -77,7 +66,6 @@ class Lies(Fault):
         self._count, self._first = 0, Sent(0, ())
 
     def measured(self, sent: Sent) -> Iterable[Sent]:
-        """Return what arrives."""
         if self._count == 0:
             self._first = sent
         self._count += 1
@@ -85,21 +73,12 @@ class Lies(Fault):
 
 
 class Orders(Fault):
-    """
-    Commands that are not what was commanded.
-
-    Parameters
-    ----------
-    alter : callable
-        From the number of the command since the fault began, and the command, to what arrives.
-
-    """
+    """Command fault; `alter` maps the message number and the command to received commands."""
 
     def __init__(self, alter: Callable[[int, Commanded], Iterable[Commanded]]) -> None:
         self._alter, self._count = alter, 0
 
     def commanded(self, command: Commanded) -> Iterable[Commanded]:
-        """Return what arrives."""
         self._count += 1
         return self._alter(self._count - 1, command)
 
@@ -108,7 +87,7 @@ def _ms(number: float) -> int:
     return round(number * 1e6)
 
 
-#: Sizes of what is added to the numbers of a topic: well below its limits, and beyond noise.
+#: Offsets of the numbers of a topic: well below its limits, and above noise.
 _SIZE: Final = {
     JOINT_STATES.name: 5e-3,
     BASE_WRENCH.name: 3.0,
@@ -117,7 +96,7 @@ _SIZE: Final = {
 
 
 def _with(sent: Sent, change: Callable[[float], float], topic: str) -> Sent:
-    """Change the number of a measurement that matters most."""
+    """Change the main number of a measurement."""
     place = {JOINT_STATES.name: 0, BASE_WRENCH.name: 2, TIP_DEFLECTION.name: 2}[topic]
     values = list(sent.values)
     values[place] = change(values[place])
@@ -129,7 +108,7 @@ def _lies(topic: str) -> dict[str, _Alter]:
     size = _SIZE[topic]
 
     def swapped(k: int, s: Sent, _f: Sent, _r: np.random.Generator) -> Iterable[Sent]:
-        # Every other one comes after the next.
+        # Every second measurement is swapped with the next.
         return (s._replace(late=_ms(7.0)) if k % 2 == 0 else s,)
 
     def added(
@@ -193,14 +172,14 @@ _ORDERS: Final[dict[str, Callable[[int, Commanded], Iterable[Commanded]]]] = {
     'a second commander': lambda _k, c: (c, c._replace(force=14.0)),
 }
 
-#: Faults that come with a second publisher.
+#: Faults by a second publisher.
 _RIVALS: Final = {(WRENCH_COMMAND.name, 'a second commander')} | {
     (name, 'two, one 90 ms ahead') for name in MEASURED
 }
 
 
 class Cell(NamedTuple):
-    """A fault, the topic that has it, and when and for how long."""
+    """A fault, its topic, start and duration."""
 
     topic: str
     fault: str
@@ -211,20 +190,20 @@ class Cell(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Found:
     """
-    What became of a motion.
+    Outcome of a motion.
 
     Attributes
     ----------
     outcome : str
-        The worst of what was done: borne, no force, stop.
+        Strongest reaction: borne, no force, stop.
     force : float
-        Largest force that acted [N].
+        Largest force on the needle [N].
     beyond : float
-        How far the needle went beyond where it would have been [m].
+        Largest distance of the needle from the undisturbed motion [m].
     unsafe : float
-        Time until no force held the needle away from its own way any more [s].
+        Time until the last force that holds the needle away from its own motion [s].
     recovery : float
-        Time to the next target, after a stop was cleared [s]; infinite if it was not reached.
+        Time to the next target after a stop was cleared [s]; infinite if not reached.
 
     """
 
@@ -236,15 +215,7 @@ class Found:
 
 
 def cells() -> list[Cell]:
-    """
-    Return all cells in simulated time.
-
-    Returns
-    -------
-    list of Cell
-        Each fault of each topic at each moment, and alone for a single message in motion.
-
-    """
+    """Return each fault of each topic in each phase, and for a single message in motion."""
     kinds = [(topic, fault) for topic in MEASURED for fault in _lies(topic)]
     orders = [(WRENCH_COMMAND.name, fault) for fault in _ORDERS]
     return [
@@ -254,7 +225,7 @@ def cells() -> list[Cell]:
 
 
 def _aim(loop: Loop, time: float) -> None:
-    """Set the targets of the motion as their times come."""
+    """Set the targets of the motion at their times."""
     for at, target in zip((_GO, _RETURN), _TARGETS, strict=True):
         if abs(time - at) < 0.5 / _RATE:
             loop.target(target)
@@ -262,7 +233,7 @@ def _aim(loop: Loop, time: float) -> None:
 
 @lru_cache(maxsize=1)
 def _undisturbed() -> tuple[float, ...]:
-    """Return the inserted length at each sample without a fault [m]."""
+    """Return the insertion depth at each sample without a fault [m]."""
     loop, depths = Loop(rate=_RATE), []
     for k in range(round((max(MOMENTS.values()) + _LASTS + _WATCHED + 1.0) * _RATE)):
         _aim(loop, k / _RATE)
@@ -272,20 +243,7 @@ def _undisturbed() -> tuple[float, ...]:
 
 
 def measure(cell: Cell) -> Found:
-    """
-    Let a fault happen.
-
-    Parameters
-    ----------
-    cell : Cell
-        The fault.
-
-    Returns
-    -------
-    Found
-        What became of the motion.
-
-    """
+    """Simulate a motion with a fault."""
     own, loop = _undisturbed(), Loop(rate=_RATE)
     begin = round(MOMENTS[cell.moment] * _RATE)
     end = begin + max(1, round(cell.lasts * _RATE))
@@ -317,7 +275,7 @@ def measure(cell: Cell) -> Found:
 
 
 def _recovery(loop: Loop) -> float:
-    """Clear the stop, if there is one, and go elsewhere; return the time that it takes [s]."""
+    """Clear a stop and move to another target; return the time [s]."""
     if (
         loop.supervisor.safety.stop is not None
         and not loop.supervisor.clear_stop(loop.now).success
@@ -334,29 +292,7 @@ def _recovery(loop: Loop) -> float:
 
 
 def compare(tick: Tick, fault: str = '') -> Answer:
-    """
-    Measure all cells.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    fault : str
-        Measure this one only, without real nodes.
-
-    Returns
-    -------
-    sections : list of Section
-        Tables.
-    bars : list of Bar
-        Bars.
-
-    Raises
-    ------
-    ParameterError
-        If there is no such fault.
-
-    """
+    """Measure all cells, or a single fault without real nodes."""
     chosen = [cell for cell in cells() if fault in ('', cell.fault)]
     if not chosen:
         known = ', '.join(dict.fromkeys(cell.fault for cell in cells()))
@@ -381,7 +317,7 @@ def compare(tick: Tick, fault: str = '') -> Answer:
 
 
 def _section(topic: str, chosen: Sequence[Cell], found: Sequence[Found]) -> Section:
-    """Return the table of a topic: a row for each fault, over all moments."""
+    """Return the table of a topic: one row per fault, over all phases."""
     rows = []
     for fault in dict.fromkeys(cell.fault for cell in chosen if cell.topic == topic):
         own = [

@@ -1,4 +1,4 @@
-"""The node `slicer` for minutes: targets in, shapes out, and either side killed."""
+"""Test the node `slicer` for minutes: targets in, shapes out, and kills of both sides."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import COMMAND
 import numpy as np
 
-#: A needle that bends, at rest.
+#: A flexible needle at rest.
 _PLANT: Final = {
     'model.preset': 'bending_35mm',
     'steered': True,
@@ -26,11 +26,11 @@ _PLANT: Final = {
     'depth': 0.06,
 }
 
-#: The target and how much its x grows from one to the next [mm]: so each is known by its x.
+#: First target, and increment of x, by which each target is identified [mm].
 _TARGET: Final = (0.0, 80.0, 0.0)
 _STEP: Final = 1e-3
 
-#: Rate that is wanted, its least in a window [Hz], and the window [s].
+#: Nominal rate, smallest rate in a window [Hz], and the window [s].
 _RATE: Final = 20.0
 _LEAST_RATE: Final = 19.5
 _WINDOW: Final = 10.0
@@ -38,36 +38,19 @@ _WINDOW: Final = 10.0
 #: Longest time from a peer to the topic [ms].
 _DELAY: Final = 200.0
 
-#: Longest time from a kill to the next shape: the node starts within it [s].
+#: Longest time from a kill to the next shape, including the start of the node [s].
 _AGAIN: Final = 15.0
 
-#: Shapes that must have come before somebody is killed.
+#: Number of received shapes before a kill.
 _SOME: Final = 20
 
 
-#: Duration of the watch [s].
+#: Duration of the measurement [s].
 PLANS: Final = {'default': 600.0, 'quick': 20.0}
 
 
 def compare(tick: Tick, plan: str = 'default') -> Answer:
-    """
-    Let the node work for some minutes, then kill it, then its peer.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    plan : str
-        Duration of the measurements: a key of `PLANS`.
-
-    Returns
-    -------
-    sections : list of Section
-        Rate and gaps of the shapes, way of the targets, memory.
-    bars : list of Bar
-        What must hold for a person who works with it.
-
-    """
+    """Run the node for some minutes, kill it, then kill its peer; `plan` is a key of `PLANS`."""
     with TemporaryDirectory() as name:
         return _watch(Path(name), PLANS[plan], tick)
 
@@ -96,7 +79,7 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
                 graph.spin_until(lambda end=end: time.monotonic() > end, 'a second')  # type: ignore[misc]
             share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
             shapes = [one for one in peer.told('NeedleShapeHeader') if one.arrived > begin]
-            # The last ones may be on their way still. A new peer begins anew.
+            # The last targets may be in transmission. A new peer restarts the numbers.
             sent = [one for one in peer.told(SENT) if begin < one.arrived < now - 1.0]
             delays = _delays(sent, arrived)
 
@@ -118,25 +101,25 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
 
 
 def _again(graph: Graph, peer: Peer, since: float) -> float:
-    """Wait for some shapes; return when the first came [s]."""
+    """Wait for some shapes; return the time of the first [s]."""
 
     def come() -> list[Told]:
         return [one for one in peer.told('NeedleShapeHeader') if one.arrived > since]
 
     def enough() -> bool:
         found = come()
-        # Those from before the kill may still have been in the system's buffers.
+        # Shapes from before the kill may be in the buffers of the system.
         return len(found) > _SOME and found[-1].arrived - found[0].arrived > 1.0
 
     graph.spin_until(enough, 'shapes after a kill', 60.0)
     times = [one.arrived for one in come()]
     gaps = np.diff([since, *times])
-    # The longest gap is that of the kill.
+    # The longest gap is caused by the kill.
     return float(times[int(np.argmax(gaps))] - since)
 
 
 def _delays(sent: list[Told], arrived: list[tuple[float, float]]) -> list[float]:
-    """Return the time from a peer to the topic [s] of each target, or of the next that came."""
+    """Return the delay of each target, or of the next received target, from peer to topic [s]."""
     places, times = np.array(arrived).T
     # Half a step: messages have 24 bits.
     first = np.searchsorted(places, [one.content[0] - 0.5 * _STEP for one in sent])

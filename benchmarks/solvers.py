@@ -1,10 +1,10 @@
 """
-The open-loop run of the paper: our integrator beside the solvers of SciPy, at equal error.
+Open-loop run of the paper: the integrator of this package and SciPy solvers, at equal error.
 
-Every solver is timed for the final state only, with the loosest setting on a fine grid that meets
-the error. The error of the solvers of SciPy is taken at their own steps, so that interpolation
-adds nothing. Ours does not report its steps; its error is taken over runs to each time of a grid,
-each in one call like the run that is timed.
+Each solver is timed for the final state only, with the loosest setting on a fine grid that meets
+the error. The error of the SciPy solvers is evaluated at their own steps, without interpolation.
+The integrator of this package does not report its steps; its error is evaluated over runs to each
+time of a grid, each in one call like the timed run.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
 _TOLERANCE_RATIO: Final = 10.0**-0.125
 _STEP_RATIO: Final = 2.0**-0.0625
 
-#: Interval of the times at which our error is taken [s]; several in a period of each mode.
+#: Sampling interval of our error [s]; several samples in a period of each mode.
 _GRID: Final = 1e-5
 
-#: Absolute over relative tolerance, where it is not proportional to the peak of each state.
+#: Absolute over relative tolerance, if not proportional to the peak of each state.
 _ABSOLUTE: Final = 1e-4
 
 _NODES: Final = 16
@@ -57,7 +57,7 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 
 
 def _compiled(function: _Function) -> _Function:
-    # Not cached on disk: Numba would not notice a change of `two_modes`.
+    # Not cached on disk: Numba does not detect a change of `two_modes`.
     return cast(_Function, numba.njit(error_model='numpy')(function))
 
 
@@ -73,10 +73,10 @@ def _derivative(
     rows: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Write the time derivative of the state into ``out``, without torque."""
+    """Write the time derivative of the state to ``out``, without torque."""
     length, rho, ei, ka, ca, mass, coulomb, viscous = constants
     depth, reach = length - x[0], length * (terms.shape[0] - 1) / TERMS_PER_LENGTH
-    # A trial of a solver may be anywhere, and no number at all.
+    # A trial state of a solver may be outside the range or nan.
     if not depth >= 0.0:
         depth = 0.0
     elif depth > reach:
@@ -111,22 +111,7 @@ def _derivative(
 
 
 def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
-    """
-    Return the equations of motion for SciPy, compiled.
-
-    Parameters
-    ----------
-    model : NeedleModel
-        Needle and tissue.
-    force : float
-        Constant insertion force [N].
-
-    Returns
-    -------
-    callable
-        X_dot as a function of time and state.
-
-    """
+    """Return the compiled equations of motion for a constant insertion force [N]."""
     p = model.parameters
     constants = (
         p.length,
@@ -153,26 +138,11 @@ def user_right_hand_side(
     model: NeedleModel, force: float, *, adaptive: bool = False
 ) -> RightHandSide:
     """
-    Return the equations of motion as a user of NumPy and SciPy would write them.
+    Return the equations of motion as typical user code with NumPy and SciPy.
 
-    G and H are integrated in each call: by default with tabulated Gauss-Legendre nodes, all in
-    one NumPy expression, which is the faster way; or with `scipy.integrate.quad` for each entry,
-    which is what one writes first.
-
-    Parameters
-    ----------
-    model : NeedleModel
-        Needle and tissue; its modes give (11).
-    force : float
-        Constant insertion force [N].
-    adaptive : bool
-        Integrate by `scipy.integrate.quad`.
-
-    Returns
-    -------
-    callable
-        X_dot as a function of time and state.
-
+    G and H are integrated in each call: by default with tabulated Gauss-Legendre nodes, all in one
+    NumPy expression, which is faster; or with `scipy.integrate.quad` for each entry (`adaptive`),
+    which is the straightforward code. The modes of the model give (11).
     """
     p = model.parameters
     rho, ei, ka, ca = (
@@ -243,7 +213,7 @@ class Candidate:
     error : float
         Largest error of the tip deflection over its peak.
     evaluations : int
-        Calls of the right-hand side, or steps of our integrator.
+        Calls of the right-hand side, or steps of the integrator of this package.
     run : callable
         Runs the solver on a right-hand side.
 
@@ -285,22 +255,7 @@ class OpenLoop:
         return np.asarray((values * states[2:4].T).sum(axis=1))
 
     def error(self, time: FloatArray, states: FloatArray) -> float:
-        """
-        Return the largest error of the tip deflection over its peak.
-
-        Parameters
-        ----------
-        time : ndarray, shape (n,)
-            Times [s].
-        states : ndarray, shape (8, n)
-            States at these times.
-
-        Returns
-        -------
-        float
-            Error; infinite if the run does not reach the end.
-
-        """
+        """Return the largest tip error of states (8, n) over the peak; inf if incomplete."""
         if time[-1] < DURATION * (1.0 - 1e-9) or not np.isfinite(states).all():
             return float('inf')
         exact = self._tips(self._solution(np.minimum(time, DURATION)))
@@ -309,24 +264,7 @@ class OpenLoop:
     def solve(
         self, method: str, relative: float, absolute: Any, right_hand_side: RightHandSide
     ) -> Any:
-        """
-        Run a solver of SciPy.
-
-        Parameters
-        ----------
-        method : str
-            One of `METHODS`.
-        relative, absolute
-            Tolerances of `scipy.integrate.solve_ivp`.
-        right_hand_side : callable
-            Equations of motion.
-
-        Returns
-        -------
-        Bunch
-            From `scipy.integrate.solve_ivp`.
-
-        """
+        """Run a SciPy solver of `METHODS` with tolerances for `solve_ivp`."""
         return solve_ivp(
             right_hand_side,
             (0.0, DURATION),
@@ -337,66 +275,21 @@ class OpenLoop:
         )
 
     def integrate(self, step: float, duration: float, *, graded: bool) -> FloatArray:
-        """
-        Run our integrator from the start in one call.
-
-        Parameters
-        ----------
-        step, duration : float
-            Time step and duration [s].
-        graded : bool
-            Whether the steps grow with depth.
-
-        Returns
-        -------
-        ndarray, shape (8,)
-            Final state.
-
-        """
+        """Run our integrator from the start in one call; `graded` steps grow with depth."""
         integrator = Integrator(self.parameters, self.start, step, graded=graded)
         integrator.advance(duration, FORCE)
         return integrator.state
 
     def own_error(self, step: float, *, graded: bool) -> float:
-        """
-        Return the error of our integrator over runs to each time of the grid.
-
-        Parameters
-        ----------
-        step : float
-            Time step [s].
-        graded : bool
-            Whether the steps grow with depth.
-
-        Returns
-        -------
-        float
-            Error as of `error`.
-
-        """
+        """Return the error of our integrator over runs to each time of the grid."""
         count = round(DURATION / _GRID)
         time = np.linspace(0.0, DURATION, count + 1)[1:]
         states = [self.integrate(step, end, graded=graded) for end in time]
         return self.error(time, np.array(states).T)
 
     def steps(self, step: float, *, graded: bool) -> int:
-        """
-        Count the steps of our integrator, by the evaluations of the modes.
-
-        Parameters
-        ----------
-        step : float
-            Time step [s].
-        graded : bool
-            Whether the steps grow with depth.
-
-        Returns
-        -------
-        int
-            Number of steps.
-
-        """
-        # Each step rotates the two modes once; the source of what is compiled can count that.
+        """Count the steps of our integrator, by the evaluations of the modes."""
+        # Each step rotates the two modes once, counted in the source of the compiled function.
         sources = {
             name: cast(Any, getattr(compiled_step, name)).py_func for name in ('advance', '_steps')
         }
@@ -409,25 +302,7 @@ class OpenLoop:
         return call.call_count
 
     def ours(self, *, graded: bool) -> Candidate:
-        """
-        Return our integrator at the longest step that meets the error.
-
-        Parameters
-        ----------
-        graded : bool
-            Whether the steps grow with depth.
-
-        Returns
-        -------
-        Candidate
-            Integrator with that step.
-
-        Raises
-        ------
-        RuntimeError
-            If no step meets the error.
-
-        """
+        """Return our integrator at the longest step that meets the error."""
 
         def run(_unused: RightHandSide) -> None:
             # It has its own equations.
@@ -446,26 +321,13 @@ class OpenLoop:
         raise RuntimeError('the integrator does not reach the accuracy')
 
     def scipy(self, method: str) -> Candidate:
-        """
-        Return a solver of SciPy at the loosest tolerances that meet the error.
-
-        Parameters
-        ----------
-        method : str
-            One of `METHODS`.
-
-        Returns
-        -------
-        Candidate
-            Solver with these tolerances.
-
-        """
+        """Return a SciPy solver of `METHODS` at the loosest tolerances that meet the error."""
         found = []
         for name, weights in (('1e-4 rtol', _ABSOLUTE), ('rtol x peaks', self._peaks)):
             for relative in geometric(0.1, 1e-9, _TOLERANCE_RATIO):
                 run = partial(self.solve, method, relative, relative * weights)
                 with warnings.catch_warnings():
-                    # LSODA warns where it gives up: the error says so too.
+                    # LSODA warns on failure, which is also in the error.
                     warnings.simplefilter('ignore')
                     solution = run(self.right_hand_side)
                     error = self.error(solution.t, solution.y)
@@ -480,22 +342,7 @@ class OpenLoop:
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Compare our integrator with SciPy's solvers on the open-loop run.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections : list of Section
-        Cost of each solver.
-    bars : list of Bar
-        Ratios to the best of SciPy.
-
-    """
+    """Compare our integrator with SciPy solvers on the open-loop run."""
     tick('reference')
     case = OpenLoop()
     ours, uniform = case.ours(graded=True), case.ours(graded=False)

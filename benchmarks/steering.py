@@ -1,4 +1,4 @@
-"""Controllers that steer the tip to a target, all on the same needles."""
+"""Controllers that steer the tip to a target, compared on the same needles."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from scipy.optimize import lsq_linear
 #: [m].
 STEP, LIMIT, DEPTHS, ASIDE = 5e-3, 6e-3, (12, 24), 6e-3
 
-#: Free length [m], and stiffness of the skin over that of the tissue [m].
+#: Free length [m], and stiffness of the skin over the stiffness of the tissue [m].
 FREE, SKIN = 0.04, 0.02
 
-#: Bending length of each medium [m]; of layers the depths at which they begin, and their lengths.
+#: Bending length of each medium [m]; for layers, their depths and bending lengths.
 MEDIA: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     'lambda 25 mm': ((0.0, 0.025),),
     'lambda 35 mm': ((0.0, 0.035),),
@@ -47,47 +47,47 @@ MEDIA: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
 #: Repeated insertions then differ by 0.3 mm along each axis at 100 mm.
 PATH_NOISE: Final = 1e-4
 
-#: What nobody knows of the needles: they drift by some 6 mm if nobody steers them.
+#: Unknown parameters of the needles: drift of about 6 mm without steering.
 TRUE: Final = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1, path_noise=PATH_NOISE)
 
-#: Deviation of a reading of the tip [m], readings while the needle rests, and part that is lost.
+#: Standard deviation of a tip reading [m], readings during a rest, and lost fraction.
 SENSORS: Final = {'EM': (1.8e-4, 20, 0.0), 'ultrasound': (3e-4, 12, 0.05)}
 
-#: Sensor, and part by which needles differ from what is believed.
+#: Sensor, and relative deviation of needles from their nominal parameters.
 CASES: Final = (('EM', 0.3), ('EM', 0.5), ('ultrasound', 0.3))
 
 CONTROLLERS: Final = ('ours', 'plan for the mean', 'springs', 'Broyden', 'open loop')
 
-#: Load of a bevel that is turned [N], error of its direction [rad], how often it may be turned,
-#: and part of its reach within which targets count.
+#: Load of a rotated bevel [N], error of its direction [rad], largest number of rotations, and
+#: largest distance of a target from the drifted tip, as a fraction of the reachable distance.
 BEVEL, MOUNTED, TURNS, WITHIN = 0.8, 0.1, 6, 0.9
 
 #: Controllers of a needle with a bevel.
 TURNING: Final = ('guide and roll', 'roll', 'roll towards the target', 'open loop')
 
-#: Squared distance within which 95 of 100 draws of two normal numbers are.
+#: 95 % quantile of chi-square with two degrees of freedom.
 _ELLIPSE: Final = 5.991
 
-#: A target that is missed by more [m] must not have been missed without a word.
+#: Largest distance from the target without a warning [m].
 _MISSED: Final = 2e-3
 
 
 class End(NamedTuple):
     """
-    How an insertion under a controller ended.
+    End of an insertion under a controller.
 
     Attributes
     ----------
     miss : float
         Distance of the tip from the target [m].
     way : float
-        Way of the guide [m].
+        Travel of the guide [m].
     turns : int
-        How often the needle was turned.
+        Number of rotations of the needle.
     load : float
         Largest lateral force on the guide [N].
     time : float
-        Median time of a step of the controller [s].
+        Median time of a controller step [s].
 
     """
 
@@ -100,21 +100,21 @@ class End(NamedTuple):
 
 class Outcome(NamedTuple):
     """
-    What became of a needle.
+    Results of a needle.
 
     Attributes
     ----------
     medium : str
         Medium.
     reachable : bool
-        Whether the target could have been reached, if all but the path had been known.
+        Whether the target was reachable with all parameters known except the path.
     ends : dict
-        How the insertion ended, by controller.
+        End of the insertion by controller.
     refused, warned, held : bool
-        Whether ours refused the target, said on the way that it is out of reach, and whether its
-        interval held the tip.
+        Whether our controller rejected the target, reported it as out of reach later, and whether
+        its interval contained the tip.
     look : float
-        Time of a look of ours alone [s].
+        Time of a tip measurement update of our controller [s].
 
     """
 
@@ -129,22 +129,7 @@ class Outcome(NamedTuple):
 
 @lru_cache
 def believed(medium: str, bevel: float = 0.0) -> tuple[NeedleParameters, SteeringParameters]:
-    """
-    Return needle and tissue as they are believed.
-
-    Parameters
-    ----------
-    medium : str
-        One of `MEDIA`.
-    bevel : float
-        Load of the bevel [N].
-
-    Returns
-    -------
-    NeedleParameters, SteeringParameters
-        Constants.
-
-    """
+    """Return the nominal parameters in a medium, with the load of a bevel [N]."""
     needle = NEEDLES['phantom']
     (_, first), *others = MEDIA[medium]
     ei = needle.bending_stiffness
@@ -169,10 +154,10 @@ def _model(
 
 
 class MeanPlan(SteeringController):
-    """Ours, but for the plan: a quadratic program for the mean of what may be true."""
+    """Our controller with a different plan: a quadratic program for the mean of the hypotheses."""
 
     def _choose(self) -> complex:
-        # Where a guide ends that may go anywhere is where the tip ends without it.
+        # The final position of an unconstrained guide is the final tip position without guide.
         (means, _, w), limit = self.reach, self._now.limit
         shifts = self._model.guide[:, -1, self.step :]
         rows = np.sqrt(w)[:, np.newaxis] * shifts
@@ -196,12 +181,12 @@ class _Trial:
         self.said = ''
 
     def known(self) -> SteeringModel:
-        """Return what is true of it, but for its path."""
+        """Return the true parameters except the path."""
         truth, known = self.truth, SteeringBelief(spread=0.0)
         return SteeringModel(truth.needle, truth.steering, self.depths, known)
 
     def end(self, controller: SteeringController | OpenLoop) -> tuple[FloatArray, End]:
-        """Return where the tip ends, and how."""
+        """Return the final tip position and the end of the insertion."""
         times, said = list[float](), list[str]()
 
         def follow(tip: FloatArray | None) -> Guidance:
@@ -216,7 +201,7 @@ class _Trial:
         try:
             done = trial.insert(self.truth, self.depths, look, follow)
         except SteeringFaultError as error:
-            # It has stopped short of the target.
+            # The insertion stopped before the target depth.
             self.said = str(error)
             return np.full(2, inf), End(inf, 0.0, 0, 0.0, inf)
         self.look, self.said = times[-1], next(filter(None, said), '')
@@ -249,20 +234,8 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
     """
     Insert one needle under each controller that moves the guide.
 
-    Parameters
-    ----------
-    sensor : str
-        One of `SENSORS`.
-    spread : float
-        Part by which the needle differs from what is believed.
-    seed : int
-        Seed of the needle, its target and all noise.
-
-    Returns
-    -------
-    Outcome
-        What became of it.
-
+    `spread` is the relative deviation of the needle from its nominal parameters; the seed defines
+    the needle, its target and all noise.
     """
     medium, one = _drawn(spread, sensor, seed)
     (needle, steering), truth = believed(medium), one.truth
@@ -297,25 +270,12 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
 
 
 def turn(seed: int) -> Outcome:
-    """
-    Insert one needle with a bevel under each controller that turns it, and some that do not.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the needle, its target and all noise.
-
-    Returns
-    -------
-    Outcome
-        What became of it.
-
-    """
+    """Insert one needle with a bevel under controllers with and without rotation."""
     sensor, spread = CASES[0]
     medium, one = _drawn(spread, sensor, seed, BEVEL)
     truth, depths = one.truth, one.depths
     alone = one.known()
-    # What the bevel can do if it always pushes to one side.
+    # Reachable set of the bevel with a load to one side.
     could = float(np.hypot(*truth.bevel)) * np.abs(alone.bevel[0, -1]).sum()
     one.target *= could / ASIDE
     causes = np.array([np.zeros(2), truth.frame, truth.tilt])
@@ -337,7 +297,7 @@ def turn(seed: int) -> Outcome:
 
 
 def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
-    """Return what takes the mean of the readings of a sensor; None if all are lost."""
+    """Return a function for the mean of sensor readings; None if all are lost."""
     rng = np.random.default_rng([seed, 1])
     sigma, count, lost = SENSORS[sensor]
 
@@ -350,22 +310,7 @@ def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:
-    """
-    Steer many needles under each controller.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    needles : int
-        Needles of each case, evenly of all media.
-
-    Returns
-    -------
-    sections, bars
-        A page.
-
-    """
+    """Steer a number of needles per case, evenly over all media, under each controller."""
     rows: list[tuple[str, ...]] = []
     bars: list[Bar] = []
     limits = {
@@ -395,7 +340,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             bars.append(Bar(f'coverage, {case}', held, 0.97))
             taken = [one for one in found if not one.refused]
             silent = sum(one.ends['ours'].miss > _MISSED and not one.warned for one in taken)
-            bars.append(Bar(f'missed by more than 2 mm without a word, {case}', silent, 0.0))
+            bars.append(Bar(f'missed by more than 2 mm without a warning, {case}', silent, 0.0))
             step, look = _times(counted, 'ours')
             others.append(
                 (
@@ -409,7 +354,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                 )
             )
             bars.append(Bar(f'a step, {case}', step, 2.0, 'ms'))
-            bars.append(Bar(f'a look, {case}', look, 0.2, 'ms'))
+            bars.append(Bar(f'a tip update, {case}', look, 0.2, 'ms'))
         tick('roll')
         turned = list(pool.map(turn, range(needles)))
     every = [one for one in turned if one.reachable and not one.refused]
@@ -433,15 +378,15 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             f'{needles} needles of each case, evenly of four media, seeds 0 to {needles - 1}; '
             f'targets within {1e3 * ASIDE:g} mm of the axis, {1e3 * STEP * DEPTHS[0]:g} to '
             f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within {1e3 * LIMIT:g} mm, steps of '
-            f'{1e3 * STEP:g} mm. Counted are targets that the guide can reach if all but the path '
-            'is known, and that ours did not refuse. Way, turns and load are means, the load of '
-            'the largest in each insertion.',
+            f'{1e3 * STEP:g} mm. Statistics: targets that are reachable with all '
+            'parameters known except the path, and that ours did not reject. Way, turns and load '
+            'are means, of the load the mean of the largest value of each insertion.',
         ),
         Section(
             'Ours',
             (
                 'case', 'within reach', 'refused', 'refused within reach', 'warned',
-                'intervals that hold the tip', 'a look',
+                'intervals that contain the tip', 'a tip update',
             ),
             others,
         ),
@@ -451,15 +396,15 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             [(name, *_figures(every, name)) for name in TURNING],
             f'Needles as in the first case, whose bevel pushes with {BEVEL:g} N +-30 %, in a '
             f'direction that is known to {MOUNTED:g} rad. Ours turns it {TURNS} times at most. '
-            'Targets are within what the bevel can do if it always pushes to one side; counted '
-            f'are the {len(every)} of which what drifts leaves {100.0 * WITHIN:g} %, and that '
-            'none of ours refused.',
+            'Targets are in the reachable set of a bevel with a load to one side. Statistics: the '
+            f'{len(every)} targets within {100.0 * WITHIN:g} % of it, relative to the drifted '
+            'tip, that none of ours rejected.',
         ),
     ], bars  # fmt: skip
 
 
 def _statistic(values: FloatArray, what: str) -> float:
-    """Return a figure of distances."""
+    """Return a metric of distances."""
     if what == 'mean':
         return float(values.mean())
     return float(np.quantile(values, 0.95 if what == '95 %' else 0.5))
@@ -470,7 +415,7 @@ def _misses(of: Sequence[Outcome], name: str) -> FloatArray:
 
 
 def _times(of: Sequence[Outcome], name: str) -> tuple[float, float]:
-    """Return the median times of a step and of a look [ms]."""
+    """Return the median times of a step and of a tip measurement update [ms]."""
     step = float(np.median([1e3 * one.ends[name].time for one in of]))
     return step, float(np.median([1e3 * one.look for one in of]))
 
@@ -492,12 +437,12 @@ def _figures(of: Sequence[Outcome], name: str) -> tuple[str, ...]:
 
 
 def _best(of: Sequence[Outcome], medium: str) -> list[Bar]:
-    """Return the bars of ours beside the best of the others."""
+    """Return the bars of our controller against the best of the others."""
     bars = []
     for what in ('mean', '95 %'):
         found = {name: _statistic(_misses(of, name), what) for name in CONTROLLERS}
         ours = found.pop('ours')
-        # It is ours, too.
+        # It is also part of our controller.
         del found['plan for the mean']
         bars.append(
             Bar(f'{what} over the best baseline, {medium}', ours / min(found.values()), 1.0)

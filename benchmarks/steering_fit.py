@@ -1,4 +1,4 @@
-"""Steered insertions that are simulated, and how well their constants are found."""
+"""Identification of simulated steered insertions: errors and coverage of the constants."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from needle_identification import identify_steering, SteeringRecording, Steering
 from needle_ros.process_pool import processes
 import numpy as np
 
-#: The paper's needle; its bending stiffness [N m^2].
+#: Needle of the paper, and its bending stiffness [N m^2].
 NEEDLE: Final = NeedleParameters.preset('phantom')
 EI: Final = NEEDLE.bending_stiffness
 
@@ -33,22 +33,22 @@ _LIMIT: Final = 6e-3
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
     """
-    What an insertion is of.
+    True parameters of an insertion.
 
     Attributes
     ----------
     length, free, skin : float
-        Bending length, free length, and stiffness of the skin over that of the tissue [m].
+        Bending length, free length, and ratio of skin stiffness to tissue stiffness [m].
     tilt : tuple of float
         Tilt of the guide in x and z.
     curvature : float
-        Curvature with which the bevel turns a long needle [1/m].
+        Curvature of a long needle by its bevel [1/m].
     noise : float
         Noise of the tracker, per axis [m].
     path_noise : float
         Noise of the path [rad^2/m].
     guide_first : bool
-        Whether the guide moves before the needle does.
+        Whether the guide moves before the needle.
     medium : str
         Name of the medium.
 
@@ -69,22 +69,9 @@ def insertion(
     seed: int, truth: Truth | None = None, roll: Callable[[float], float] | None = None
 ) -> SteeringRecording:
     """
-    Insert to 100 mm in steps of 5 mm with a guide that wanders within 6 mm; measure the tip.
+    Insert to 100 mm in steps of 5 mm with random guide motion within 6 mm; measure the tip.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of guide, offset and noise.
-    truth : Truth, optional
-        What it is of.
-    roll : callable, optional
-        Roll of the base [rad] by depth [m].
-
-    Returns
-    -------
-    SteeringRecording
-        The insertion.
-
+    `roll` is the roll of the base [rad] by depth [m].
     """
     truth = truth or Truth()
     rng = np.random.default_rng(seed)
@@ -124,7 +111,7 @@ def insertion(
     )
 
 
-#: What is fitted: its name, what it is of, and how many insertions together.
+#: Cases: name, true parameters, and number of insertions per fit.
 _CASES: Final = (
     ('one insertion', Truth(), 1),
     ('one insertion, no skin', Truth(skin=0.0), 1),
@@ -146,22 +133,7 @@ def _one(case: int, seed: int) -> tuple[float, float, float, float]:
 
 
 def compare(tick: Tick, recordings: int = 1000) -> Answer:
-    """
-    Fit many simulated insertions, and count how often the intervals hold the truth.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    recordings : int
-        Fits of each kind; a tenth where a fit is of ten insertions.
-
-    Returns
-    -------
-    sections, bars
-        A page.
-
-    """
+    """Fit simulated insertions, and count intervals that contain the true value."""
     rows, bars = [], []
     with processes(os.cpu_count() or 1) as pool:
         for k, (name, truth, count) in enumerate(_CASES):
@@ -183,7 +155,7 @@ def compare(tick: Tick, recordings: int = 1000) -> Answer:
                     f'{1e3 * rms.mean():.3f} mm',
                 )
             )
-            # A hundred fits tell a coverage to 2 %.
+            # The coverage from a hundred fits has an error of 2 %.
             slack = 0.0 if count == 1 else 0.03
             bars.append(Bar(f'coverage, {name}', coverage, COVERAGE[0] - slack, '', at_least=True))
             bars.append(Bar(f'coverage, {name}', coverage, COVERAGE[1] + slack))

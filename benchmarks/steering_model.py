@@ -1,4 +1,4 @@
-"""The steered needle beside the same model as a user would write it with NumPy and SciPy."""
+"""Cost of the steered needle, compared with the same model in NumPy and SciPy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from needle_dynamics import (
 import numpy as np
 from scipy.linalg import solveh_banded
 
-#: Depth [m] and steps of the insertion that is measured, and insertions of a batch.
+#: Depth [m] and steps of the measured insertion, and insertions of a batch.
 _DEPTH, _STEPS = 0.1, 100
 _BATCH: Final = 20_000
 
@@ -28,9 +28,10 @@ _ROUNDS: Final = 7
 
 class HermiteNeedle:
     """
-    A beam of cubic Hermite elements that cuts its path, in one plane.
+    Beam of cubic Hermite elements along its cut path, in one plane.
 
-    The path is straight between the nodes, and its end at the tip is solved for with the beam.
+    The path is straight between the nodes, and its end at the tip is solved together with the
+    beam.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ class HermiteNeedle:
     step : float
         Length of the elements [m].
     entry : float
-        Where the skin is pierced [m].
+        Position of the skin [m].
 
     """
 
@@ -58,20 +59,9 @@ class HermiteNeedle:
 
     def advance(self, position: float, tilt: float, load: float) -> FloatArray:
         """
-        Cut on by one element.
+        Extend the path by one element, for the guide position [m] and tilt and the tip load [N].
 
-        Parameters
-        ----------
-        position, tilt : float
-            Position [m] and tilt of the guide.
-        load : float
-            Lateral load on the tip [N].
-
-        Returns
-        -------
-        ndarray, shape (nodes, 2)
-            Deflections [m] and slopes, from the guide to the tip.
-
+        Returns deflections [m] and slopes from the guide to the tip, (nodes, 2).
         """
         middle = self._depth + 0.5 * self._step
         self._lengths = np.append(self._lengths, self._step)
@@ -80,7 +70,7 @@ class HermiteNeedle:
         h, k = self._lengths, self._tissue
         count = len(h)
         size = 2 * (count + 1)
-        # Stiffness and foundation of each element, with entries (w, w') of both its nodes.
+        # Stiffness and foundation of each element, with entries (w, w') of both nodes.
         one = np.ones(count)
         units = np.array([one, h, one, h]).T
         bending = np.array([[12, 6, -12, 6], [6, 4, -6, 2], [-12, -6, 12, -6], [6, 2, -6, 4]])
@@ -97,7 +87,7 @@ class HermiteNeedle:
             for j in range(i + 1):
                 np.add.at(band[i - j], 2 * np.arange(count) + j, matrices[:, i, j])
         band[0, 2] += self._skin
-        # Loads of a path that is straight in each element, for its values at both ends.
+        # Loads of a path that is linear in each element, by its values at both ends.
         shares = (k * h / 60.0)[:, np.newaxis] * units
         left = shares * np.array([21, 3, 9, -2])
         right = shares * np.array([9, 2, 21, -3])
@@ -126,20 +116,7 @@ class HermiteNeedle:
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Measure an insertion, a solution and a batch.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections, bars
-        A page.
-
-    """
+    """Measure an insertion, a solution and a batch."""
     needle, steering, _ = STEERING_PRESETS['bending_35mm']
     steering = replace(steering, bevel_load=(0.1,))
     step = _DEPTH / _STEPS
@@ -149,7 +126,7 @@ def compare(tick: Tick) -> Answer:
         return insert_batch(needle, steering, depths[np.newaxis], workers=1)
 
     def theirs() -> float:
-        # Both planes, as ours.
+        # Both planes, as in our model.
         for _ in range(2):
             other = HermiteNeedle(needle, steering.free_length, 0.0, step)
             for _ in range(_STEPS):

@@ -1,11 +1,10 @@
 """
-Cost of a step, and a bound on it from its arithmetic.
+Cost of an integration step, and a lower bound from its arithmetic.
 
 The source of the compiled kernel is run on numbers that count their operations. Each kind of
-operation is then timed in a loop of its own, with the dependencies that it has in the step: the
-series of the modes side by side, other sums and products in eight independent chains, and slow
-operations (division, root, sine and cosine, exponentials) in two chains, since there are two
-modes.
+operation is then timed in a separate loop, with the dependencies of the step: the series of the
+modes in parallel, other sums and products in eight independent chains, and slow operations
+(division, root, sine and cosine, exponentials) in two chains, one per mode.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ from needle_dynamics.compiled.step import advance, Sums
 import numba
 import numpy as np
 
-#: Depth [m], deflection [m], force [N] and step [s] of the measured steps: the open-loop run,
-#: nearly all of it, as the modes need the more terms the deeper the needle is.
+#: Depth [m], deflection [m], force [N] and step [s] of the measured steps: nearly the complete
+#: open-loop run, since the number of terms of the modes increases with depth.
 _DEPTH, _DEFLECTION, _FORCE, _STEP = 0.02, 5e-4, 3.0, 1e-5
 _STEPS: Final = 2800
 
-#: Kernel function whose sums and products are series side by side.
+#: Kernel function whose sums and products are parallel series.
 SERIES: Final = 'two_modes'
 
 _FUNCTIONS: Final = {
@@ -51,26 +50,25 @@ def _compiled(function: _Function) -> _Function:
 
 
 class _Tally:
-    """Counts operations, those within one function separately."""
+    """Counts of operations, separately within one function."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._place = ''
 
     def add(self, operation: str) -> None:
-        """Count one operation."""
         self.counts[self._place + operation] += 1
 
     @contextmanager
     def within(self, place: str) -> Iterator[None]:
-        """Count under another name."""
+        """Count under a different name."""
         before, self._place = self._place, place
         yield
         self._place = before
 
 
 class _Counted(float):
-    """A number that counts the operations on it."""
+    """Number that counts its operations."""
 
     tally: _Tally
 
@@ -111,20 +109,10 @@ class _Counted(float):
 
 def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]) -> Counter[str]:
     """
-    Count the floating-point operations of a call of a compiled function.
+    Count the floating-point operations of a call of a compiled function, by kind.
 
-    Parameters
-    ----------
-    function : callable
-        Compiled by Numba; calls of compiled functions are followed.
-    arguments : tuple
-        Numbers, arrays, tuples of numbers; arrays are copied.
-
-    Returns
-    -------
-    Counter
-        Number of operations by kind; names of those in a function `SERIES` begin with 'series '.
-
+    Calls of compiled functions are followed. Operations in a function of `SERIES` have names with
+    the prefix 'series '.
     """
     tally = _Tally()
     number = type('Number', (_Counted,), {'tally': tally})
@@ -134,7 +122,7 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
         result: _Counted = number(getattr(math, name)(value))
         return result
 
-    # Scratch arrays hold these numbers too.
+    # Scratch arrays also contain counted numbers.
     scratch = SimpleNamespace(
         empty=partial(np.empty, dtype=object), zeros=partial(np.zeros, dtype=object)
     )
@@ -142,7 +130,7 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
     made: dict[Any, Callable[..., object]] = {}
 
     def plain(function: Any) -> Callable[..., object]:
-        """Return the Python source of a compiled function, in which operations are counted."""
+        """Return the Python source of a compiled function with counted operations."""
         if function in made:
             return made[function]
         source = function.py_func
@@ -182,20 +170,7 @@ def _start() -> tuple[NeedleParameters, FloatArray]:
 
 
 def operations_of_a_step(steps: int = _STEPS) -> dict[str, float]:
-    """
-    Count the operations of a step of `Integrator` for a sliding needle with two modes.
-
-    Parameters
-    ----------
-    steps : int
-        Number of steps to average over, from the second step.
-
-    Returns
-    -------
-    dict[str, float]
-        Mean number of operations by kind.
-
-    """
+    """Return the mean operations per `Integrator` step (sliding needle, two modes) by kind."""
     counts: list[Counter[str]] = []
 
     def count(*arguments: Any) -> tuple[float, Sums]:
@@ -205,7 +180,7 @@ def operations_of_a_step(steps: int = _STEPS) -> dict[str, float]:
     with mock.patch('needle_dynamics.simulated.integrator.advance', count):
         for taken in (1, steps + 1):
             Integrator(*_start(), _STEP).advance(taken * _STEP, _FORCE)
-    # What is done once a call, and the step from rest, drop out.
+    # The difference cancels operations per call, and the step from rest.
     first, all_of_them = counts
     all_of_them.subtract(first)
     return {name: number / steps for name, number in all_of_them.items() if number}
@@ -226,22 +201,7 @@ def _columns_loop(columns: int) -> Callable[[FloatArray, FloatArray, float, int]
 
 @_compiled
 def chains(a: float, b: float, repeats: int) -> float:
-    """
-    Add and multiply in eight independent chains.
-
-    Parameters
-    ----------
-    a, b : float
-        Factor and summand.
-    repeats : int
-        Number of operations in each chain.
-
-    Returns
-    -------
-    float
-        Sum of the chains.
-
-    """
+    """Run eight independent chains of multiply-add; return the sum of the chains."""
     x0, x1, x2, x3, x4, x5, x6, x7 = a, 2.0 * a, 3.0 * a, 4.0 * a, 5.0 * a, 6.0 * a, 7.0 * a, b
     for _ in range(repeats):
         x0 = x0 * a + b
@@ -309,7 +269,7 @@ def _logarithms(a: float, b: float, repeats: int) -> float:
     return x + y
 
 
-#: Loop of each kind, and operations of that kind in a round of it.
+#: Loop of each kind, and its operations of this kind per round.
 _LOOPS: Final[dict[str, tuple[Callable[[float, float, int], float], int]]] = {
     'multiply-add': (chains, 8),
     'division': (_divisions, 2),
@@ -322,20 +282,7 @@ _LOOPS: Final[dict[str, tuple[Callable[[float, float, int], float], int]]] = {
 
 
 def grouped(counts: Mapping[str, float]) -> dict[str, float]:
-    """
-    Group operations as they are timed: products with sums, and sines with cosines.
-
-    Parameters
-    ----------
-    counts : Mapping[str, float]
-        From `count_operations` or `operations_of_a_step`.
-
-    Returns
-    -------
-    dict[str, float]
-        Number by kind; kinds that do not occur are left out.
-
-    """
+    """Group operations by timed kind: products with sums, and sines with cosines."""
 
     def number(*names: str) -> float:
         return max(counts.get(name, 0.0) for name in names)
@@ -354,22 +301,7 @@ def grouped(counts: Mapping[str, float]) -> dict[str, float]:
 
 
 def compare(tick: Tick) -> Answer:
-    """
-    Measure a step of `Integrator` and derive the bound from its operations.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-
-    Returns
-    -------
-    sections : list of Section
-        Number and cost of the operations.
-    bars : list of Bar
-        Cost of a step, and its ratio to the bound.
-
-    """
+    """Measure a step of `Integrator` and the bound from its operations."""
     tick('operations of a step')
     counts = operations_of_a_step()
     groups = grouped(counts)

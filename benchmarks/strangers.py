@@ -1,4 +1,4 @@
-"""Nodes that nobody asked for, and nodes that are killed, beside a real plant and controller."""
+"""Effect of unexpected publishers and killed nodes on a real plant and controller."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from sensor_msgs.msg import JointState
 
-#: Comes, pushes for 6 to 48 ms, or for 80 ms from its first breath, and goes, again and again.
+#: Publishes force commands repeatedly: for 6 to 48 ms, or for the first 80 ms after its start.
 PUSHER: Final = """
 import sys, time
 from geometry_msgs.msg import WrenchStamped
@@ -45,8 +45,8 @@ for k in range(tries):
 print(found)
 """
 
-#: Says for a time, once somebody listens, or until told to end, that the needle is elsewhere,
-#: with stamps that are ahead or not.
+#: Publishes false needle positions for a time after the first subscription, or until terminated,
+#: with current or future stamps.
 LIAR: Final = """
 import signal, sys, time
 import rclpy
@@ -71,8 +71,7 @@ while time.monotonic() < end and not (told and found):
 print(found)
 """
 
-#: Asks for targets that no needle can reach, as fast as it can, for 2 s once somebody
-#: listens.
+#: Publishes unreachable targets at the highest rate, for 2 s after the first subscription.
 ASKER: Final = """
 import time
 from geometry_msgs.msg import PointStamped
@@ -91,25 +90,20 @@ while time.monotonic() < end:
 print(found)
 """
 
-#: Where the needle rests before a stranger comes, where it goes afterwards, and how near is there.
+#: Depth before a disturbance, target depth after it, and its tolerance [m].
 START, NEXT, NEAR = 0.04, 0.045, 2e-4
 
 
 class Bystander:
     """
-    Watches a plant and a controller, each a process, and sets targets.
-
-    Parameters
-    ----------
-    graph : Graph
-        Graph to start them in.
+    Observes a plant and a controller, each a process, and sets targets.
 
     Attributes
     ----------
     plant, controller : NodeProcess
         The processes.
     depths : list of float
-        True inserted lengths since the last stranger came [m].
+        True insertion depths since the start of the last disturbance [m].
 
     """
 
@@ -127,29 +121,11 @@ class Bystander:
         self.depths.append(0.2 - message.position[0])
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
-        """
-        Spin until a condition holds.
-
-        Parameters
-        ----------
-        condition : callable
-            The condition.
-        what : str
-            What is waited for.
-
-        """
+        """Spin until a condition holds."""
         self._graph.spin_until(condition, what, timeout=180.0)
 
     def goes_to(self, depth: float) -> None:
-        """
-        Ask for a depth until the needle rests there.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length [m].
-
-        """
+        """Send a target depth [m] until the needle rests there."""
         target = PointStamped()
         target.point.y = depth
 
@@ -162,22 +138,9 @@ class Bystander:
 
     def endures(self, script: str, *arguments: object, word: str = '') -> tuple[int, float]:
         """
-        Let a stranger in.
+        Run the program of an unexpected node; terminate it after a word on diagnostics, if given.
 
-        Parameters
-        ----------
-        script : str
-            Program of the stranger.
-        *arguments : object
-            Its arguments.
-        word : str
-            Part of a message of diagnostics after which it is told to end.
-
-        Returns
-        -------
-        int, float
-            How often it was connected, and how far the needle moved [m].
-
+        Returns the number of connections, and the motion of the needle [m].
         """
         self.depths.clear()
         stranger = subprocess.Popen(
@@ -191,65 +154,35 @@ class Bystander:
                 lambda: self.was_told(word) or stranger.poll() is not None, f'the word {word!r}'
             )
             stranger.terminate()
-        self.until(lambda: stranger.poll() is not None, 'the end of the stranger')
+        self.until(lambda: stranger.poll() is not None, 'the end of the other node')
         said, _ = stranger.communicate()
         return int(said), self.moved
 
     @property
     def moved(self) -> float:
-        """How far the needle moved since the last stranger came [m]."""
+        """Motion of the needle since the start of the last disturbance [m]."""
         return max(self.depths) - min(self.depths)
 
     def was_told(self, what: str) -> bool:
-        """
-        Return whether diagnostics have said something.
-
-        Parameters
-        ----------
-        what : str
-            Part of a message.
-
-        Returns
-        -------
-        bool
-            Whether they have.
-
-        """
+        """Return whether diagnostics contained a text."""
         return any(what in status.message for one in self._health for status in one.status)
 
     @property
     def complaints(self) -> str:
-        """What each node has said last."""
+        """Last message of each node."""
         last = {status.name: status.message for one in self._health for status in one.status}
-        return '; '.join(f'{name} says {message!r}' for name, message in last.items())
+        return '; '.join(f'{name}: {message!r}' for name, message in last.items())
 
     @property
     def stops(self) -> set[str]:
-        """How many stops the controllers have latched, as they said."""
+        """Number of latched stops reported by the controllers."""
         statuses = (status for one in self._health for status in one.status)
         values = ({one.key: one.value for one in status.values} for status in statuses)
         return {one['stops latched'] for one in values if 'stops latched' in one}
 
 
 def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Bar]]:
-    """
-    Let strangers in, and kill nodes.
-
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    tries : int
-        How often each stranger comes.
-
-    Returns
-    -------
-    rows : list of tuple of str
-        Rows of a table.
-    bars : list of Bar
-        Bars.
-
-    """
+    """Run unexpected nodes and kill nodes, several times each; return table rows and bars."""
     rows: list[tuple[str, ...]] = []
     bars: list[Bar] = []
     for what, bar, count, act in _trials(tries):
@@ -270,12 +203,12 @@ def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Ba
     return rows, bars
 
 
-#: A trial: what comes, how far the needle may move [mm], how often it comes, and what lets it.
+#: A trial: disturbance, largest motion of the needle [mm], repeats, and its function.
 _Trial = tuple[str, float, int, Callable[[Graph, Bystander], float]]
 
 
 def _trials(tries: int) -> list[_Trial]:
-    """Return the trials. A killed controller leaves the motion where it was."""
+    """Return the trials. A killed controller leaves the motion unfinished."""
     pushers = [
         (
             f'{force:g} N from a second commander, {words}',
@@ -308,7 +241,7 @@ def _visit(script: str, *arguments: object) -> Callable[[Graph, Bystander], floa
 
 
 def _killed(name: str, how: signal.Signals) -> Callable[[Graph, Bystander], float]:
-    """Return what ends a node in motion and starts another one."""
+    """Return a function that kills a node in motion and starts a new one."""
 
     def act(graph: Graph, bystander: Bystander) -> float:
         target = PointStamped()

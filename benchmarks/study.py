@@ -1,8 +1,8 @@
 """
-Studies of populations: insertions per second, memory, and the same tables whoever computes.
+Studies of populations: insertions per second, memory, and identical tables for all workers.
 
-The study is that of `examples/studies`. Workers of every kind are started, and have loaded or
-compiled what they need, before a rate is measured; then they take turns.
+The study is the example of `examples/studies`. Workers of each kind are started, and have loaded
+or compiled their code, before a rate is measured; then they take turns.
 """
 
 from __future__ import annotations
@@ -35,53 +35,53 @@ import numpy as np
 import psutil
 import yaml
 
-#: The study that is computed.
+#: Study of the benchmark.
 STUDY: Final = Path(__file__).parents[1] / 'examples/studies/steering.yaml'
 
-#: What makes it one of needles whose guide rests: 100 mm by steps of 1 mm.
+#: Changes for needles with a fixed guide: 100 mm in steps of 1 mm.
 _OPEN: Final = {'controller': 'open loop', 'depth': 0.1, 'step': 1e-3}
 
-#: Samples that a worker computes before it counts.
+#: Warm-up samples of a worker.
 _FIRST: Final = 16
 
-#: Insertions in open loop whose time is a bar.
+#: Number of open-loop insertions for the bar on time.
 _MILLION: Final = 1_000_000
 
-#: Insertions of a chunk whose cost to the parent is measured: a worker takes a second for them.
+#: Insertions per chunk for the cost to the parent: a worker takes a second for them.
 _CHUNK: Final = 200
 
 #: Workers of ten machines with 32 cores each.
 _WORKERS: Final = 320
 
-#: What docs/howto/study.md tells to set for workers. Otherwise each insertion gives its memory
-#: back and takes it anew, and a profiler looks at the worker a hundred times per second.
+#: Settings for workers in docs/howto/study.md. Otherwise each insertion releases and reallocates
+#: its memory, and a profiler samples the worker a hundred times per second.
 _SETTINGS: Final = {
     'distributed.nanny.pre-spawn-environ.MALLOC_TOP_PAD_': '16777216',
     'distributed.worker.profile.enabled': False,
 }
 
-#: Makes what computes, as `engine.compute` takes it.
+#: Factory of executors for `engine.compute`.
 _Factory: TypeAlias = Callable[[], AbstractContextManager[Executor]]
 
 
 class Plan(NamedTuple):
     """
-    How much is computed.
+    Size of the benchmark.
 
     Attributes
     ----------
     closed : int
-        Insertions under our controller in the studies whose tables are compared.
+        Insertions under our controller in the studies with compared tables.
     timed : int
-        Those in the studies that are timed.
+        Insertions in the timed studies.
     rounds : int
-        How often each is timed.
+        Number of timings of each study.
     open : tuple of int
-        Insertions in open loop in each study whose memory is watched.
+        Open-loop insertions in each study with a memory measurement.
     kills : int
-        How often a study is killed.
+        Number of kills of a study.
     chunks : int
-        Chunks whose cost to the parent is measured.
+        Number of chunks for the cost to the parent.
 
     """
 
@@ -106,9 +106,9 @@ class Watched(NamedTuple):
     Attributes
     ----------
     taken : float
-        Time from start to end [s].
+        Duration [s].
     parent, worker : float
-        Peak of the memory of the command, and of that of its workers the larger [MB].
+        Peak memory of the command, and the largest peak memory of its workers [MB].
 
     """
 
@@ -119,20 +119,9 @@ class Watched(NamedTuple):
 
 def compare(tick: Tick, plan: str = 'default') -> Answer:
     """
-    Compute studies with one worker and two, on a pool and on Dask, and kill them.
+    Compute studies with one and two workers, on a pool and on Dask, and kill them.
 
-    Parameters
-    ----------
-    tick : callable
-        Called with the name of each stage.
-    plan : str
-        How much is computed: a key of `PLANS`.
-
-    Returns
-    -------
-    sections, bars
-        A page.
-
+    `plan` is a key of `PLANS`.
     """
     chosen = PLANS[plan]
     with TemporaryDirectory() as name:
@@ -163,7 +152,7 @@ def _compare(folder: Path, plan: Plan, tick: Tick) -> Answer:
 
 
 def _study(samples: int, settings: dict[str, Any] | None = None) -> Study:
-    """Return the study with other numbers."""
+    """Return the study with different numbers."""
     document = read_study(STUDY).document
     return made(
         {**document, 'samples': samples, 'settings': {**document['settings'], **(settings or {})}}
@@ -171,29 +160,14 @@ def _study(samples: int, settings: dict[str, Any] | None = None) -> Study:
 
 
 def _ready(text: str) -> int:
-    """Compute something; return by which process."""
+    """Compute a warm-up; return the process id."""
     engine.chunk(text, 0, _FIRST)
     return os.getpid()
 
 
 @contextmanager
 def pool(text: str, workers: int) -> Iterator[_Factory]:
-    """
-    Start processes, and have each compute something.
-
-    Parameters
-    ----------
-    text : str
-        Of `engine.order`.
-    workers : int
-        How many.
-
-    Yields
-    ------
-    callable
-        As `engine.compute` takes it.
-
-    """
+    """Start a number of processes, each warmed up; yield their factory for `engine.compute`."""
     with processes(workers) as executor:
         ready: set[int] = set()
         while len(ready) < workers:
@@ -203,20 +177,7 @@ def pool(text: str, workers: int) -> Iterator[_Factory]:
 
 @contextmanager
 def cluster(text: str, workers: int) -> Iterator[_Factory]:
-    """
-    Start a cluster of Dask on this machine, and have each of its workers compute something.
-
-    Parameters
-    ----------
-    text, workers
-        As in `pool`.
-
-    Yields
-    ------
-    callable
-        As `engine.compute` takes it.
-
-    """
+    """Start a local Dask cluster, each worker warmed up; yield its factory."""
     with _dask(workers) as client:
         client.run(_ready, text)
         yield partial(engine.dask, client)
@@ -234,7 +195,7 @@ def _dask(workers: int) -> Iterator[Any]:
         yield client
 
 
-#: Who computes, and how many they are.
+#: Executors, and number of workers.
 WAYS: Final = {
     'process pool, 1 worker': (pool, 1),
     'process pool, 2 workers': (pool, 2),
@@ -243,24 +204,7 @@ WAYS: Final = {
 
 
 def take_turns(folder: Path, study: Study, rounds: int) -> dict[str, float]:
-    """
-    Measure how long each of `WAYS` takes for a study.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of all results.
-    study : Study
-        The study.
-    rounds : int
-        How often each takes its turn.
-
-    Returns
-    -------
-    dict of str to float
-        The least time of each, from the first sample to the table [s].
-
-    """
+    """Return the least time of each of `WAYS` for a study, from first sample to table [s]."""
     numbers = count()
 
     def once(factory: _Factory, workers: int) -> None:
@@ -275,50 +219,18 @@ def take_turns(folder: Path, study: Study, rounds: int) -> dict[str, float]:
 
 
 def computed(folder: Path, study: Study, factory: _Factory, workers: int) -> str:
-    """
-    Compute a study.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of its results.
-    study : Study
-        The study.
-    factory : callable
-        Of `pool` or `cluster`.
-    workers : int
-        Number of workers.
-
-    Returns
-    -------
-    str
-        SHA-256 of the table.
-
-    """
+    """Compute a study with the workers of a factory; return the SHA-256 of the table."""
     results = engine.Results(folder, study)
     engine.compute(results, factory, workers, _ignore)
     return _checksum(results.table)
 
 
 def _ignore(_count: int) -> None:
-    """Do nothing with the progress."""
+    """Ignore the progress."""
 
 
 def half_way(folder: Path, study: Study) -> str:
-    """
-    Compute a study on Dask, and kill one of two workers when half of it is there.
-
-    Parameters
-    ----------
-    folder, study
-        As in `computed`.
-
-    Returns
-    -------
-    str
-        SHA-256 of the table.
-
-    """
+    """Compute a study on Dask, with one of two workers killed half way; return the SHA-256."""
     results = engine.Results(folder, study)
     with _dask(2) as client:
         victim, done = min(client.run(os.getpid).values()), 0
@@ -334,13 +246,12 @@ def half_way(folder: Path, study: Study) -> str:
 
 
 class _Instant(Executor):
-    """Gives chunks that were computed before, each as if a worker had taken a second."""
+    """Returns precomputed chunks, each as if a worker had taken a second."""
 
     def __init__(self, columns: dict[str, FloatArray]) -> None:
         self._columns = columns
 
     def submit(self, _function: Any, /, *words: Any, **_options: Any) -> Future[Any]:
-        """Return a chunk."""
         _text, first, count = words
         columns = {name: values[:count] for name, values in self._columns.items()}
         future: Future[Any] = Future()
@@ -349,20 +260,7 @@ class _Instant(Executor):
 
 
 def parent_time(folder: Path, study: Study) -> float:
-    """
-    Measure what a chunk costs the process that writes the results.
-
-    Parameters
-    ----------
-    folder, study
-        As in `computed`.
-
-    Returns
-    -------
-    float
-        Time for a chunk, from the worker's answer to its part of the table [s].
-
-    """
+    """Return the time per chunk of the writing process, from result to table part [s]."""
     results = engine.Results(folder, study)
     columns = study.rows(0, _CHUNK)
     instant = _Instant(columns)
@@ -374,30 +272,13 @@ def parent_time(folder: Path, study: Study) -> float:
 
 
 def watch(folder: Path, study: Study, workers: int = 2) -> Watched:
-    """
-    Compute a study by the command `needle study`, and watch its memory.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the results.
-    study : Study
-        The study.
-    workers : int
-        Number of workers.
-
-    Returns
-    -------
-    Watched
-        Time and memory.
-
-    """
+    """Compute a study by the command `needle study`, and measure its time and memory."""
     begin = time.perf_counter()
     process = subprocess.Popen(_words(folder, study, workers), stdout=subprocess.DEVNULL)
     own, peaks = psutil.Process(process.pid), dict[int, float]()
     while process.poll() is None:
         for one in (own, *_children(own)):
-            # A peak only grows; that of a process that is made by a copy of another one does not
+            # A peak only increases; the peak of a forked process does not
             # count.
             peaks[one.pid] = _peak(one.pid) or peaks.get(one.pid, 0.0)
         time.sleep(0.02)
@@ -424,7 +305,7 @@ def _children(process: psutil.Process) -> list[psutil.Process]:
 
 
 def _peak(process: int) -> float:
-    """Return the peak of the memory of a process that was in RAM [MB]; 0 if it has ended."""
+    """Return the peak resident memory of a process [MB]; 0 if it has ended."""
     try:
         status = Path(f'/proc/{process}/status').read_text('ascii')
     except (FileNotFoundError, ProcessLookupError):
@@ -434,24 +315,7 @@ def _peak(process: int) -> float:
 
 
 def killed(folder: Path, study: Study, times: int) -> tuple[Kills, bool]:
-    """
-    Kill a study some times, and let it end.
-
-    Parameters
-    ----------
-    folder, study
-        As in `computed`.
-    times : int
-        How often.
-
-    Returns
-    -------
-    kills : Kills
-        What became of it.
-    same : bool
-        Whether its table is that of one that was not killed.
-
-    """
+    """Kill a study repeatedly, complete it; return the outcome and whether the table is equal."""
     words = _words(folder, study, 2)
     kills = kill_again_and_again(words, folder, times, np.random.default_rng(1))
     subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
@@ -485,8 +349,8 @@ def _answer(
             ('who computes', 'per second', 'per second and worker'),
             [(name, number(rate), number(rate / WAYS[name][1])) for name, rate in rates.items()],
             f'{plan.timed} insertions of `examples/studies/steering.yaml`, from the first sample '
-            f'to the table, the best of {plan.rounds} turns. All workers are there all the time; '
-            'those of Dask with the settings that the how-to names. '
+            f'to the table, the best of {plan.rounds} turns. All workers run all the time, '
+            'on Dask with the settings of the how-to. '
             f'The parent takes {1e3 / fed:.2f} ms for a chunk and its part of the table, and a '
             'chunk is a second of a worker.',
         ),
@@ -500,14 +364,14 @@ def _answer(
             f'100 mm by steps of 1 mm, with start and page. An insertion takes '
             f'{1e6 * each:.0f} us of wall time, and start and page {start:.1f} s. A million takes '
             f'{million:.0f} s, by the line through {small} and {large}. '
-            'Peaks are those of the kernel (`VmHWM`).',
+            'Peaks are from the kernel (`VmHWM`).',
         ),
         Section(
             'Equal tables',
             ('who computes', 'SHA-256 of the table'),
             [(name, f'`{table[:16]}`') for name, table in tables.items()],
             f'{plan.closed} insertions under our controller. Another study was killed '
-            f'{kills.killed} times by `kill -9`, and went on each time: {kills.twice} insertions '
+            f'{kills.killed} times by `kill -9`, and resumed each time: {kills.twice} insertions '
             f'were computed though they had been written, its table is '
             f'{"that" if same else "NOT that"} of one that was not killed, and {kills.left} '
             'processes were left behind.',

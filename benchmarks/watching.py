@@ -1,11 +1,11 @@
 """
-What `needle watch` with an open page costs the plant.
+CPU cost of `needle watch` with an open page to the plant.
 
 A plant and a controller at 1 kHz run all the time. In each round their CPU time is measured twice:
-alone, and with `needle watch` and a browser that shows its page. What a process that has to share
-its core leaves out is not saved: the time counts over the samples that the plant has taken. A
-ratio is the median over the rounds of the ratios within a round. Run it from a clone:
-``python -m benchmarks.watching``.
+alone, and with `needle watch` and a browser that shows its page. A process on a shared core may
+skip samples, so the CPU time is divided by the number of samples of the plant. A ratio is the
+median over the rounds of the ratios within a round. Run it from a clone: ``python -m
+benchmarks.watching``.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from needle_ros.errors import JobError
 import numpy as np
 from rclpy.node import Node
 
-#: CPU of the plant with a page over that without.
+#: CPU of the plant with a page, relative to without.
 LARGEST: Final = 1.1
 
-#: Rounds, time that is measured in each half of one, and time before it [s].
+#: Rounds, measuring time of each half of a round, and settling time before it [s].
 ROUNDS, TURN, SETTLE = 5, 6.0, 4.0
 
-#: A needle that bends, half way in.
+#: A flexible needle, inserted half way.
 _NEEDLE: Final[dict[str, object]] = {'model.preset': 'bending_35mm'}
 _PLANT: Final = {**_NEEDLE, 'steered': True, 'depth': 0.06}
 
@@ -44,27 +44,7 @@ _BROWSERS: Final = ('chromium', 'chromium-browser', 'google-chrome')
 
 @contextmanager
 def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
-    """
-    Show the page within a ``with`` statement.
-
-    Parameters
-    ----------
-    graph : Graph
-        What it shows.
-    folder : str
-        Folder for the browser.
-
-    Yields
-    ------
-    int, int
-        Process id of `needle watch`, and its port.
-
-    Raises
-    ------
-    JobError
-        If there is no browser, or no page.
-
-    """
+    """Show the page within a ``with`` statement; yield process id of `needle watch` and port."""
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise JobError(f'none of {", ".join(_BROWSERS)} is installed')
@@ -97,20 +77,7 @@ def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
 
 
 def connected(port: int) -> bool:
-    """
-    Tell whether somebody is connected to a port of this machine.
-
-    Parameters
-    ----------
-    port : int
-        The port.
-
-    Returns
-    -------
-    bool
-        Whether there is an established connection.
-
-    """
+    """Return whether a port of this machine has an established connection."""
     rows = (line.split() for line in Path('/proc/net/tcp').read_text('ascii').splitlines()[1:])
     return any(row[1].endswith(f':{port:04X}') and row[3] == '01' for row in rows)
 
@@ -162,7 +129,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def main() -> int:
-    """Measure, and print what was found; return 1 if the bar is missed."""
+    """Measure, and print the results; return 1 if the bar is missed."""
     found = measure()
     for what, shares in found.items():
         sys.stdout.write(f'{what}: {np.median(shares):.1f} % {np.round(shares, 1)}\n')

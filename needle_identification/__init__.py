@@ -1,8 +1,8 @@
 """
-Friction and stiffness identified from recordings of the needle base, without ROS.
+Identification of friction, stiffness and tissue from recordings at the needle base, without ROS.
 
-A `Recording` comes from a bag (`read_friction_recording`) or from NumPy arrays.
-`identify_friction` and `identify_stiffness` give parameters with confidence intervals;
+A `Recording` is read from a bag (`read_friction_recording`) or built from NumPy arrays.
+`identify_friction` and `identify_stiffness` return parameters with confidence intervals;
 `summarize` and `summarize_stiffness` combine several recordings. Nodes are in ``*_node.py``.
 
 "The paper" is A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling and

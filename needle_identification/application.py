@@ -1,4 +1,4 @@
-"""Identified parameters that are set in running nodes, and the answers of these nodes."""
+"""Set identified parameters in running nodes and collect the responses."""
 
 from __future__ import annotations
 
@@ -7,32 +7,22 @@ from typing import Any, Final, Protocol
 
 from needle_ros.status import no_answer
 
-#: Parameters that a running plant can change; it cannot change the others.
+#: Parameters that a running plant can change; all others are fixed.
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
 class Answer(Protocol):
-    """The answer of a node to a SetParameters request, a future."""
+    """Future of the response of a node to a SetParameters request."""
 
     def done(self) -> bool:
-        """Return whether it was received, or the call has failed."""
+        """Return whether the response was received or the call failed."""
 
     def result(self) -> Any:
-        """Return the response; None if the call has failed."""
+        """Return the response; None if the call failed."""
 
 
 class Application:
-    """
-    Parameters that were offered to other nodes.
-
-    Parameters
-    ----------
-    values : mapping
-        Parameters by name.
-    answers : mapping
-        Answer of each node by name; None for a node that does not exist.
-
-    """
+    """Parameters sent to other nodes, and their responses (None: no such node), by name."""
 
     def __init__(
         self, values: Mapping[str, float | str], answers: Mapping[str, Answer | None]
@@ -47,15 +37,9 @@ class Application:
 
     def outcome(self) -> tuple[bool, str]:
         """
-        Return the parameters that each node has set, or why not.
+        Return whether each existing node set all parameters that it can change, and a message.
 
-        Returns
-        -------
-        success : bool
-            Whether every node that exists set all parameters that it can change.
-        message : str
-            The outcome of each node.
-
+        The message lists for each node the parameters that it set and those that it rejected.
         """
         outcomes = [self._of_node(name, answer) for name, answer in self._answers.items()]
         verdicts = [verdict for verdict, _ in outcomes if verdict is not None]

@@ -1,10 +1,10 @@
-"""What can go wrong with recordings and with identification, as types."""
+"""Errors of recordings and of identification."""
 
 from needle_ros.errors import NeedleError
 
 
 class RecordingError(NeedleError):
-    """A recording cannot be written or read, or lacks what is needed."""
+    """A recording cannot be written or read, or lacks required data."""
 
 
 class IdentificationError(NeedleError):

@@ -1,4 +1,4 @@
-"""Node that identifies friction and stiffness, from recordings and from running topics."""
+"""Node that identifies friction and stiffness from recordings and from running topics."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-#: What can be identified.
+#: Quantities that can be identified.
 WHAT: Final = ('friction', 'stiffness')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentificationSettings:
-    """Settings of the node itself; each field says its meaning and unit."""
+    """Settings of the node; each field has its meaning and unit."""
 
     level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
     forgetting: float = constant(
@@ -64,22 +64,23 @@ class IdentificationSettings:
 
 class IdentificationNode(BaseNode):
     """
-    Publishes ``friction`` or ``stiffness`` (latched) from the recordings named in ``bags``.
+    Identifies friction or stiffness from recordings and from running topics.
 
-    It identifies when it is activated with recordings, and when ``~/identify`` is called; ``bags``
-    may change in between. With ``live`` it also takes ``joint_states`` and ``base_wrench`` and
+    The result is published latched on ``friction`` or ``stiffness``. Recordings named in ``bags``
+    are identified on activation and by each call of ``~/identify``; ``bags`` may change in
+    between. With ``live`` the node also subscribes to ``joint_states`` and ``base_wrench`` and
     publishes ``friction`` once a second. ``~/apply`` sets the last result in the nodes named in
-    ``apply_to``; the answer says what each node set.
+    ``apply_to``; the response lists the parameters that each node set.
 
-    All recordings are identified, or none, within the callback: meanwhile the node does nothing
-    else, for some tenths of a second per recording.
+    Identification fails as a whole if a recording cannot be identified. It runs within the
+    callback, which blocks the node for some tenths of a second per recording.
     """
 
     LIVE: ClassVar[frozenset[str]] = frozenset({'bags'})
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('identification', **node_options)
-        # An empty list would have no type.
+        # The type of an empty list is undefined.
         self.declare_text('bags', [''], 'recordings to identify from')
         self.declare_text('what', 'friction', ' or '.join(WHAT))
         self.declare_text('output', '', 'parameter file to write the result to; none if empty')
@@ -113,7 +114,7 @@ class IdentificationNode(BaseNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Read what to identify from and how."""
+        """Read the recordings, axes and settings of identification."""
         self._what = self.text('what', WHAT)
         self.text('time', TIMES)
         self._friction_settings = self.settings('friction.', FrictionSettings)
@@ -133,14 +134,14 @@ class IdentificationNode(BaseNode):
         }
 
     def cleanup(self) -> None:
-        """Disconnect from the nodes that results are applied to."""
+        """Disconnect from the nodes of ``apply_to``."""
         self._calls.abandon()
         for client in self._setters.values():
             self.destroy_client(client)
         self._setters.clear()
 
     def activate(self) -> None:
-        """Identify from the recordings, if there are any, and listen, if it is live."""
+        """Identify from the recordings if any are named; with ``live``, subscribe."""
         if self._bags:
             self._identify()
         if self._is_live:
@@ -152,24 +153,23 @@ class IdentificationNode(BaseNode):
             self._timer = self.create_timer(1.0, self._publish_live)
 
     def about(self) -> str:
-        """Name what is identified, and how to ask for it."""
+        """Return the identified quantity and its sources."""
         live = (contract.JOINT_STATES.name, contract.BASE_WRENCH.name) if self._is_live else ()
         heard = f', and live from {" and ".join(live)}' if live else ''
         return f'{self._what} from {len(self._bags)} recordings at ~/identify{heard}'
 
     def deactivate(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         if self._is_live:
             self.destroy_timer(self._timer)
             for subscription in self._listening:
                 self.destroy_subscription(subscription)
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Identify from other recordings the next time."""
+        """Set the recordings of the next identification."""
         self._bags = [name for name in changes['bags'] if name]
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Report the last result."""
         if self._live is not None:
             values: dict[str, object] = {'samples': self._live.samples, **self._live.dropped}
             if not self._live.samples:
@@ -194,7 +194,7 @@ class IdentificationNode(BaseNode):
         return response
 
     def _identify(self) -> None:
-        """Identify from the recordings, all or none, publish and write the result."""
+        """Identify from all recordings, publish the result and write it to ``output``."""
         reading: dict[str, Any] = {
             'wrench_topic': self.text('wrench_topic') or None,
             'motion_topic': self.text('motion_topic') or None,
@@ -236,7 +236,7 @@ class IdentificationNode(BaseNode):
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
-        """Identify each recording and log what to know of it."""
+        """Identify each distinct recording; log its losses and warnings."""
         estimates = []
         seen: dict[bytes, str] = {}
         for bag in self._bags:
@@ -284,12 +284,12 @@ class IdentificationNode(BaseNode):
                 self._found = found
             self._publish(self._friction, live_statuses(found, self._live.samples))
 
-    # Into running nodes.
+    # Parameters of running nodes.
 
     def _on_apply(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response | Future:
-        """Set the last result in other nodes; the answer comes when all of them have answered."""
+        """Set the last result in other nodes; respond after all of them have responded."""
         values = model_parameters(self._found)
         if not values:
             response.message = 'nothing identified yet that plant and controller can use'
@@ -312,14 +312,14 @@ class IdentificationNode(BaseNode):
         return later
 
     def _answer_applications(self) -> None:
-        """Answer those calls of ``~/apply`` of which all calls are answered or have failed."""
+        """Send the responses of those calls of ``~/apply`` that are complete."""
         over = [one for one in self._applications if one[0].is_over]
         for one in over:
             self._applications.remove(one)
             application, response, later = one
             response.success, response.message = application.outcome()
             later.set_result(response)
-            # Two lines of code: rclpy refuses a second severity from the same line.
+            # Two statements: rclpy rejects a second severity from the same source line.
             if response.success:
                 self.get_logger().info(response.message)
             else:
@@ -330,7 +330,7 @@ def _answer_later(service: Service) -> None:
     """
     Let the callback of a service return a future of its response.
 
-    The events executor of rclpy takes no coroutines as callbacks, and sends what they return.
+    The events executor of rclpy accepts no coroutines as callbacks and sends the returned value.
     """
     send = service.send_response
 

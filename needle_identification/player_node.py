@@ -1,4 +1,4 @@
-"""Node that plays a recording into the graph, as it was received."""
+"""Node that plays a recording into the ROS graph with its original timing."""
 
 from __future__ import annotations
 
@@ -28,44 +28,44 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool, Trigger
 
-#: Time between checks for due messages [s], and the longest time that one check publishes: a
-#: longer burst after a stall would overrun readers and delay services.
+#: Time between checks for due messages [s], and the longest burst of one check: a longer
+#: burst after a stall would overrun readers and delay services.
 _TICK: Final = 1e-3
 _LONGEST_BURST: Final = 1e-3
 
 #: Time between checks for other publishers [s].
 _LOOK: Final = 0.25
 
-#: Messages of one topic that may wait for a reader, if it is not latched.
+#: Queue length of a topic that is not latched.
 _DEPTH: Final = 1000
 
 #: Shortest time between two messages on /clock [ns].
 _CLOCK_PERIOD: Final = 1_000_000
 
-#: Delay that is reported on /diagnostics [s]; a busy machine has smaller ones now and then.
+#: Delay that is reported on /diagnostics [s]; smaller delays are normal on a busy machine.
 _LATE: Final = 0.1
 
-#: Time that readers have to receive the last messages [s].
+#: Timeout of the acknowledgment of the last messages [s].
 _FAREWELL: Final = 2.0
 
-#: As rclpy subscribes to /clock.
+#: QoS of the subscription of rclpy to /clock.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class PlayerNode(BaseNode):
     """
-    Plays while active, each topic with the quality of service that its publishers offered.
+    Plays a recording while active, each topic with the QoS that its publishers offered.
 
-    Messages are published byte for byte as they were stored, in the order and at the speed in
-    which they were received. Latched ones from before ``start`` come first. A recording that is
-    cut off is played as far as it goes. ``~/pause`` stops the recorded time; ``~/step`` then
-    plays the next message. With ``publish_clock`` the recorded time is /clock, and a /clock in
-    the recording is not played.
+    Messages are published byte for byte as stored, in the order and with the timing of their
+    reception. Latched messages from before ``start`` are published first. A truncated recording is
+    played up to its last complete message. ``~/pause`` stops the recorded time; ``~/step`` then
+    plays the next message. With ``publish_clock`` the recorded time is published on /clock, and a
+    recorded /clock is not played.
 
     Attributes
     ----------
     at_end : callable
-        Called when all is played; ``main`` ends the process.
+        Called after the last message; ``main`` ends the process.
 
     """
 
@@ -74,10 +74,10 @@ class PlayerNode(BaseNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('player', **node_options)
         self.declare_text('path', '', 'recording to play: a folder, an .mcap or a .db3 file')
-        self.declare_text('topics', ['*'], 'topics to play; * stands for all')
+        self.declare_text('topics', ['*'], 'topics to play; * selects all')
         self.declare_settings('', PlaybackSettings())
-        self.declare_text('loop', False, 'begin again at the end')
-        self.declare_text('paused', False, 'begin paused')
+        self.declare_text('loop', False, 'restart at the end')
+        self.declare_text('paused', False, 'start paused')
         self.declare_text('publish_clock', False, 'publish the recorded time on /clock')
         self.declare_text('exit_at_end', True, 'end the process when all is played')
         self.at_end: Callable[[], None] = lambda: None
@@ -92,7 +92,7 @@ class PlayerNode(BaseNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Open the recording and offer its topics."""
+        """Open the recording and create its publishers."""
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a recording to play, got nothing')
@@ -134,7 +134,7 @@ class PlayerNode(BaseNode):
             raise RecordingError(f'{path} has no topic {", ".join(missing)}; it has {listing}')
         if '*' in words:
             named |= {name for name in there if not is_hidden(name)}
-        # This node publishes its own.
+        # This node publishes its own configuration.
         named.discard(self.resolve_topic_name('~/configuration'))
         if publishes:
             named.discard('/clock')
@@ -145,7 +145,7 @@ class PlayerNode(BaseNode):
         return chosen
 
     def _imported(self, name: str, topics: list[Topic]) -> Any:
-        """Return the class of the messages of a topic; None, with a warning, if there is none."""
+        """Return the message class of a topic; None, with a warning, if not installed."""
         try:
             return message_class(*(topic.type_name for topic in topics))
         except MessageError as error:
@@ -154,7 +154,7 @@ class PlayerNode(BaseNode):
             return None
 
     def cleanup(self) -> None:
-        """Stop offering the topics."""
+        """Destroy the publishers."""
         for publisher in self._outputs.values():
             self.destroy_publisher(publisher)
         self._outputs.clear()
@@ -163,7 +163,7 @@ class PlayerNode(BaseNode):
             self._clock_publisher = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Continue at another rate."""
+        """Change the rate."""
         self._playback.settings = self.settings('', PlaybackSettings, changes)
 
     def activate(self) -> None:
@@ -171,7 +171,7 @@ class PlayerNode(BaseNode):
         self._playback.start(paused=bool(self.get_parameter('paused').value))
         self._reset_clock()
         self._played = 0
-        # A recorded time that stands still must not stop the player.
+        # Timers must run while the recorded time is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers_of_play = [
             self.create_timer(_TICK, self._on_timer, clock=steady),
@@ -179,11 +179,11 @@ class PlayerNode(BaseNode):
         ]
 
     def about(self) -> str:
-        """Name the recording and its topics."""
+        """Return the recording and its topics."""
         return f'plays {", ".join(sorted(self._outputs))} of {self._playback.bag.path}'
 
     def deactivate(self) -> None:
-        """Stop playing; the messages published last still have to arrive."""
+        """Stop playing and wait until readers have acknowledged the last messages."""
         for timer in self._timers_of_play:
             self.destroy_timer(timer)
         deadline = time.monotonic() + _FAREWELL
@@ -198,7 +198,7 @@ class PlayerNode(BaseNode):
             self._guarded(self._play)
 
     def _guarded(self, action: Callable[[], None]) -> None:
-        """End with an error if the recording is no longer readable."""
+        """Run an action; end with an error if the recording is no longer readable."""
         try:
             action()
         except NeedleError as error:
@@ -220,7 +220,7 @@ class PlayerNode(BaseNode):
         self._finish()
 
     def _finish(self) -> None:
-        """At the end: begin again or end."""
+        """Restart or end playback after the last message."""
         playback = self._playback
         playback.finish(loop=bool(self.get_parameter('loop').value))
         if not playback.is_ended:
@@ -235,7 +235,7 @@ class PlayerNode(BaseNode):
         self.at_end()
 
     def _publish(self, messages: Sequence[Recorded]) -> None:
-        """Publish messages, and the time of the last one before it."""
+        """Publish messages, and the time of the last message before that message."""
         for message in messages:
             if message is messages[-1]:
                 self._show_time(message.received)
@@ -243,12 +243,12 @@ class PlayerNode(BaseNode):
             self._played += 1
 
     def _reset_clock(self) -> None:
-        #: Time last shown on /clock [ns].
+        #: Time last published on /clock [ns].
         self._shown = self._playback.begin - _CLOCK_PERIOD
 
     def _show_time(self, position: int) -> None:
-        """Publish a time of the recording on /clock if it is later than the last one."""
-        # While it pauses the time is repeated, for nodes that join.
+        """Publish a recorded time [ns] on /clock if it is later than the previous one."""
+        # During a pause the time is repeated for nodes that start late.
         step = 0 if self._playback.is_paused else _CLOCK_PERIOD
         if self._clock_publisher is None or position - self._shown < step:
             return
@@ -287,21 +287,20 @@ class PlayerNode(BaseNode):
     # Diagnostics.
 
     def _look(self) -> None:
-        """Check who else publishes what is played: readers get both."""
+        """Check for duplicate publishers of the played topics."""
         contested = {
             name
             for name in self._outputs
-            # Every node publishes there.
+            # Each node publishes on /diagnostics.
             if name != '/diagnostics' and self.count_publishers(name) > 1
         }
         for name in sorted(contested - self._contested):
-            self.get_logger().warning(f'{name} has another publisher: its readers get both')
+            self.get_logger().warning(f'{name} has another publisher: its readers receive both')
         self._contested = contested
         if self._playback.is_paused:
             self._show_time(self._playback.position)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Report the position in the recording, and delays."""
         if not self.is_active:
             return super().diagnose()
         playback = self._playback
@@ -327,7 +326,7 @@ class PlayerNode(BaseNode):
 
 
 def _profile(topics: list[Topic]) -> QoSProfile:
-    """Return the strongest QoS that any publisher offered, so that every reader is served."""
+    """Return the strongest QoS offered by any publisher, which is compatible with each reader."""
     offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)
     reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
@@ -338,13 +337,13 @@ def _profile(topics: list[Topic]) -> QoSProfile:
             ('lifespan', {qos.lifespan for qos in offered}),
             ('liveliness_lease_duration', {qos.lease for qos in offered}),
         )
-        # What publishers do not agree on is unlimited.
+        # Durations that differ between publishers are left unlimited.
         for at in found
         if len(found) == 1 and at != UNLIMITED
     }
     if not any(qos.durability == 'transient_local' for qos in offered):
         return QoSProfile(depth=_DEPTH, reliability=reliability, **times)
-    # The middleware does not tell a recorder the depth: then one message of each publisher.
+    # The middleware may not report the depth to a recorder: then one message per publisher.
     known = [qos.depth for qos in offered if qos.durability == 'transient_local']
     depth = min(sum(max(1, number) for number in known), _DEPTH)
     durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -356,7 +355,7 @@ def _player() -> PlayerNode:
 
     def end() -> None:
         if node.get_parameter('exit_at_end').value:
-            # As Ctrl-C: `run` then shuts down in order.
+            # Same as Ctrl-C: `run` then shuts down in order.
             signal.raise_signal(signal.SIGINT)
 
     node.at_end = end

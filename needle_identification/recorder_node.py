@@ -1,4 +1,4 @@
-"""Node that records topics into an MCAP bag, with the QoS that their publishers offer."""
+"""Node that records topics to an MCAP bag with the QoS that their publishers offer."""
 
 from __future__ import annotations
 
@@ -27,18 +27,17 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-#: Time between checks for new topics, between writes that survive a crash, and between looks at
-#: what has come [s].
+#: Periods of topic discovery, of flushes to the disk, and of taking received messages [s].
 _DISCOVERY_PERIOD: Final = 0.1
 _FLUSH_PERIOD: Final = 0.5
 _TAKE_PERIOD: Final = 0.005
 
-#: Messages of one topic that may wait while the recorder is busy, and that are taken at once.
+#: Queue length of a topic, and largest number of its messages that are taken at once.
 _DEPTH: Final = 5000
 _AT_ONCE: Final = 1000
 
-#: Last parts of the names of topics whose late messages are worth no second try: asking for one
-#: would cost the plant a third more of its CPU.
+#: Last parts of the names of topics that are recorded best effort: retransmission would increase
+#: the CPU load of the plant by a third.
 _LOSSY: Final = {topic.name.rpartition('/')[2] for topic in TOPICS if topic.qos.lossy}
 
 #: Topics of the middleware that * does not include.
@@ -46,7 +45,7 @@ _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
 
 
 class _Recorded(NamedTuple):
-    """A subscription, what it requests, and what the publishers so far have offered."""
+    """Subscription of a topic, its requested QoS, and the QoS that its publishers have offered."""
 
     kind: type
     subscription: Subscription
@@ -57,44 +56,44 @@ class _Recorded(NamedTuple):
 
 class RecorderNode(BaseNode):
     """
-    Records while active, each topic with the quality of service that its publishers offer.
+    Records topics while active, each with the QoS that its publishers offer.
 
-    Measurements it hears best effort, as all nodes of the suite do. Messages are stored byte for
-    byte, with the receive time. A second recording of the same node (``~/stop``, ``~/start``)
-    goes to ``path`` with ``_2`` appended.
+    Measurements are subscribed to best effort, as in all nodes of the suite. Messages are stored
+    byte for byte with their receive time. A second recording of the same node (``~/stop``,
+    ``~/start``) is written to ``path`` with ``_2`` appended.
     """
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('recorder', **node_options)
         self.declare_text('path', '', 'folder to record to; it must not exist')
-        self.declare_text('topics', ['*'], 'topics to record; * stands for all but hidden ones')
+        self.declare_text('topics', ['*'], 'topics to record; * selects all except hidden topics')
         self.declare_text('compression', 'zstd', f'one of {", ".join(COMPRESSIONS)}')
         self._bag: BagWriter | None = None
         self._recordings = 0
-        #: Outcome of the latest recording.
+        #: Summary of the latest recording.
         self._result = 'not recording'
         self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
-        #: Stamp of the newest sample that was recorded [ns]; a plant may wait for it.
+        #: Stamp of the newest recorded sample [ns]; a plant may wait for it.
         self._recorded_stamp = 0
         self._reports = self.publisher(RECORDED, always=True)
-        #: What reads the topics that have every sample.
+        #: Readers of the topics that contain each sample.
         self._sampled = {
             self.resolve_topic_name(topic.name): Reader(topic.type_name).read
             for topic in (JOINT_STATES, BASE_WRENCH)
         }
-        #: Number of the newest message of each topic, by its publisher.
+        #: Publication sequence number of the newest message of each topic.
         self._newest: dict[str, int] = {}
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
-        # A simulation that pauses must not pause the recorder.
+        # The timers must run while the simulation time is paused.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
         self.create_timer(_FLUSH_PERIOD, self._flush, clock=steady)
         self.create_timer(_TAKE_PERIOD, self._take, clock=steady)
 
     def configure(self) -> None:
-        """Read what to record, and where to."""
+        """Read the topics and the path."""
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a folder to record to, got nothing')
@@ -105,7 +104,7 @@ class RecorderNode(BaseNode):
         self._names = {self.resolve_topic_name(name) for name in names if name != '*'}
 
     def activate(self) -> None:
-        """Begin to record."""
+        """Start a recording."""
         self._begin()
 
     def deactivate(self) -> None:
@@ -114,7 +113,6 @@ class RecorderNode(BaseNode):
             self._end(self._bag)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Report what has been recorded."""
         if self._bag is None:
             return DiagnosticStatus.OK, 'not recording', {}
         counts, lost = self._bag.counts, self._bag.lost
@@ -132,7 +130,7 @@ class RecorderNode(BaseNode):
     # Services.
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Begin to record; a repeated request changes nothing."""
+        """Start a recording; no effect during a recording."""
         try:
             if not self.is_active:
                 raise RecordingError('not active')
@@ -144,7 +142,7 @@ class RecorderNode(BaseNode):
         return response
 
     def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Complete the bag; a repeated request is answered as the first one."""
+        """Complete the bag; a repeated request gets the same response."""
         if self._bag is not None:
             self._result = self._end(self._bag)
         response.success = self.failure is None
@@ -165,7 +163,7 @@ class RecorderNode(BaseNode):
         self._discover()
 
     def _end(self, bag: BagWriter) -> str:
-        """Complete the bag; return what it holds, or why it cannot be completed."""
+        """Complete the bag; return a summary of its content, or the error."""
         self._take(_DEPTH)
         if self._bag is None:
             return self.failure or 'not recording'
@@ -193,7 +191,7 @@ class RecorderNode(BaseNode):
         self._bag = None
 
     def _give_up(self, bag: BagWriter, error: OSError) -> str:
-        """Stop after an error of the disk; what is in the file remains readable."""
+        """Stop the recording after a disk error; the bag remains readable up to this point."""
         self._release()
         bag.abort()
         self.failed = True
@@ -210,7 +208,7 @@ class RecorderNode(BaseNode):
                 self._give_up(self._bag, error)
 
     def _take(self, most: int = _AT_ONCE) -> None:
-        """Write what has come, with the time at which the middleware has received it."""
+        """Write the received messages with their time of reception by the middleware."""
         for topic, recorded in self._recorded.items():
             if self._bag is None:
                 return
@@ -225,7 +223,7 @@ class RecorderNode(BaseNode):
             self._report_recorded(self._recorded_stamp or 1)
 
     def _report_recorded(self, stamp: int) -> None:
-        """Report the newest sample to a plant; zero: it need not wait any more."""
+        """Publish the stamp [ns] of the newest recorded sample; 0: the plant need not wait."""
         if self._reports.get_subscription_count():
             message = Header(frame_id=self.get_fully_qualified_name())
             message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
@@ -239,14 +237,14 @@ class RecorderNode(BaseNode):
                 if taken is None:
                     break
                 data, about = taken
-                # Not every middleware says when, nor which.
+                # Not every middleware reports the receive time and the sequence number.
                 bag.write(topic, data, about['received_timestamp'] or time.time_ns())
                 number = about['publication_sequence_number']
                 if number is None:
                     continue
                 missing = number - self._newest.get(topic, number) - 1
                 self._newest[topic] = number
-                # Two publishers count on their own.
+                # Each publisher has its own sequence numbers.
                 if missing > 0 and len(recorded.offered) == 1:
                     bag.lose(topic, missing)
         if data and topic in self._sampled:
@@ -268,7 +266,7 @@ class RecorderNode(BaseNode):
     def _subscribe(
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
     ) -> None:
-        """Subscribe, or subscribe again if a new publisher offers less than was requested."""
+        """Subscribe; subscribe again if a new publisher offers less than was requested."""
         profiles = [publisher.qos_profile for publisher in publishers]
         best_effort = topic.rpartition('/')[2] in _LOSSY or any(
             q.reliability == ReliabilityPolicy.BEST_EFFORT for q in profiles
@@ -302,30 +300,17 @@ class RecorderNode(BaseNode):
             topic,
             lambda _: None,
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
-            # By default a mismatch is logged; here the next check for topics ends it.
+            # No log of a QoS mismatch: the next discovery subscribes again.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        # The executor would take the messages one by one, without their numbers and times.
+        # The executor would take single messages, without sequence number and receive time.
         self._subscriptions.remove(subscription)
         self._recorded[topic] = _Recorded(kind, subscription, best_effort, latched, offered)
 
 
 def is_hidden(topic: str) -> bool:
-    """
-    Tell whether a topic belongs to the middleware or to a tool, so that * does not include it.
-
-    Parameters
-    ----------
-    topic : str
-        Full name.
-
-    Returns
-    -------
-    bool
-        Whether it is hidden.
-
-    """
+    """Return whether a topic (full name) of the middleware or of a tool is excluded from *."""
     return '/_' in topic or topic in _NOT_FOR_ALL
 
 

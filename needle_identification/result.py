@@ -1,4 +1,4 @@
-"""The result of identification as a ROS parameter file for plant and controller."""
+"""Write identified parameters to a ROS parameter file for plant and controller."""
 
 from __future__ import annotations
 
@@ -24,21 +24,11 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     """
     Return identified parameters as parameters of the nodes plant and controller.
 
-    A mean outside the range of its parameter, which can only be within its error of the limit,
-    is moved to the limit. Parameters that the data do not determine are left out.
-
-    Parameters
-    ----------
-    statistics : iterable of Statistic
-        Identified parameters; those that are no constants of the model are left out.
-
-    Returns
-    -------
-    dict
-        Values in SI units by name, such as ``model.coulomb_friction``.
-
+    Keys are names such as ``model.coulomb_friction``; values are in SI units. Only determined
+    parameters that are constants of the model are included. A mean outside the range of its
+    parameter, which can only be within its error of the limit, is set to the limit.
     """
-    # Imported here: the model takes longer than all else that identification needs.
+    # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters
 
     constants = {item.name: item for item in fields(NeedleParameters) if 'unit' in item.metadata}
@@ -47,7 +37,7 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
         item = constants.get(statistic.name)
         if item is not None and isfinite(statistic.mean):
             low, high = item.metadata['low'], item.metadata['high']
-            # More digits than any experiment gives.
+            # More digits than the accuracy of any experiment.
             values[f'model.{item.name}'] = float(f'{min(max(statistic.mean, low), high):.7g}')
     if 'model.breakaway_friction' in values:
         values['model.friction_law'] = 'stribeck'
@@ -58,9 +48,9 @@ def result_yaml(
     friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> str:
     """
-    Return a ROS parameter file with the identified parameters.
+    Return the text of a ROS parameter file with the identified parameters.
 
-    It applies to nodes named plant and controller in any namespace.
+    The parameters apply to nodes named plant and controller in any namespace.
 
     Parameters
     ----------
@@ -123,7 +113,7 @@ def write_result(
     path: Path | str, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> None:
     """
-    Write the parameter file of `result_yaml`.
+    Write the parameters to a ROS parameter file, the text of `result_yaml`.
 
     Parameters
     ----------

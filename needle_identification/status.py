@@ -1,4 +1,4 @@
-"""Results as named values, as /diagnostics has them."""
+"""Convert identification results to named values for /diagnostics."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from needle_identification.stiffness.summary import StiffnessSummary
 
 class Status(NamedTuple):
     """
-    A result in words and values.
+    A result as a message and values.
 
     Attributes
     ----------
     name, message : str
-        Parameter or recording, and the result in words.
+        Parameter or recording, and the result as text.
     values : mapping
-        Values by name; None for one that does not apply.
+        Values by name; None if not applicable.
     is_determined : bool
-        Whether the data determine it.
+        Whether the data determine the parameter.
     source : str
-        Where a parameter comes from: ``recordings`` or ``live``.
+        Source of a parameter: ``recordings`` or ``live``.
 
     """
 
@@ -38,40 +38,12 @@ class Status(NamedTuple):
 
 
 def live_statuses(found: Sequence[Statistic], samples: int) -> list[Status]:
-    """
-    Report parameters that were identified from running topics.
-
-    Parameters
-    ----------
-    found : sequence of Statistic
-        Parameters.
-    samples : int
-        Number of samples they come from.
-
-    Returns
-    -------
-    list of Status
-        One per parameter.
-
-    """
+    """Return one status per parameter identified from running topics."""
     return [_of_statistic(one, samples=samples, source='live') for one in found]
 
 
 def summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[Status]:
-    """
-    Report what was identified from recordings.
-
-    Parameters
-    ----------
-    summary : FrictionSummary or StiffnessSummary
-        Parameters over all recordings.
-
-    Returns
-    -------
-    list of Status
-        One per parameter and force level, then one per recording.
-
-    """
+    """Return one status per parameter and force level, then one per recording."""
     if isinstance(summary, FrictionSummary):
         samples = sum(one.samples for one in summary.estimates)
         statuses = [_of_statistic(one, samples=samples) for one in summary.statistics]
@@ -125,18 +97,5 @@ def _of_stiffness(estimate: StiffnessEstimate) -> Status:
 
 
 def sentence(found: Sequence[Statistic]) -> str:
-    """
-    Write parameters in one line.
-
-    Parameters
-    ----------
-    found : sequence of Statistic
-        Parameters.
-
-    Returns
-    -------
-    str
-        Such as ``mu_s = 0.5600 ± 0.0083 N, mu_v = 300.0 ± 9.9 N s/m``.
-
-    """
+    """Format parameters in one line, such as ``mu_s = 0.5600 ± 0.0083 N, mu_v = ...``."""
     return ', '.join(f'{one.symbol} = {measured(one.mean, one.error, one.unit)}' for one in found)

@@ -1,1 +1,1 @@
-"""Bags: recordings on disk, written as MCAP, read in any form that rosbag2 writes."""
+"""Bags: read and write recordings on disk (rosbag2 MCAP and sqlite3, ROS 1)."""

@@ -1,4 +1,4 @@
-"""Reading of bags: topics and messages of a recording of any origin and in any state."""
+"""Read topics and messages of bags, also of incomplete or damaged bags."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
 
-#: Messages that wait to be put in order of time [bytes].
+#: Size of the buffer for sorting messages by receive time [bytes].
 _WINDOW: Final = 2**22
 
 
 def _ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
-    # A large import that few recordings need.
+    # Lazy import: large, and needed for ROS 1 only.
     from needle_identification.bags.ros1_file import ros1_batches
 
     return ros1_batches(file, tally)
 
 
-#: Readers of the forms of storage.
+#: Readers by storage format.
 _BATCHES: Final = {'.mcap': mcap_batches, '.db3': sqlite_batches, '.bag': _ros1_batches}
 
 
@@ -41,9 +41,9 @@ class Recorded(NamedTuple):
     received : int
         Receive time [ns].
     topic : Topic
-        Its topic.
+        Topic of the message.
     data : bytes
-        The message as on the wire (CDR).
+        Serialized message (CDR).
 
     """
 
@@ -59,22 +59,22 @@ class Bag:
     Parameters
     ----------
     path : Path or str
-        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not, whose end may be
-        missing; or a ``.bag`` file of ROS 1.
+        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not, possibly
+        truncated; or a ``.bag`` file of ROS 1.
 
     Attributes
     ----------
     path : Path
-        Its path.
+        Path of the recording.
     counts : dict
-        Messages by topic that `batches` has met so far.
+        Number of messages by topic, up to the present position of `batches`.
     losses : list of str
-        What is missing or damaged, as far as `batches` has come.
+        Missing or damaged parts, up to the present position of `batches`.
 
     Raises
     ------
     RecordingError
-        If there is no such recording.
+        If the path is not a recording.
 
     Examples
     --------
@@ -106,12 +106,12 @@ class Bag:
         Returns
         -------
         tuple of Topic
-            In order of name.
+            Sorted by name.
 
         Raises
         ------
         RecordingError
-            If there is none.
+            If the bag has no messages.
 
         """
         found: set[Topic] = set()
@@ -127,12 +127,12 @@ class Bag:
 
     def count(self) -> Mapping[Topic, int]:
         """
-        Go through the bag and count its messages.
+        Read the whole bag and count its messages.
 
         Returns
         -------
         mapping
-            Number of messages by topic; empty if there is none.
+            Number of messages by topic; empty for an empty bag.
 
         """
         for _ in self.batches(lambda _topic: False):
@@ -141,12 +141,12 @@ class Bag:
 
     def batches(self, wanted: Callable[[Topic], bool]) -> Iterator[Batch]:
         """
-        Go through the bag from its start, many messages at a time.
+        Iterate over the bag in batches of messages, from its start.
 
         Parameters
         ----------
         wanted : callable
-            Tells whether the messages of a topic are wanted.
+            Selects topics: returns whether to read the messages of a topic.
 
         Yields
         ------
@@ -159,14 +159,14 @@ class Bag:
 
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Recorded]:
         """
-        Go through the bag in the order of receive time.
+        Iterate over the messages in the order of receive time.
 
-        A message that is more than 4 MB late in the file comes when it is met.
+        A message stored more than 4 MB after its place in this order is yielded when it is read.
 
         Parameters
         ----------
         wanted : callable
-            Tells whether the messages of a topic are wanted.
+            Selects topics: returns whether to read the messages of a topic.
 
         Yields
         ------
@@ -178,14 +178,14 @@ class Bag:
         size = order = 0
         piece: tuple[Path, int] | None = None
         for current, batch in self._pieces(wanted):
-            # Within a piece the messages come topic by topic.
+            # Within a piece the messages are sorted by topic.
             while current != piece and size > _WINDOW:
                 received, _, topic, data = heappop(waiting)
                 size -= len(data)
                 yield Recorded(received, topic, data)
             piece = current
             for received, data in batch.messages():
-                # Equal times keep the order of the file; topics are never compared.
+                # `order` keeps the order of the file at equal times.
                 heappush(waiting, (received, order, batch.topic, data))
                 size += len(data)
                 order += 1
@@ -194,7 +194,7 @@ class Bag:
             yield Recorded(received, topic, data)
 
     def _pieces(self, wanted: Callable[[Topic], bool]) -> Iterator[tuple[tuple[Path, int], Batch]]:
-        """Yield batches with the piece of the bag that each is from."""
+        """Yield each batch with its file and its piece of the file."""
         self.counts.clear()
         self.losses[:] = self._missing
         for file in self._files:
@@ -226,7 +226,7 @@ def message_counts(path: Path | str) -> dict[str, int]:
     Returns
     -------
     dict
-        Number of messages by name of topic, in order of name.
+        Number of messages by topic name, sorted by name.
 
     Raises
     ------
@@ -275,7 +275,7 @@ def read_topic(path: Path | str, topic: str) -> list[tuple[int, Any]]:
     ['insertion', 'rotation']
 
     """
-    # A large import that only messages as objects need.
+    # Lazy import: large, and needed for deserialization only.
     from needle_identification.bags.messages import deserialize
 
     bag = Bag(path)

@@ -1,4 +1,4 @@
-"""Batches: many messages of one topic, as arrays; and the count of what was read of a file."""
+"""Batches of messages of one topic as arrays, and counts of the messages read from a file."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from numpy.typing import NDArray
 #: Largest number of messages in a batch.
 LARGEST_BATCH: Final = 2**14
 
-#: Receive times are limited to this, so that their differences fit in 64 bits [ns].
+#: Upper limit of receive times, so that their differences fit in 64 bits [ns].
 LATEST: Final = 2**62
 
-#: How compressed messages begin; others begin with 0.
+#: Magic bytes of compressed messages; others begin with 0.
 _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
 class Batch(NamedTuple):
     """
-    Messages of one topic, in order.
+    Messages of one topic, in the order of the file.
 
     Attributes
     ----------
     topic : Topic
-        The topic.
+        Topic of the messages.
     received : ndarray of int64, shape (m,)
         Receive times [ns].
     data, begin, end : ndarray
-        Bytes that hold the messages, and where each begins and ends, shape (m,).
+        Bytes of the messages; offsets of the begin and end of each message, shape (m,).
 
     """
 
@@ -46,24 +46,7 @@ class Batch(NamedTuple):
 
     @classmethod
     def joined(cls, topic: Topic, received: NDArray[np.int64], messages: Sequence[bytes]) -> Batch:
-        """
-        Make a batch of separate messages.
-
-        Parameters
-        ----------
-        topic : Topic
-            The topic.
-        received : ndarray of int64, shape (m,)
-            Receive times [ns].
-        messages : sequence of bytes
-            The messages.
-
-        Returns
-        -------
-        Batch
-            The batch.
-
-        """
+        """Build a batch from separate messages and their receive times [ns], shape (m,)."""
         lengths = np.array([len(message) for message in messages], dtype=np.int64)
         end = np.cumsum(lengths)
         data = np.frombuffer(b''.join(messages), dtype=np.uint8)
@@ -72,22 +55,10 @@ class Batch(NamedTuple):
     @classmethod
     def of_times(cls, topic: Topic, times: Sequence[Any], messages: Sequence[Any]) -> Batch:
         """
-        Make a batch of what a file holds, which may be of another kind than it should.
+        Build a batch from unchecked values of a file.
 
-        Parameters
-        ----------
-        topic : Topic
-            The topic.
-        times : sequence of object
-            Receive times [ns]; 0 for what is no whole number.
-        messages : sequence of object
-            The messages; an empty one for what is not bytes.
-
-        Returns
-        -------
-        Batch
-            The batch.
-
+        A receive time [ns] that is not an integer becomes 0; a message that is not bytes becomes
+        empty.
         """
         stamps = np.array(
             [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times],
@@ -96,37 +67,15 @@ class Batch(NamedTuple):
         return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
 
     def messages(self) -> Iterator[tuple[int, bytes]]:
-        """
-        Go through the messages.
-
-        Yields
-        ------
-        int, bytes
-            Receive time [ns] and bytes.
-
-        """
+        """Iterate over receive times [ns] and serialized messages."""
         for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
             yield int(received), self.data[begin:end].tobytes()
 
     def decompressed(self, budget: Budget) -> Batch:
         """
-        Decompress messages that were compressed one by one.
+        Decompress messages that were compressed one by one; a damaged message becomes empty.
 
-        Parameters
-        ----------
-        budget : Budget
-            What they may unfold to.
-
-        Returns
-        -------
-        Batch
-            The same messages; a damaged one is empty.
-
-        Raises
-        ------
-        RecordingError
-            If they unfold to too much.
-
+        Raises a RecordingError if the decompressed size exceeds the budget.
         """
         compression = _COMPRESSED.get(next(self.messages())[1][:4])
         if compression is None:
@@ -140,20 +89,7 @@ class Batch(NamedTuple):
 
 
 def grouped(rows: Iterable[tuple[Any, Any, Any]]) -> dict[Any, list[tuple[Any, Any]]]:
-    """
-    Group messages by topic.
-
-    Parameters
-    ----------
-    rows : iterable of (key, time, message)
-        Messages in the order of a file.
-
-    Returns
-    -------
-    dict
-        Times and messages by the key of their topic, in that order.
-
-    """
+    """Group rows (key, time, message) by the key of their topic, in the order of the file."""
     groups: dict[Any, list[tuple[Any, Any]]] = {}
     for key, received, data in rows:
         groups.setdefault(key, []).append((received, data))
@@ -163,22 +99,22 @@ def grouped(rows: Iterable[tuple[Any, Any, Any]]) -> dict[Any, list[tuple[Any, A
 @dataclass(slots=True)
 class Tally:
     """
-    Counts what is read of a file.
+    Counts of the messages read from a file.
 
     Attributes
     ----------
     counts : dict
-        Messages by topic.
+        Number of messages by topic.
     wanted : callable
-        Tells whether the messages of a topic are wanted.
+        Selects topics: returns whether to read the messages of a topic.
     faults : list of str
-        What is wrong with the file.
+        Faults of the file.
     budget : Budget
-        What the file may unfold to.
+        Limits of the decompressed size.
     count, written : int
-        Messages read of known topics, and messages that the file should have, if it says so.
+        Messages read of known topics, and messages by the statistics of the file, if available.
     piece : int
-        Number of the piece that is being read; the pieces of a file are in order of time.
+        Number of the current piece; the pieces of a file are in order of time.
 
     """
 
@@ -195,22 +131,7 @@ class Tally:
         return f'{self.count}{of} messages'
 
     def enter(self, topic: Topic | None, number: int) -> bool:
-        """
-        Count messages.
-
-        Parameters
-        ----------
-        topic : Topic or None
-            Their topic; None if it is unknown, which is a fault.
-        number : int
-            Number of messages.
-
-        Returns
-        -------
-        bool
-            Whether they are wanted.
-
-        """
+        """Count messages of a topic (None: unknown, a fault); return whether it is selected."""
         if topic is None:
             self.faults.append(f'is damaged: {number} messages of an unknown topic')
             return False

@@ -1,4 +1,4 @@
-"""Compressed files and messages (zstd, lz4), also where their end is missing."""
+"""Decompress files and messages (zstd, lz4), also truncated data."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, Final
 import lz4.frame
 import zstandard
 
-#: Endings of compressed files.
+#: File name suffixes of compressed files.
 COMPRESSED: Final = ('.zstd', '.zst', '.lz4')
 
-#: Bytes that are read at a time.
+#: Block size of reads [bytes].
 BLOCK: Final = 2**20
 
-#: What readers raise at damaged bytes.
+#: Exceptions of the readers for damaged bytes.
 DAMAGED: Final = (
     RuntimeError,
     zstandard.ZstdError,
@@ -31,23 +31,10 @@ DAMAGED: Final = (
 
 
 def open_file(file: Path) -> Any:
-    """
-    Open a file for reading.
-
-    Parameters
-    ----------
-    file : Path
-        A file, compressed or not.
-
-    Returns
-    -------
-    binary stream
-        Its decompressed content.
-
-    """
+    """Open a file, compressed or not, as a binary stream of its decompressed content."""
     if file.suffix == '.lz4':
         archive = lz4.frame.LZ4FrameFile(file)
-        # Where the end is missing, read would lose what there is.
+        # `read` would discard the last data of a truncated file.
         archive.read = archive.read1
         return archive
     stream = file.open('rb')
@@ -55,22 +42,7 @@ def open_file(file: Path) -> Any:
 
 
 def read_up_to(stream: Any, length: int) -> bytes:
-    """
-    Read bytes from a stream.
-
-    Parameters
-    ----------
-    stream : binary stream
-        Stream to read.
-    length : int
-        Number of bytes.
-
-    Returns
-    -------
-    bytes
-        That many bytes, fewer only at the end of the stream.
-
-    """
+    """Read `length` bytes from a binary stream; fewer only at its end."""
     parts = []
     with suppress(EOFError):
         while length > 0 and (part := stream.read(min(length, BLOCK))):
@@ -81,27 +53,10 @@ def read_up_to(stream: Any, length: int) -> bytes:
 
 def decompress(compression: str, data: bytes, size: int) -> bytes:
     """
-    Decompress data.
+    Decompress data (``zstd``, ``lz4``, or '' for none) up to `size` bytes.
 
-    Parameters
-    ----------
-    compression : str
-        ``zstd``, ``lz4``, or '' for none.
-    data : bytes
-        Compressed data; their end may be missing.
-    size : int
-        Largest number of bytes to return.
-
-    Returns
-    -------
-    bytes
-        As much as the data hold.
-
-    Raises
-    ------
-    ValueError
-        If the compression is unknown.
-
+    Truncated data are decompressed up to their end. Raises a ValueError for an unknown
+    compression.
     """
     if compression == 'zstd':
         with _zstd_stream(data) as stream:

@@ -1,4 +1,4 @@
-"""The files that a bag consists of."""
+"""List the files of a bag."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from needle_identification.errors import RecordingError
 from needle_ros.documents import DocumentError, LARGEST, read_document
 from needle_ros.errors import printable
 
-#: File of a rosbag2 folder that lists the others; written when the bag is closed.
+#: File of a rosbag2 folder that lists its other files; written when the bag is closed.
 METADATA: Final = 'metadata.yaml'
 
-#: Key under which the metadata say what the recorder has lost.
+#: Key of the metadata for the messages that the recorder lost.
 LOST: Final = 'messages lost'
 
 _FORMS: Final = ('.mcap', '.db3', '.bag')
@@ -23,50 +23,21 @@ _VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag fil
 
 
 def form_of(file: Path) -> str:
-    """
-    Tell the form of storage of a file by its name.
-
-    Parameters
-    ----------
-    file : Path
-        A file, compressed or not.
-
-    Returns
-    -------
-    str
-        ``.mcap``, ``.db3``, ``.bag`` (of ROS 1), or '' for another.
-
-    """
+    """Return the storage format by file name: ``.mcap``, ``.db3``, ``.bag`` (ROS 1), or ''."""
     suffix = _uncompressed(file).suffix
     return suffix if suffix in _FORMS else ''
 
 
 def _uncompressed(file: Path) -> Path:
-    """Return the name of a file without the ending of its compression."""
+    """Return the file name without the suffix of its compression."""
     return file.with_suffix('') if file.suffix in COMPRESSED else file
 
 
 def files_of(path: Path) -> tuple[list[Path], list[str]]:
     """
-    List the files of a bag.
+    List the files of a bag in the order of recording, and its missing or foreign files.
 
-    Parameters
-    ----------
-    path : Path
-        A rosbag2 folder, or one of its files alone.
-
-    Returns
-    -------
-    files : list of Path
-        In the order of recording.
-    losses : list of str
-        What is missing or does not belong to the bag.
-
-    Raises
-    ------
-    RecordingError
-        If there is no bag.
-
+    `path` is a rosbag2 folder or a single file of it. Raises a RecordingError if it is not a bag.
     """
     if not path.exists():
         raise RecordingError(f'{path} does not exist; {_VALID}')
@@ -74,7 +45,7 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         if not form_of(path):
             raise RecordingError(f'{path} is not a recording; {_VALID}')
         return [path], []
-    # part_10 comes after part_9.
+    # Sort part_10 after part_9.
     found = sorted(
         (file for file in (path.iterdir() if path.is_dir() else ()) if file.is_file()),
         key=lambda file: [len(file.name), file.name],
@@ -91,10 +62,10 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     except DocumentError as error:
         losses = [f'{METADATA} {error}']
     except (OSError, UnicodeDecodeError, KeyError, TypeError):
-        # There is none, or it is of another kind.
+        # Missing, or of an unknown structure.
         pass
     if names is None:
-        # The parts of one recording differ in a number at the end.
+        # The parts of one recording differ only in a number at the end of the name.
         if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
             raise RecordingError(
                 f'{path} holds several recordings; name them, such as {chosen[0]}; {losses[0]}'
@@ -114,13 +85,13 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
 
 
 def _metadata(folder: Path) -> tuple[list[str], str]:
-    """Return the files of a bag by its metadata, and what its recorder has lost."""
+    """Return the files listed in the metadata of a bag, and its lost messages."""
     with (folder / METADATA).open(encoding='utf-8') as stream:
         document = read_document(stream.read(LARGEST + 1))
     information = document['rosbag2_bagfile_information']
     paths = information['relative_file_paths']
     if not isinstance(paths, list):
-        raise TypeError('relative_file_paths is no list')
+        raise TypeError('relative_file_paths is not a list')
     own = information.get('custom_data') or {}
     lost = printable(str(own.get(LOST, ''))) if isinstance(own, dict) else ''
     return list(dict.fromkeys(Path(str(name)).name for name in paths)), lost

@@ -1,4 +1,4 @@
-"""How much a file may unfold to: a small one must not fill the memory or run for hours."""
+"""Limit the decompressed size of a file, so that a small file cannot exhaust memory or time."""
 
 from __future__ import annotations
 
@@ -9,33 +9,20 @@ from typing import Any, Final
 
 from needle_identification.errors import RecordingError
 
-#: Environment variable by which all limits here are multiplied.
+#: Environment variable: factor of all limits of this module.
 FACTOR: Final = 'NEEDLE_BAG_FACTOR'
 
-#: Largest record or chunk, and largest message that was compressed on its own [bytes].
+#: Largest record or chunk, and largest message that was compressed individually [bytes].
 LARGEST_RECORD: Final = 2**27
 LARGEST_MESSAGE: Final = 2**26
 
-#: What any file may unfold to [bytes], and what each of its own bytes may.
+#: Decompressed size allowed for any file [bytes], and per byte of the file.
 _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
 
 def factor() -> float:
-    """
-    Return by how much the limits are multiplied.
-
-    Returns
-    -------
-    float
-        `FACTOR` of the environment, or 1.
-
-    Raises
-    ------
-    RecordingError
-        If it is not a positive number.
-
-    """
+    """Return the positive factor of all limits, `FACTOR` of the environment or 1."""
     text = os.environ.get(FACTOR, '1')
     try:
         value = float(text)
@@ -48,12 +35,7 @@ def factor() -> float:
 
 class Budget:
     """
-    What may still be read of a file.
-
-    Parameters
-    ----------
-    file : Path
-        The file.
+    Remaining decompressed size of a file.
 
     Attributes
     ----------
@@ -62,12 +44,7 @@ class Budget:
     largest : int
         Largest record [bytes].
     largest_message : int
-        Largest message that was compressed on its own [bytes].
-
-    Raises
-    ------
-    RecordingError
-        If `FACTOR` is not valid.
+        Largest message that was compressed individually [bytes].
 
     """
 
@@ -79,20 +56,7 @@ class Budget:
         self.largest_message = round(times * LARGEST_MESSAGE)
 
     def spend(self, number: int) -> None:
-        """
-        Count bytes that the file has unfolded to.
-
-        Parameters
-        ----------
-        number : int
-            Number of bytes.
-
-        Raises
-        ------
-        RecordingError
-            If there are too many.
-
-        """
+        """Count decompressed bytes; raise a RecordingError above the limit."""
         self._left -= number
         if self._left < 0:
             raise RecordingError(
@@ -101,42 +65,14 @@ class Budget:
             )
 
     def too_large(self, what: str, size: int) -> str:
-        """
-        Say that something is larger than `largest`.
-
-        Parameters
-        ----------
-        what : str
-            What it is.
-        size : int
-            Its size [bytes].
-
-        Returns
-        -------
-        str
-            A line.
-
-        """
+        """Return the message for an item of `size` bytes, above `largest`."""
         return (
             f'a {what} of {size} bytes, at most {_bytes(self.largest)} are read; {FACTOR}=10 '
             'raises this limit tenfold'
         )
 
     def metered(self, stream: Any) -> Any:
-        """
-        Return a stream of which each byte counts.
-
-        Parameters
-        ----------
-        stream : binary stream
-            Stream of decompressed bytes.
-
-        Returns
-        -------
-        binary stream
-            The same, with ``read`` alone, as a context.
-
-        """
+        """Wrap a stream of decompressed bytes so that each byte read is counted."""
         return _Metered(stream, self)
 
 

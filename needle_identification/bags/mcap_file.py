@@ -1,8 +1,7 @@
 """
-Messages of MCAP files, also of damaged ones.
+Read messages of MCAP files, also of truncated or damaged files.
 
-A file is read from its start and chunk by chunk. One whose end is missing gives all that it
-holds, and a long file needs no more memory than a short one.
+A file is read from its start, chunk by chunk, in bounded memory.
 """
 
 from __future__ import annotations
@@ -45,18 +44,18 @@ _CHUNK: Final = struct.Struct('<QQQII')
 #: The end of a file: a footer record and the magic bytes.
 _TAIL: Final = struct.Struct('<BQQQI8s')
 
-#: What comes before the data of a message.
+#: Header of a message record.
 _MESSAGE: Final = np.dtype(
     [('channel', '<u2'), ('sequence', '<u4'), ('received', '<u8'), ('published', '<u8')]
 )
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
-#: What is raised at damaged bytes.
+#: Exceptions for damaged bytes.
 DAMAGED_MCAP: Final = (*DAMAGED, McapError)
 
 
 class _Channels:
-    """Topics of a file by channel, and the messages of each by the statistics of the file."""
+    """Topics of a file by channel, and the message counts of the statistics record."""
 
     def __init__(self) -> None:
         self.topics: dict[int, Topic] = {}
@@ -64,7 +63,7 @@ class _Channels:
         self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
 
     def define(self, opcode: int, record: bytes) -> None:
-        """Add a record if it is a schema, a channel or the statistics."""
+        """Add a schema, channel or statistics record; ignore other records."""
         stream = ReadDataStream(BytesIO(record))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -85,20 +84,7 @@ class _Channels:
 
 
 def indexed_topics(file: Path) -> set[Topic] | None:
-    """
-    List the topics of a file by its own index.
-
-    Parameters
-    ----------
-    file : Path
-        An ``.mcap`` file.
-
-    Returns
-    -------
-    set of Topic or None
-        Topics with messages; None if the file has no valid index.
-
-    """
+    """Return the topics with messages by the index of a file; None without a valid index."""
     channels = _Channels()
     try:
         with file.open('rb') as stream:
@@ -107,14 +93,14 @@ def indexed_topics(file: Path) -> set[Topic] | None:
             if (footer, magic) != (Opcode.FOOTER, _MAGIC) or not start or not checksum:
                 return None
             stream.seek(start)
-            # The checksum covers everything before itself.
+            # The checksum covers all bytes before it.
             summary = stream.read()[: -4 - len(_MAGIC)]
         if zlib.crc32(summary) != checksum:
             return None
         for begin, end in _records(summary):
             for first, after in zip(begin.tolist(), end.tolist(), strict=True):
                 channels.define(summary[first - _HEAD.size], summary[first:after])
-        # A topic has a further channel when it got further publishers: the last knows them all.
+        # New publishers of a topic add a channel: the last channel has the QoS of all of them.
         latest = {topic: topic for topic in channels.topics.values()}
         found = {channels.topics[id_] for id_, number in channels.counts.items() if number}
         return {latest[topic] for topic in found} or None
@@ -124,25 +110,9 @@ def indexed_topics(file: Path) -> set[Topic] | None:
 
 def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
     """
-    Read an MCAP file.
+    Read an MCAP file, compressed or not; yield the messages of the selected topics.
 
-    Parameters
-    ----------
-    file : Path
-        An ``.mcap`` file, compressed or not.
-    tally : Tally
-        Counts what is read.
-
-    Yields
-    ------
-    Batch
-        Messages of the wanted topics.
-
-    Raises
-    ------
-    RecordingError
-        If it is not an MCAP file.
-
+    Raises a RecordingError if it is not an MCAP file.
     """
     channels = _Channels()
     loose = bytearray()
@@ -181,13 +151,13 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
 
 
 def _skip(stream: Any, length: int) -> None:
-    """Read past bytes, in bounded memory."""
+    """Skip bytes of a stream, in bounded memory."""
     while length > 0 and (part := read_up_to(stream, min(length, BLOCK))):
         length -= len(part)
 
 
 def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
-    """Return the records of a chunk; of one that is cut off, what there is; none if damaged."""
+    """Return the records of a chunk: all available if truncated, none if damaged."""
     try:
         _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
         begin = _CHUNK.size + name_length + 8
@@ -207,7 +177,7 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
 
 
 def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Yield where the whole records begin and end after their heads, in groups."""
+    """Yield the begin (after the head) and end of complete records, in groups."""
     length_of, head = struct.Struct('<Q').unpack_from, _HEAD.size
     position, size = 0, len(content)
     is_more = True
@@ -231,7 +201,7 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batc
     for begin, end in _records(content):
         opcodes = data[begin - _HEAD.size]
         for k in np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)):
-            # The messages of a channel that cannot be read are of an unknown topic.
+            # Messages of an unreadable channel are counted as of an unknown topic.
             with suppress(*DAMAGED_MCAP):
                 channels.define(opcodes[k], content[begin[k] : end[k]])
         tally.piece += 1

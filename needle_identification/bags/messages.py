@@ -1,4 +1,4 @@
-"""Types of messages, and messages as objects; no ROS is needed."""
+"""Message definitions, and serialization of messages, without ROS."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def message_type(type_name: str) -> Any:
     Returns
     -------
     type
-        The class.
+        Message class.
 
     Raises
     ------
     RecordingError
-        If it is not a type of ROS 2 Jazzy.
+        If the type is not in ROS 2 Jazzy.
 
     """
     try:
@@ -58,7 +58,7 @@ def message_type(type_name: str) -> Any:
 
 @lru_cache(maxsize=64)
 def _installed(type_name: str) -> Typestore:
-    """Return a store that knows a type, those within it from their .msg files if need be."""
+    """Return a store with a type; types outside Jazzy are read from installed .msg files."""
     store, types, wanted = _jazzy(), {}, [type_name]
     while wanted:
         name = wanted.pop()
@@ -76,44 +76,31 @@ def _installed(type_name: str) -> Typestore:
 
 
 def _message_in(kind: Any) -> str | None:
-    """Return the type of the message in a field, if there is one; arrays wrap another kind."""
+    """Return the message type of a field (element type of an array), or None."""
     while kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         kind = kind[1][0]
     return str(kind[1]) if kind[0] == Nodetype.NAME else None
 
 
 def _message_file(type_name: str) -> Path:
-    """Return the file that defines a type in a sourced workspace."""
+    """Return the .msg file of a type in the sourced workspaces."""
     package, _, name = type_name.partition('/msg/')
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         path = Path(prefix) / 'share' / package / 'msg' / f'{name}.msg'
         if prefix and path.is_file():
             return path
     raise RecordingError(
-        f'no definition of {type_name}: it is no type of ROS 2 Jazzy, and no package of the '
+        f'no definition of {type_name}: it is not a type of ROS 2 Jazzy, and no package of the '
         'sourced workspaces has it as a .msg file'
     )
 
 
 def definition_of(type_name: str) -> tuple[str, str]:
     """
-    Return what a bag stores of a message type.
+    Return the definition (``ros2msg``) and the type hash of a message type, as stored in a bag.
 
-    Parameters
-    ----------
-    type_name : str
-        Type, such as ``sensor_msgs/msg/JointState``.
-
-    Returns
-    -------
-    definition, type_hash : str
-        Definition in the language ``ros2msg``, and hash of the type.
-
-    Raises
-    ------
-    RecordingError
-        If it is not a type of ROS 2 Jazzy nor installed, or its definition is not readable.
-
+    Raises a RecordingError if the type is neither in ROS 2 Jazzy nor installed, or its definition
+    is not readable.
     """
     try:
         store = _installed(type_name)
@@ -135,7 +122,7 @@ def encode(message: Any) -> bytes:
     Returns
     -------
     bytes
-        The message as on the wire (CDR).
+        Serialized message (CDR).
 
     """
     return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
@@ -148,9 +135,9 @@ def deserialize(topic: Topic, data: bytes) -> Any:
     Parameters
     ----------
     topic : Topic
-        Topic of a bag; the bag holds the definition if the type is not of ROS 2 Jazzy.
+        Topic of a bag; a type outside ROS 2 Jazzy is defined in the bag.
     data : bytes
-        The message as on the wire (CDR).
+        Serialized message (CDR).
 
     Returns
     -------
@@ -160,7 +147,7 @@ def deserialize(topic: Topic, data: bytes) -> Any:
     Raises
     ------
     RecordingError
-        If the type is unknown, or the bytes are not of that type.
+        If the type is unknown, or the bytes are not a message of this type.
 
     """
     store = _store(topic.type_name, topic.encoding, topic.definition)
@@ -172,7 +159,7 @@ def deserialize(topic: Topic, data: bytes) -> Any:
 
 @lru_cache(maxsize=64)
 def _store(type_name: str, encoding: str, definition: str) -> Typestore:
-    """Return a store that knows a type: that of Jazzy, else one with the definition of the bag."""
+    """Return a store with a type: the Jazzy store, or a store with the definition of the bag."""
     known = _jazzy().fielddefs
     if type_name in known:
         return _jazzy()

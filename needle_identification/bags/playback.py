@@ -1,4 +1,4 @@
-"""Playback of a bag: which message is due when, in the time of the recording."""
+"""Play back a bag: schedule its messages in recorded time."""
 
 from __future__ import annotations
 
@@ -15,27 +15,23 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 
-#: Longest pause between two messages that is believed: a day [ns].
+#: Longest plausible pause between two messages: a day [ns].
 _LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaybackSettings:
     """
-    Which part of a recording is played, and how fast; each field says its meaning and unit.
+    Interval and rate of playback; each field has its meaning and unit.
 
-    Raises
-    ------
-    ParameterError
-        If a setting is out of range, or end is not after start.
-
+    Raises a ParameterError if a setting is out of range, or `end` is not after `start`.
     """
 
     rate: float = constant(
         1.0, '1', 'playback speed relative to the recording; 0: as fast as possible'
     )
-    start: float = constant(0.0, 's', 'time in the recording at which to begin')
-    end: float = constant(0.0, 's', 'time in the recording at which to end; 0: its end')
+    start: float = constant(0.0, 's', 'start time in the recording')
+    end: float = constant(0.0, 's', 'end time in the recording; 0: end of the recording')
     delay: float = constant(
         0.5, 's', 'time before the first message, for readers to find the publishers'
     )
@@ -50,35 +46,30 @@ class PlaybackSettings:
 
 class Playback:
     """
-    Goes through the messages of a bag in the order in which they were received.
+    Iterates over the messages of a bag in the order of reception, in recorded time.
 
     Parameters
     ----------
     bag : Bag
-        The recording.
+        Recording to play.
     topics : set of str
         Names of the topics to play.
     latched : mapping
-        Number of messages that are kept for late readers, by name of each latched topic. Those
-        from before the start are played first.
+        Number of messages that are kept for late readers, by name of each latched topic. Latched
+        messages from before the start are played first.
     settings : PlaybackSettings
-        Which part is played, and how fast.
+        Interval and rate of playback.
 
     Attributes
     ----------
     bag : Bag
-        The recording.
+        Recording to play.
     is_paused, is_ended : bool
-        Whether the recorded time stands still, or all is played.
+        Whether the recorded time is paused; whether all messages are played.
     late, latest : float
-        Delay of the last message, and the largest delay so far [s].
+        Delay of the last message, and the largest delay [s].
     loops : int
-        How often it began again.
-
-    Raises
-    ------
-    RecordingError
-        If there is no message to play.
+        Number of restarts at the end.
 
     """
 
@@ -87,25 +78,12 @@ class Playback:
     ) -> None:
         self.bag = bag
         self._topics, self._latched, self._settings = topics, latched, settings
-        #: Time at which the recording begins [ns].
+        #: Receive time of the first message [ns].
         self._origin = next(bag.messages(lambda _topic: True)).received
         self.start(paused=True)
 
     def start(self, *, paused: bool) -> None:
-        """
-        Play from the start.
-
-        Parameters
-        ----------
-        paused : bool
-            Whether to begin paused.
-
-        Raises
-        ------
-        RecordingError
-            If there is no message to play.
-
-        """
+        """Play from the start; raise a RecordingError if there is no message to play."""
         self._rewind()
         self.is_paused, self.is_ended = paused, False
         self.late = self.latest = 0.0
@@ -114,12 +92,12 @@ class Playback:
 
     @property
     def begin(self) -> int:
-        """Time of the recording at which to begin [ns]."""
+        """Recorded time of the start [ns]."""
         return self._origin + round(self._settings.start * NANOSECONDS)
 
     @property
     def settings(self) -> PlaybackSettings:
-        """Which part is played, and how fast; the rate may change while playing."""
+        """Interval and rate of playback; the rate may change during playback."""
         return self._settings
 
     @settings.setter
@@ -128,49 +106,28 @@ class Playback:
         self._settings = settings
 
     def _set_position(self, position: int, delay: float = 0.0) -> None:
-        """Let a time of the recording [ns] be now, or after a delay [s]."""
+        """Map a recorded time [ns] to the present time plus a delay [s]."""
         self._at, self._since = position, time.monotonic() + delay
 
     @property
     def position(self) -> int:
-        """Present time of the recording [ns]."""
+        """Present recorded time [ns]."""
         if self.is_paused or self.is_ended or self._settings.rate == 0.0:
             return self._at
         elapsed = max(0.0, time.monotonic() - self._since)
         return self._at + round(elapsed * self._settings.rate * NANOSECONDS)
 
     def seconds(self, position: int) -> float:
-        """
-        Return a time of the recording relative to its begin.
-
-        Parameters
-        ----------
-        position : int
-            Time of the recording [ns].
-
-        Returns
-        -------
-        float
-            Time [s].
-
-        """
+        """Convert a recorded time [ns] to the time since the begin of the recording [s]."""
         return (position - self._origin) / NANOSECONDS
 
     def pause(self, paused: bool) -> None:
-        """
-        Let the recorded time stand still, or go on.
-
-        Parameters
-        ----------
-        paused : bool
-            Whether to stand still.
-
-        """
+        """Pause or resume the recorded time."""
         self._set_position(self.position)
         self.is_paused = paused
 
     def _rewind(self) -> None:
-        """Go to the start: keep what was latched before, and have the first message ready."""
+        """Return to the start: collect earlier latched messages and read the first message."""
         settings = self._settings
         end = self._origin + round(settings.end * NANOSECONDS) if settings.end else None
         before: dict[str, deque[Recorded]] = {}
@@ -201,28 +158,18 @@ class Playback:
 
     @property
     def is_running(self) -> bool:
-        """Whether the recorded time runs."""
         return not (self.is_paused or self.is_ended) and time.monotonic() >= self._since
 
     @property
     def has_next(self) -> bool:
-        """Whether there is a message left."""
         return self._next is not None
 
     def is_due(self) -> bool:
         """
-        Tell whether the next message is due, and note how late it is.
+        Return whether the next message is due (False without one), and record its delay.
 
-        Returns
-        -------
-        bool
-            Whether it is due; False if there is none.
-
-        Raises
-        ------
-        RecordingError
-            If it is so much later than the one before that its receive time must be wrong.
-
+        Raises a RecordingError for an implausible receive time, more than a day after the previous
+        one.
         """
         if self._next is None:
             return False
@@ -242,15 +189,7 @@ class Playback:
         return True
 
     def take(self) -> list[Recorded]:
-        """
-        Take the next message.
-
-        Returns
-        -------
-        list of Recorded
-            The message, after those that were latched before the start; empty if there is none.
-
-        """
+        """Take the next message, after earlier latched messages; empty at the end."""
         if self._next is None:
             return []
         taken = [*self._before, self._next]
@@ -264,20 +203,7 @@ class Playback:
         return taken
 
     def finish(self, *, loop: bool) -> None:
-        """
-        At the end of the recording, begin again or end.
-
-        Parameters
-        ----------
-        loop : bool
-            Whether to begin again.
-
-        Raises
-        ------
-        RecordingError
-            If the recording is no longer readable.
-
-        """
+        """Restart or end playback at the end of the recording."""
         if loop:
             self.loops += 1
             self._rewind()

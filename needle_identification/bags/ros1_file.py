@@ -1,4 +1,4 @@
-"""Recordings of ROS 1: their messages as those of ROS 2."""
+"""Read ROS 1 recordings, with messages converted to ROS 2."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from rosbags.rosbag1.reader import decompressors
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 
-#: What the library raises at damaged bytes.
+#: Exceptions of the library for damaged bytes.
 _DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)
 
-#: The library's functions, and ours with a limit on what they return.
+#: Decompressors of the library, and replacements with a size limit.
 _BOUNDED: Final[dict[Any, Callable[[bytes, int], bytes]]] = {
     decompressors['bz2']: lambda data, size: BZ2Decompressor().decompress(data, size),
     decompressors['lz4']: lambda data, size: decompress('lz4', data, size),
@@ -31,22 +31,7 @@ _BOUNDED: Final[dict[Any, Callable[[bytes, int], bytes]]] = {
 
 
 def ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
-    """
-    Read the messages of a ``.bag`` file.
-
-    Parameters
-    ----------
-    file : Path
-        The file.
-    tally : Tally
-        Counts what is read.
-
-    Yields
-    ------
-    Batch
-        Messages of one topic, as ROS 2 would have recorded them.
-
-    """
+    """Read a ``.bag`` file; yield its messages, converted to ROS 2."""
     try:
         with Reader(file) as reader:
             for at, chunk in reader.chunks.items():
@@ -87,7 +72,7 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[Batch]:
 
 
 def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:
-    """Return a message of ROS 2; an empty one if it cannot be read."""
+    """Convert a message to ROS 2; return b'' if it is not readable."""
     try:
         return bytes(convert(data))
     except _DAMAGED:

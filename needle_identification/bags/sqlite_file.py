@@ -1,4 +1,4 @@
-"""Messages of sqlite3 files, also of damaged ones."""
+"""Read messages of sqlite3 files, also of damaged files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from needle_identification.errors import RecordingError
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
-#: Bytes that a row stands for beside its data.
+#: Size of a row in addition to its data [bytes].
 _ROW: Final = 16
 
-#: Steps of SQLite: of any query, by each byte of the file, and between two counts. A message takes
-#: about 20 steps and 40 bytes.
+#: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
+#: A message takes about 20 steps and 40 bytes.
 _STEPS: Final = 10**7
 _STEPS_PER_BYTE: Final = 20
 _STEPS_PER_CALL: Final = 10**5
@@ -31,25 +31,9 @@ _STEPS_PER_CALL: Final = 10**5
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
     """
-    Read a sqlite3 file.
+    Read a ``.db3`` file, compressed or not; yield the messages of the selected topics.
 
-    Parameters
-    ----------
-    file : Path
-        A ``.db3`` file, compressed or not.
-    tally : Tally
-        Counts what is read.
-
-    Yields
-    ------
-    Batch
-        Messages of the wanted topics.
-
-    Raises
-    ------
-    sqlite3.Error
-        If the file is damaged; what comes before is read.
-
+    At a damaged part it raises a sqlite3.Error, after yielding the messages before this part.
     """
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
@@ -59,30 +43,30 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
                 while part := read_up_to(stream, BLOCK):
                     copy.write(part)
             file = Path(folder, file.stem)
-        # A journal that was not merged into the file holds the end of a recording.
+        # An unmerged journal contains the end of the recording.
         journal = file.with_name(f'{file.name}-wal').exists()
         uri = f'file:{quote(str(file.resolve()))}?{"mode=ro" if journal else "immutable=1"}'
         database = stack.enter_context(closing(sqlite3.connect(uri, uri=True)))
         database.text_factory = bytes
-        # Otherwise nothing is read of a file whose end, with an index, is missing.
+        # Without it, a truncated file (missing index) is not readable.
         database.execute('PRAGMA writable_schema = ON')
         _bound(database, file.stat().st_size, tally)
         yield from _rows(database, tally)
 
 
 def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
-    """Let no query run for longer than the file may take, nor compute what it does not hold."""
+    """Limit the duration of queries by the file size, and reject computed tables and columns."""
     steps = _STEPS + size * _STEPS_PER_BYTE
     calls = iter(range(int(factor() * steps) // _STEPS_PER_CALL))
-    # Something other than None or 0 ends the query.
+    # A value other than None or 0 ends the query.
     database.set_progress_handler(lambda: next(calls, None) is None, _STEPS_PER_CALL)
     if hasattr(database, 'setlimit'):
-        # From Python 3.11 on.
+        # Python 3.11 or newer.
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, tally.budget.largest)
     for kind, name in database.execute('SELECT type, name FROM sqlite_master').fetchall():
         if _text(name) not in _TABLES:
             continue
-        # A view or a computed column need not end.
+        # A view or a computed column may not terminate.
         columns = database.execute(f'PRAGMA table_xinfo("{_text(name)}")').fetchall()
         if _text(kind) != 'table' or any(hidden for *_, hidden in columns):
             raise RecordingError(
@@ -94,7 +78,7 @@ def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
     """Return the topics by their key in the database."""
     definitions: dict[Any, tuple[Any, Any]] = {}
     with suppress(sqlite3.Error):
-        # Older recordings have no such table.
+        # Older recordings lack this table.
         definitions = {
             name: (encoding, definition)
             for name, encoding, definition in database.execute(
@@ -103,7 +87,7 @@ def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
         }
     profiles: dict[Any, Any] = {}
     with suppress(sqlite3.Error):
-        # The oldest recordings have no such column.
+        # The oldest recordings lack this column.
         profiles.update(database.execute('SELECT id, offered_qos_profiles FROM topics'))
     topics = {}
     for key, name, kind, form in database.execute(
@@ -117,10 +101,10 @@ def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
 
 
 def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
-    """Yield the messages of a database, as far as it is readable."""
+    """Yield the messages of a database up to its first damaged part."""
     topics = _topics(database)
     wanted = ', '.join(str(key) for key, topic in topics.items() if tally.wanted(topic))
-    # Only wanted data are loaded, not the images beside them.
+    # Load only the data of selected topics, not images.
     rows = database.execute(
         f'SELECT topic_id, timestamp, CASE WHEN topic_id IN ({wanted}) THEN data END FROM messages'  # noqa: S608
     )
@@ -130,7 +114,7 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
         try:
             some.extend(islice(rows, LARGEST_BATCH))
         except sqlite3.Error as error:
-            # What came before the fault is still good.
+            # Rows before the fault are valid.
             fault = error
         if not some:
             break

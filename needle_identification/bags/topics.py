@@ -11,7 +11,7 @@ from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import shown
 from needle_ros.timing import NANOSECONDS
 
-#: Numbers that older recordings have instead of the words of rosbag2.
+#: Names of rosbag2 for the numbers in older recordings.
 _WORDS: Final = {
     'reliability': {1: 'reliable', 2: 'best_effort'},
     'durability': {1: 'transient_local', 2: 'volatile'},
@@ -19,13 +19,13 @@ _WORDS: Final = {
     'liveliness': {1: 'automatic', 3: 'manual_by_topic'},
 }
 
-#: No limit, as the middleware says it [ns].
+#: Value of the middleware for no limit [ns].
 UNLIMITED: Final = 2**63 - 1
 
 
 class OfferedQos(NamedTuple):
     """
-    Quality of service that a publisher offers, in the words of rosbag2.
+    Quality of service that a publisher offers, with the names of rosbag2.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class OfferedQos(NamedTuple):
     depth : int
         Number of messages that are kept.
     deadline, lifespan : int
-        Longest time between messages, and that for which one counts [ns].
+        Longest time between messages, and longest lifetime of a message [ns].
     liveliness : str
         ``automatic`` or ``manual_by_topic``.
     lease : int
-        Longest time without a sign of the publisher [ns].
+        Longest time without a liveliness signal of the publisher [ns].
 
     """
 
@@ -54,12 +54,12 @@ class OfferedQos(NamedTuple):
 
     def as_mapping(self) -> dict[str, Any]:
         """
-        Return the profile as rosbag2 stores it.
+        Return the profile in the storage format of rosbag2.
 
         Returns
         -------
         dict
-            The profile.
+            Values by name.
 
         """
         return {
@@ -81,7 +81,7 @@ def _time(nanoseconds: int) -> dict[str, int]:
 
 
 def _nanoseconds(time: Mapping[str, int] | None) -> int:
-    """Return a time as stored; none, zero, and what is less stand for no limit."""
+    """Convert a stored time to ns; None, zero and negative times mean no limit."""
     if time is None:
         return UNLIMITED
     found = int(time['sec']) * NANOSECONDS + int(time['nsec'])
@@ -97,11 +97,11 @@ class Topic:
     ----------
     name, type_name : str
         Full name, and type such as ``sensor_msgs/msg/JointState``. A message encoding other than
-        that of ROS 2 follows the type in brackets, so that it is no known type.
+        CDR (ROS 2) follows the type in brackets, which makes it an unknown type.
     encoding, definition : str
         Language of the definition of the type, ``ros2msg`` or ``ros2idl``, and the definition.
     profiles : str
-        YAML of the QoS that its publishers offered, for `offered_qos`.
+        YAML of the QoS that the publishers offered, for `offered_qos`.
 
     """
 
@@ -116,12 +116,12 @@ class Topic:
 
     def offered_qos(self) -> tuple[OfferedQos, ...]:
         """
-        Read the QoS that the publishers offered.
+        Parse the QoS that the publishers offered.
 
         Returns
         -------
         tuple of OfferedQos
-            One per publisher; empty if there are none or they are not readable.
+            One per publisher; empty if missing or not readable.
 
         """
         try:
@@ -153,24 +153,12 @@ def make_topic(
     profiles: str = '',
 ) -> Topic:
     """
-    Make a topic from what a file says of it.
+    Build a topic from the names and definitions in a file.
 
-    Parameters
-    ----------
-    name, type_name : str
-        Name and type, as written; some writers leave out the middle of the type, as ROS 1 did.
-    message_encoding : str
-        Encoding of the messages; ``cdr`` is that of ROS 2.
-    encoding, definition, profiles : str
-        As in `Topic`.
-
-    Returns
-    -------
-    Topic
-        The topic, with the full name of its type and names that can be shown.
-
+    A type such as ``std_msgs/String`` (ROS 1, some writers) is completed to
+    ``std_msgs/msg/String``; a message encoding other than ``cdr`` (ROS 2) is appended to the type.
     """
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'
-    # Messages about a topic are one line, whatever a damaged file calls it.
+    # Escaped names keep error messages of damaged files on one line.
     return Topic(shown(name), shown(full), encoding, definition, profiles)

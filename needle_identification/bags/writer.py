@@ -1,4 +1,4 @@
-"""Writing of bags, as MCAP."""
+"""Write bags as MCAP."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ COMPRESSIONS: Final = tuple(_COMPRESSIONS)
 
 class BagWriter:
     """
-    Writes serialized messages into a new rosbag2 folder.
+    Writes serialized messages to a new rosbag2 folder.
 
-    ``metadata.yaml`` is written last: a folder without it was not closed. What `flush` has passed
-    on survives the end of the process.
+    ``metadata.yaml`` is written last: a folder without it was not closed. Data passed to the
+    operating system by `flush` survive the end of the process.
 
     Parameters
     ----------
     path : Path or str
-        Folder to make.
+        Folder to create.
     compression : str
         One of `COMPRESSIONS`.
 
     Attributes
     ----------
     path : Path
-        The folder.
+        Folder of the bag.
 
     Raises
     ------
     ParameterError
         If the compression is unknown.
     RecordingError
-        If the folder exists or cannot be made.
+        If the folder exists or cannot be created.
 
     Examples
     --------
@@ -92,24 +92,24 @@ class BagWriter:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of messages written so far, by topic."""
+        """Number of written messages by topic."""
         return dict(self._counts)
 
     @property
     def lost(self) -> Mapping[str, int]:
-        """Number of messages known to be lost so far, by topic."""
+        """Number of lost messages by topic."""
         return dict(self._lost)
 
     @property
     def size(self) -> int:
-        """Bytes written so far, without the chunk in progress."""
+        """Number of written bytes, without the chunk in progress."""
         return self._stream.tell()
 
     def add_topic(
         self, topic: str, type_name: str, offered: Sequence[OfferedQos] = (OfferedQos(),)
     ) -> None:
         """
-        Announce a topic, or that it has other publishers now.
+        Announce a topic, or update the QoS of its publishers.
 
         Parameters
         ----------
@@ -118,12 +118,12 @@ class BagWriter:
         type_name : str
             Message type, such as ``geometry_msgs/msg/WrenchStamped``.
         offered : sequence of OfferedQos
-            QoS of its publishers so far.
+            QoS of all of its publishers.
 
         Raises
         ------
         RecordingError
-            If the definition of the type is not known.
+            If the definition of the type is not available.
 
         """
         definition, type_hash = definition_of(type_name)
@@ -159,7 +159,7 @@ class BagWriter:
         topic : str
             Full name.
         data : bytes
-            The message as on the wire (CDR).
+            Serialized message (CDR).
         receive_ns : int
             Receive time, since the epoch [ns].
 
@@ -171,7 +171,7 @@ class BagWriter:
 
     def lose(self, topic: str, number: int) -> None:
         """
-        Take note of messages that are lost; the metadata will say so.
+        Count lost messages, which are written to the metadata.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class BagWriter:
         self._lost[topic] = self._lost.get(topic, 0) + number
 
     def flush(self) -> None:
-        """Pass everything on to the operating system."""
+        """Pass all buffered data to the operating system."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -196,7 +196,7 @@ class BagWriter:
         draft.replace(self.path / METADATA)
 
     def abort(self) -> None:
-        """Close the file without completing it, for when it can no longer be written."""
+        """Close the file without completing it, after a write error."""
         with suppress(OSError):
             self._stream.close()
 
@@ -238,18 +238,5 @@ class BagWriter:
 
 
 def described(lost: Mapping[str, int]) -> str:
-    """
-    Say how many messages are lost.
-
-    Parameters
-    ----------
-    lost : Mapping[str, int]
-        Number by topic.
-
-    Returns
-    -------
-    str
-        In one line.
-
-    """
+    """Format the numbers of lost messages by topic in one line."""
     return ', '.join(f'{number} of {topic}' for topic, number in sorted(lost.items()))

@@ -1,1 +1,1 @@
-"""Linear regression with standard errors, tests of its residuals, and estimates of parameters."""
+"""Linear regression with standard errors, residual tests, and parameter estimates."""

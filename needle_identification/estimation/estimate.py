@@ -1,4 +1,4 @@
-"""Estimates of a parameter: from one recording, and the mean over several."""
+"""Parameter estimates from one recording, and their mean over several recordings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ParameterEstimate:
     Attributes
     ----------
     name : str
-        Name; that of the field of `NeedleParameters` if there is one.
+        Name; for a model parameter, its field in `NeedleParameters`.
     symbol, unit : str
         Symbol in text, such as ``mu_s``, and unit; ``1`` for a pure number.
     value, error : float
@@ -43,17 +43,18 @@ class ParameterEstimate:
 
     def with_value(self, value: float, error: float, half_width: float) -> ParameterEstimate:
         """
-        Return a copy that is determined, with an interval symmetric about the value.
+        Return a determined copy, with an interval symmetric about the value.
 
         Parameters
         ----------
         value, error, half_width : float
-            Estimate, standard error and half the width of the 95 % interval, in its unit.
+            Estimate, standard error and half the width of the 95 % interval, in the unit of
+            the parameter.
 
         Returns
         -------
         ParameterEstimate
-            The copy.
+            Estimate with the new value.
 
         """
         interval = (value - half_width, value + half_width)
@@ -73,7 +74,7 @@ class Statistic:
     name, symbol, unit : str
         As in `ParameterEstimate`.
     mean : float
-        Mean over the recordings that determine the parameter; nan if none does.
+        Mean over the recordings that determine the parameter; nan without such a recording.
     deviation : float or None
         Standard deviation over the recordings, as in Tables 1 and 2; None for fewer than two.
     error : float
@@ -102,7 +103,7 @@ _Named = TypeVar('_Named', ParameterEstimate, Statistic)
 
 
 class Named(Generic[_Named]):
-    """Results with names: ``results[name]`` is one, and KeyError lists the names."""
+    """Results by name: ``results[name]``; a KeyError lists the valid names."""
 
     __slots__ = ()
 
@@ -118,18 +119,18 @@ class Named(Generic[_Named]):
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     """
-    Take the mean of one parameter over several recordings, as in Tables 1 and 2.
+    Compute the mean of one parameter over several recordings, as in Tables 1 and 2.
 
     The standard error of the mean is the standard deviation over the recordings divided by the
-    square root of their number. It is never smaller than the errors within the recordings allow,
-    because a few recordings may agree by chance. Where the recordings differ by more than their
-    own errors, the interval is that of Student's t, since a standard deviation from few
-    recordings is itself uncertain. Otherwise it is the mean plus and minus two standard errors.
+    square root of their number. Its lower limit results from the errors within the recordings,
+    because a few recordings may agree by chance. If the recordings differ by more than their own
+    errors, the interval is from Student's t, since a standard deviation from few recordings is
+    uncertain. Otherwise it is the mean plus and minus two standard errors.
 
     Parameters
     ----------
     parameters : sequence of ParameterEstimate
-        The parameter, one estimate per recording. Those that are not determined are left out.
+        One estimate per recording. Undetermined estimates are ignored.
 
     Returns
     -------

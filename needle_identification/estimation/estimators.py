@@ -1,4 +1,4 @@
-"""Names of the estimators of a linear regression."""
+"""Names of the estimators of linear regression."""
 
 from __future__ import annotations
 
@@ -6,27 +6,12 @@ from typing import Final
 
 from needle_ros.errors import ParameterError
 
-#: Estimators that `regress` offers.
+#: Estimators of `regress`.
 ESTIMATORS: Final = ('ordinary', 'weighted', 'huber', 'total')
 
 
 def check_estimator(estimator: str, *more: str) -> None:
-    """
-    Reject an unknown estimator.
-
-    Parameters
-    ----------
-    estimator : str
-        Name to check.
-    *more : str
-        Further names that are valid.
-
-    Raises
-    ------
-    ParameterError
-        If it is none of `ESTIMATORS` nor of these.
-
-    """
+    """Reject a name that is not in `ESTIMATORS` or in the additional names."""
     names = (*more, *ESTIMATORS)
     if estimator not in names:
         raise ParameterError(f'estimator must be one of {", ".join(names)}, got {estimator!r}')

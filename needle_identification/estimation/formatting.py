@@ -1,4 +1,4 @@
-"""Numbers as text: as many digits as the error of a number leaves it."""
+"""Format numbers with the digits that are significant for their error."""
 
 from __future__ import annotations
 
@@ -8,25 +8,13 @@ from typing import Final
 #: Text for a parameter that the data do not determine.
 UNKNOWN: Final = 'not determined by the data'
 
-#: Below this an error does not limit the digits.
+#: Smallest error that limits the digits.
 _SMALLEST_ERROR: Final = 1e-9
 
 
 def measured(value: float, error: float, unit: str = '') -> str:
     """
-    Write a value with its error.
-
-    Parameters
-    ----------
-    value, error : float
-        Estimate and standard error, or half the width of an interval.
-    unit : str
-        Unit of both; ``1`` is not written.
-
-    Returns
-    -------
-    str
-        Such as ``0.5604 ± 0.0005 N``; `UNKNOWN` if the value is not finite.
+    Format a value with its error; `UNKNOWN` for a value that is not finite.
 
     Examples
     --------
@@ -42,61 +30,17 @@ def measured(value: float, error: float, unit: str = '') -> str:
 
 
 def rounded(value: float, error: float, unit: str = '') -> str:
-    """
-    Write a value without its error, rounded to the digits that the error leaves it.
-
-    Parameters
-    ----------
-    value, error : float
-        Estimate and standard error.
-    unit : str
-        Unit; ``1`` is not written.
-
-    Returns
-    -------
-    str
-        The rounded value; `UNKNOWN` if it is not finite.
-
-    """
+    """Format a value without its error, rounded to significant digits; or `UNKNOWN`."""
     return f'{value:{_format(error)}}{_suffix(unit)}' if isfinite(value) else UNKNOWN
 
 
 def spread(deviation: float, unit: str = '') -> str:
-    """
-    Write a standard deviation with three digits.
-
-    Parameters
-    ----------
-    deviation : float
-        Standard deviation.
-    unit : str
-        Unit; ``1`` is not written.
-
-    Returns
-    -------
-    str
-        The rounded standard deviation; `UNKNOWN` if it is not finite.
-
-    """
+    """Format a standard deviation with three digits; `UNKNOWN` if not finite."""
     return rounded(deviation, 0.1 * deviation, unit)
 
 
 def between(interval: tuple[float, float]) -> str:
-    """
-    Write an interval.
-
-    Parameters
-    ----------
-    interval : (float, float)
-        Lower and upper limit.
-
-    Returns
-    -------
-    str
-        Such as ``0.559 to 0.562``, rounded to a part of the width; `UNKNOWN` if the interval is
-        not finite.
-
-    """
+    """Format an interval, such as ``0.559 to 0.562``; `UNKNOWN` if not finite."""
     low, high = interval
     if not (isfinite(low) and isfinite(high)):
         return UNKNOWN
@@ -105,7 +49,7 @@ def between(interval: tuple[float, float]) -> str:
 
 
 def _format(error: float) -> str:
-    """Return the format specification that keeps two digits of the error."""
+    """Return the format specification for two digits of the error."""
     if not _SMALLEST_ERROR < error < inf:
         return '.6g'
     return f'.{max(1 - floor(log10(error)), 0)}f'

@@ -1,20 +1,20 @@
 r"""
-How long noise remembers, and what that does to the errors of a regression.
+Estimate the autocorrelation of noise and its effect on the errors of a regression.
 
-The samples of a recording are put together to parts, as long as a filter correlates white noise.
+The samples of a recording are divided into parts, as long as a filter correlates white noise.
 Their mean residuals are modeled as white noise and exponentially correlated noise,
 
 .. math:: \operatorname{cov}(r_i, r_j) = \sigma^2 \left( w_i \delta_{ij}
    + g \, e^{-|t_i - t_j| / \tau} \right)
 
-with :math:`w_i` one over the relative length of part i. White noise alone is one of the models;
-the others are a grid of :math:`g` and :math:`\tau`, up to times longer than the recording, where
-the model is a random walk. A third kind is white noise with differences of white noise, as the
-speed has it that comes from noisy positions: what it adds to one part it takes from the next, and
-errors shrink. Each has its restricted likelihood [Patterson1971]_, which knows that
-the fit has taken a part of slow noise away. The error of a parameter is such that its 95 %
-interval is that of all models, each weighted by its probability. So errors widen with what the
-data show, and also with what they cannot exclude.
+with :math:`w_i` one over the relative length of part i. The models are white noise, and a grid of
+:math:`g` and :math:`\tau`, with times up to longer than the recording, where the model is a random
+walk. A third kind is white noise with differences of white noise, as in a velocity computed from
+noisy positions: an error added to one part is subtracted from the next, and errors shrink. The
+probability of each model follows from its restricted likelihood [Patterson1971]_, which accounts
+for the slow noise removed by the fit. The error of a parameter is such that its 95 % interval is
+the interval of all models, weighted by probability. Errors therefore include correlations that the
+data cannot exclude.
 
 References
 ----------
@@ -35,33 +35,34 @@ import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import ndtr, ndtri
 
-#: Variances of correlated over that of white noise in a part.
+#: Variances of correlated noise relative to white noise in a part.
 _RATIOS: Final = np.geomspace(0.02, 2e6, 10)
 
-#: Number of times of correlation, from half a part to so many times the recording.
+#: Number of correlation times, and the longest relative to the recording; the shortest is half a
+#: part.
 _TIMES: Final = 24
 _LONGEST: Final = 10.0
 
-#: Variances of differences over that of white noise in a part.
+#: Variances of differences relative to white noise in a part.
 _DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)
 
-#: Their probability before anything is seen.
+#: Prior probability of differences.
 _DIFFERENCED: Final = 0.1
 
-#: Probability of white noise before anything is seen. Half is too much: a memory of a fifth of a
-#: part went unseen, and 89 % of the intervals held the truth.
+#: Prior probability of white noise. 0.5 is too large: a correlation time of a fifth of a part was
+#: not detected, and 89 % of the intervals contained the true value.
 _WHITE: Final = 0.2
 
-#: Models of less probability do not count.
+#: Smallest probability of a model that is included.
 _NEGLIGIBLE: Final = 1e-6
 
-#: Halvings that find an interval to less than a thousandth of the widest.
+#: Bisection steps, for an accuracy of an interval of 1/1000 of the widest.
 _BISECTIONS: Final = 30
 
-#: Relative size of what counts as rounding.
+#: Relative size of rounding errors.
 _ROUNDING: Final = 1e-9
 
-#: Parts by which the models are judged, and parts in a run of them.
+#: Largest number of parts for the comparison of models, and parts per run.
 _MOST_PARTS: Final = 1000
 _RUN: Final = 50
 
@@ -69,14 +70,14 @@ _RUN: Final = 50
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
     """
-    Parts of about equal length, without a gap.
+    Parts of about equal length, without gaps.
 
     Attributes
     ----------
     limits : ndarray of int, shape (m, 2)
         First sample of each part, and one past its last.
     length : float
-        Length that they should have [samples].
+        Nominal length [samples].
 
     """
 
@@ -94,78 +95,24 @@ class Parts:
         return np.asarray(self.limits.mean(axis=1))
 
     def sums(self, values: FloatArray) -> FloatArray:
-        """
-        Return the sum over each part.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n, ...)
-            A value for each sample.
-
-        Returns
-        -------
-        ndarray, shape (m, ...)
-            Sums.
-
-        """
-        # The limit behind the last sample needs one more.
+        """Return the sum over each part, (m, ...), of values (n, ...)."""
+        # Padding for the limit after the last sample.
         padded = np.concatenate([values, np.zeros_like(values[:1])])
         return np.asarray(np.add.reduceat(padded, self.limits.ravel(), axis=0)[::2])
 
     def means(self, values: FloatArray) -> FloatArray:
-        """
-        Return the mean over each part.
-
-        Parameters
-        ----------
-        values : ndarray, shape (n, ...)
-            A value for each sample.
-
-        Returns
-        -------
-        ndarray, shape (m, ...)
-            Means.
-
-        """
+        """Return the mean over each part, (m, ...), of values (n, ...)."""
         return np.asarray((self.sums(values).T / self.sizes).T)
 
 
 def stretches(chosen: BoolArray) -> IntArray:
-    """
-    Find the stretches of samples that are chosen.
-
-    Parameters
-    ----------
-    chosen : ndarray of bool, shape (n,)
-        Samples that are chosen.
-
-    Returns
-    -------
-    ndarray of int, shape (m, 2)
-        First sample of each stretch, and one past its last.
-
-    """
+    """Return the first and one past the last sample of each run of chosen samples, (m, 2)."""
     edges = np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))
     return np.flatnonzero(edges).reshape(-1, 2)
 
 
 def divided(used: BoolArray, length: int) -> Parts:
-    """
-    Divide the used samples into parts.
-
-    Parameters
-    ----------
-    used : ndarray of bool, shape (n,)
-        Samples that are used.
-    length : int
-        Length over which a filter correlates white noise [samples].
-
-    Returns
-    -------
-    Parts
-        Parts of about that length; of at least half of it where the used samples allow.
-
-    """
+    """Divide the used samples, (n,), into parts of about `length`, if possible at least half."""
     limits: list[tuple[int, int]] = []
     for start, end in stretches(used).tolist():
         count = max(1, round((end - start) / length))
@@ -177,17 +124,17 @@ def divided(used: BoolArray, length: int) -> Parts:
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Memory:
     """
-    The memory of noise, and what it does to the errors.
+    Autocorrelation of noise, and its effect on the errors.
 
     Attributes
     ----------
     inflation, far : ndarray, shape (k,)
-        Error of each parameter over that with white noise: such that an interval of 95 % is right,
-        and one of 99.6 %, for tests that must hardly ever fail by chance.
+        Error of each parameter relative to white noise, for intervals of 95 % and of 99.6 %, the
+        latter for tests with few false alarms.
     length : float
-        Time of correlation of the most probable model [samples]; 0 for white noise.
+        Correlation time of the most probable model [samples]; 0 for white noise.
     ratio : float
-        Variance of correlated noise, or of differences, over that of white noise in that model.
+        Variance of correlated noise, or of differences, relative to white noise in that model.
 
     """
 
@@ -198,20 +145,9 @@ class Memory:
 
     def whitened(self, means: FloatArray, parts: Parts) -> FloatArray:
         """
-        Return what each mean says that those before it did not (Kalman filter).
+        Return the innovations of the means of the noise over parts, (m,) (Kalman filter).
 
-        Parameters
-        ----------
-        means : ndarray, shape (m,)
-            Means of the noise over parts.
-        parts : Parts
-            The parts.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Uncorrelated values with one variance, if the noise is as the model says.
-
+        They are uncorrelated with equal variance if the noise agrees with the model.
         """
         white = parts.length / parts.sizes
         if not self.length:
@@ -236,23 +172,11 @@ def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
     """
-    Find the memory of noise from what a fit leaves.
+    Estimate the autocorrelation of noise from the residuals (n,) of a fit.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (n,)
-        Response minus model.
-    regressors, influence : ndarray, shape (n, k)
-        Regressors, and the change of each parameter with the response of each sample; zero where
-        not used.
-    parts : Parts
-        Parts of the used samples.
-
-    Returns
-    -------
-    Memory
-        White noise, if there are too few parts to tell.
-
+    With too few parts, the noise is assumed white. `influence` (n, k) is the change of each
+    parameter with the response of each sample. Regressors and influence are zero for unused
+    samples.
     """
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
@@ -264,13 +188,13 @@ def memory_of(
         return Memory(inflation=ones, far=ones, length=0.0, ratio=0.0)
     white, time = parts.length / parts.sizes, parts.centers
     plain = (a**2 * white[:, np.newaxis]).sum(axis=0)
-    # The models are judged by some of the parts of a long recording.
+    # In a long recording, the models are compared on a subset of the parts.
     some = _spread_out(m)
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Without a time it is white noise
-    # with so much of differences, the first one with none.
+    # Each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Time 0: white noise with a ratio of
+    # differences, the first without.
     models, sizes, products = [], [], []
     for ratio in (0.0, *_DIFFERENCES.tolist()):
         d, e, _ = dpttrf(own + ratio, _shared(time[some], parts.length) * ratio)
@@ -286,7 +210,7 @@ def memory_of(
             sizes.append(sizes[0] + log_chain + len(some) * np.log(ratio) + float(np.log(d).sum()))
             products.append(products[0] - weighed.T @ dpttrs(d, e, weighed)[0])
     table = np.array(products)
-    # The determinant of a block times what it leaves of r is that of the whole.
+    # Determinant of the whole = determinant of the block * residual sum of squares of r.
     within = np.linalg.slogdet(table[:, :k, :k])[1]
     left = np.exp(np.linalg.slogdet(table)[1] - within)
     logs = -0.5 * (np.array(sizes) + free * np.log(left) + within)
@@ -296,7 +220,7 @@ def memory_of(
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     counts = np.flatnonzero(weights > _NEGLIGIBLE).tolist()
-    # The diagonal of a' V a, of the models that count.
+    # The diagonal of a' V a, of the included models.
     beside = (a[:-1] * a[1:] * _shared(time, parts.length)[:, np.newaxis]).sum(axis=0)
     spreads = {0.0: (a**2).sum(axis=0) + 2.0 * beside}
     deviations = []
@@ -317,7 +241,7 @@ def memory_of(
 
 
 def _spread_out(count: int) -> IntArray:
-    """Choose runs of parts, evenly over a recording: for both short and long times."""
+    """Select runs of parts, evenly over a recording: for short and long correlation times."""
     if count <= _MOST_PARTS:
         return np.arange(count)
     starts = np.linspace(0, count - _RUN, _MOST_PARTS // _RUN).astype(np.int_)
@@ -325,12 +249,12 @@ def _spread_out(count: int) -> IntArray:
 
 
 def _shared(time: FloatArray, length: float) -> FloatArray:
-    """Return the covariance of differences in neighbors: none where there is a gap."""
+    """Return the covariance of differences in neighbors; zero across a gap."""
     return np.where(np.diff(time) < 1.5 * length, -0.5, 0.0)
 
 
 def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
-    """Return diagonal and neighbors of the inverse of a chain's covariance, and its log size."""
+    """Return diagonal, off-diagonal and log determinant of the inverse covariance of a chain."""
     gaps = np.diff(time)
     kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
     diagonal = np.ones(len(time))
@@ -342,7 +266,7 @@ def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray,
 def _growth(
     weights: FloatArray, deviations: FloatArray, white: FloatArray, outside: float
 ) -> FloatArray:
-    """Return the intervals of mixtures of normal distributions over those of white noise."""
+    """Return the intervals of mixtures of normal distributions relative to white noise."""
     normal = float(ndtri(1.0 - 0.5 * outside))
     low, high = (normal * limit(deviations, axis=0) for limit in (np.min, np.max))
     for _ in range(_BISECTIONS):

@@ -1,20 +1,21 @@
 r"""
-Linear regression with standard errors that respect autocorrelation.
+Linear regression with standard errors for autocorrelated noise.
 
 With the regressors :math:`x_i` of sample i and its response :math:`y_i`, the estimators solve
 
 .. math:: \sum_i w_i \, x_i (y_i - x_i^T \beta) + n \Sigma \beta = 0
 
 ``ordinary``: w = 1. ``weighted``: w = 1 / (noise variance measured in the group of the sample),
-the matrix W of section 3.2.2.1 of the paper. ``huber``: w falls with the size of the
-residual [Huber1981]_. ``total``: Sigma is the covariance of the noise of the regressors, which
-ordinary least squares takes for signal; this is total least squares with exact and noisy columns
-and free noise of the response, which has a closed solution [VanHuffel1991]_.
+the matrix W of section 3.2.2.1 of the paper. ``huber``: w falls with the size of the residual
+[Huber1981]_. ``total``: Sigma is the covariance of the noise of the regressors, which biases
+ordinary least squares; this is total least squares with exact and noisy columns and free noise of
+the response, which has a closed solution [VanHuffel1991]_.
 
-The covariance of the parameters comes from the sums of their scores over a triangular window, so
-that it holds for noise that is correlated over the window, uneven, or both [NeweyWest1987]_. Noise
-that may be correlated for longer is modeled, and the errors grow by what the window misses; see
-`memory`. Intervals are those of Student's t, with the degrees of freedom of Satterthwaite.
+The covariance of the parameters is computed from the sums of their scores over a triangular
+window, so that it is valid for noise that is correlated over the window, heteroskedastic, or both
+[NeweyWest1987]_. Noise with a longer correlation is modeled, and the errors are increased
+accordingly; see `memory`. Intervals are from Student's t, with the degrees of freedom of
+Satterthwaite.
 
 References
 ----------
@@ -45,10 +46,10 @@ from scipy.special import fdtrc, stdtrit
 #: determined: an error of 1 % in the response would change a parameter by a fifth.
 LARGEST_CONDITION: Final = 20.0
 
-#: Share of such a direction that a determined parameter may have; its error includes it.
+#: Largest component of a determined parameter in such a direction; its error includes it.
 _LARGEST_SHARE: Final = 0.1
 
-#: Relative size of what counts as rounding.
+#: Relative size of rounding errors.
 _ROUNDING: Final = 1e-9
 
 #: Weight of the noise of all groups in the variance of each group [correlation windows].
@@ -90,7 +91,7 @@ class Regression:
     degrees_of_freedom : ndarray, shape (k,)
         Degrees of freedom of the errors; few where few samples determine a parameter.
     memory : Memory or None
-        Memory of the noise, which the errors allow for; None if it was not asked for.
+        Autocorrelation of the noise, included in the errors; None if not requested.
 
     """
 
@@ -113,7 +114,7 @@ class Regression:
 
     @property
     def is_exact(self) -> bool:
-        """Whether what is left of the response is rounding."""
+        """Whether the residuals are rounding errors only."""
         return 1.0 - self.determination < _ROUNDING
 
     def interval(self, level: float = 0.95) -> FloatArray:
@@ -142,7 +143,7 @@ class Regression:
         Parameters
         ----------
         which : sequence of int
-            Their positions; all determined.
+            Indices of the parameters, all determined.
 
         Returns
         -------
@@ -165,17 +166,18 @@ class Regression:
 
     def differs(self, whole: Regression, count: int) -> float:
         """
-        Test whether this fit to a part of the samples contradicts that to all of them.
+        Test whether this fit to a part of the samples contradicts the fit to all samples.
 
-        Where the model holds for all, the parameters differ by no more than their errors here
-        (Hausman's test; the errors of ``whole`` would make it sharper, but not safer).
+        If the model holds for all samples, the parameters differ by at most their errors in this
+        fit (Hausman's test; including the errors of ``whole`` would increase the power, but not
+        the safety).
 
         Parameters
         ----------
         whole : Regression
             Fit of the same parameters to these samples and others.
         count : int
-            How many parameters to compare, from the first.
+            Number of parameters to compare, from the first.
 
         Returns
         -------
@@ -193,10 +195,10 @@ class Regression:
 
 class _Solution(NamedTuple):
     """
-    Parameters (k,), inverse of the normal matrix (k, k), and of each sample its influence (n, k).
+    Parameters (k,), inverse normal matrix (k, k), influence and scores of each sample (n, k).
 
-    The influence is the change of the normal equations with the response of the sample; its
-    scores (n, k) are its share in these equations, and sum to zero.
+    The influence is the change of the normal equations with the response of the sample; the scores
+    are the contribution of the sample to these equations, and sum to zero.
     """
 
     values: FloatArray
@@ -228,21 +230,20 @@ def regress(
     estimator : str
         One of `ESTIMATORS`.
     correlation : int
-        Length over which the noise is correlated [samples]; 1 if the samples are independent.
+        Correlation length of the noise [samples]; 1 for independent samples.
     groups : ndarray of int, shape (n,), optional
         Group of each sample, in which ``weighted`` measures the noise.
     regressor_noise : ndarray, shape (k,), optional
         Standard deviation of the noise of each column, for ``total``.
     used : ndarray of bool, shape (n,), optional
-        Samples to use; default all. Samples that are not used keep the others at their true
-        distance in time.
+        Samples to use; default all. Unused samples preserve the time between the others.
     colored : bool
-        Whether the noise may be correlated for longer, and the errors shall allow for it.
+        Whether the errors include a longer correlation of the noise.
 
     Returns
     -------
     Regression
-        Parameters with errors. Those that the regressors do not determine are marked.
+        Parameters with errors; undetermined parameters are marked.
 
     Raises
     ------
@@ -277,7 +278,7 @@ def regress(
     norms[norms == 0.0] = 1.0
     x = x / norms
     singular, directions = np.linalg.svd(x, full_matrices=False)[1:]
-    # Null directions are left out; parameters without a part in them are still solved.
+    # Null directions are omitted; parameters without a component in them are still solved.
     basis, unknown = determinable(singular, directions)
     x = x @ basis
     if estimator == 'ordinary':
@@ -307,11 +308,11 @@ def _with_errors(
     singular: FloatArray,
     colored: bool,
 ) -> Regression:
-    """Add covariance and degrees of freedom, and go back to the columns that were given."""
+    """Add covariance and degrees of freedom, and transform back to the given columns."""
     samples, k = int(np.count_nonzero(used)), len(unknown)
     effective = samples / independent_span(correlation)
     residual = y - x @ solution.values
-    # The fit itself takes as many degrees of freedom as it has parameters.
+    # The fit uses one degree of freedom per parameter.
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
     # Effective number of samples behind each parameter, from the share of each sample in its
     # variance (Satterthwaite).
@@ -383,11 +384,11 @@ def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
     """
-    Weigh each sample by the inverse of the noise variance measured in its group.
+    Weight each sample by the inverse of the noise variance measured in its group.
 
-    The variance of a group is taken about its own mean, so that a misfit of the model does not
-    count as noise. A few correlation windows of the noise of all groups are added to each group,
-    because a group of few samples may look less noisy than it is.
+    The variance of a group is about its own mean, which excludes a misfit of the model. The noise
+    of all groups enters with the weight of a few correlation windows, because a group of few
+    samples may have a small variance by chance.
     """
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
@@ -429,7 +430,7 @@ def _huber(x: FloatArray, y: FloatArray, used: BoolArray) -> _Solution:
 
 
 def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> _Solution:
-    """Solve without the part of the normal matrix that is noise of the regressors."""
+    """Solve with the noise of the regressors subtracted from the normal matrix."""
     normal = x.T @ x - np.count_nonzero(used) * noise
     if np.linalg.eigvalsh(normal)[0] <= 0.0:
         raise IdentificationError('the noise of the regressors exceeds their variation')
@@ -440,22 +441,11 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
     """
-    Decide which parameters regressors of unit norm determine.
+    Return a basis of the directions that regressors determine, and the undetermined parameters.
 
-    Parameters
-    ----------
-    singular : ndarray, shape (k,)
-        Singular values of the regressors, largest first.
-    directions : ndarray, shape (k, k)
-        Their directions in the space of the parameters, one per row.
-
-    Returns
-    -------
-    basis : ndarray, shape (k, r)
-        Directions that are not null, one per column.
-    unknown : ndarray of bool, shape (k,)
-        Parameters that have a part in a direction that is null or nearly null.
-
+    Inputs are the singular values of the regressors of unit norm, (k,), largest first, and their
+    directions, one per row (k, k). Returned are the directions that are not null, one per column
+    (k, r), and a mask of the undetermined parameters, (k,).
     """
     null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
@@ -475,45 +465,19 @@ def _window(length: int) -> FloatArray:
 
 
 def independent_span(correlation: int) -> float:
-    """
-    Return how many correlated samples count as one independent sample.
-
-    Parameters
-    ----------
-    correlation : int
-        Length over which the noise is correlated [samples].
-
-    Returns
-    -------
-    float
-        Span of the triangular window of that length [samples].
-
-    """
+    """Return the number of correlated samples [samples] with the information of one sample."""
     window = _window(correlation)
     return float(window.sum()) ** 2 / float(window @ window)
 
 
 def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
     """
-    Return the covariance of the sum of correlated scores.
+    Return the covariance (k, k) of the sum of correlated scores (n, k).
 
-    The scores are summed over all positions of a triangular window. This weighs their
-    autocovariances with the autocorrelation of the window, the Parzen kernel, which is flat at
-    lag zero and gives no negative variance. Samples that are not used have score zero and keep
-    the others at their true distance.
-
-    Parameters
-    ----------
-    scores : ndarray, shape (n, k)
-        Scores.
-    correlation : int
-        Length over which the noise is correlated [samples].
-
-    Returns
-    -------
-    ndarray, shape (k, k)
-        Covariance.
-
+    The scores are summed over all positions of a triangular window. This weights their
+    autocovariances with the autocorrelation of the window, the Parzen kernel, which is flat at lag
+    zero and gives no negative variance. Unused samples have score zero, which preserves the time
+    between the others.
     """
     window = _window(correlation)
     padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))

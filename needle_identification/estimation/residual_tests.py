@@ -1,4 +1,4 @@
-"""Tests of the residuals of a fit, valid for correlated noise."""
+"""Test the residuals of a fit, with validity for correlated noise."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from needle_identification.estimation.memory import Memory, Parts
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
-#: Fewest parts of the residual that are tested.
+#: Smallest number of parts for any test.
 _FEWEST_PARTS: Final = 10
 
-#: Fewest parts for the test of d'Agostino and Pearson; below, that of Shapiro and Wilk.
+#: Smallest number of parts for the test of d'Agostino and Pearson; below, Shapiro and Wilk.
 _FEWEST_FOR_MOMENTS: Final = 20
 
-#: p-value below which a test fails: one recording in a hundred fails any of the four by chance.
+#: p-value below which a test fails: 1 % of the recordings fail any of the four by chance.
 _SIGNIFICANCE: Final = 0.0025
 
-#: What each test says if it fails, and if it does not.
+#: Result of each test in words, if failed and if passed.
 _WORDS: Final = {
     'normality': (
         'the residuals are not normal: outliers change the estimates; consider estimator huber',
@@ -62,7 +62,6 @@ class ResidualTest:
 
     @property
     def failed(self) -> bool:
-        """Whether the test is evidence against the model."""
         return self.p_value < _SIGNIFICANCE
 
 
@@ -76,26 +75,10 @@ def residual_tests(
     parameters: int,
 ) -> tuple[ResidualTest, ...]:
     """
-    Test the means of the residual over parts, less what the memory of the noise explains.
+    Test the means of the residual over parts, whitened by the noise model.
 
-    They are nearly independent, although the samples are not.
-
-    Parameters
-    ----------
-    residual, time, speed : ndarray, shape (n,)
-        Response minus model, time [s], and the speed that it may depend on.
-    parts : Parts
-        Parts of the samples that were fitted, as long as a filter correlates them.
-    memory : Memory
-        Memory of the noise that the errors allow for.
-    parameters : int
-        Number of fitted parameters.
-
-    Returns
-    -------
-    tuple of ResidualTest
-        The tests for which there are enough parts.
-
+    These means are nearly independent, although the samples are correlated. `residual` (response
+    minus model), `time` [s] and `speed` have shape (n,). Tests with too few parts are omitted.
     """
     if len(parts.limits) < _FEWEST_PARTS:
         return ()
@@ -107,7 +90,7 @@ def residual_tests(
         if len(groups) > parameters:
             found['speed'] = _lack_of_fit(means, groups, parameters)
             found['spread'] = _equal_spread([means[group] for group in groups])
-    # Residuals that are all equal give nan.
+    # Equal residuals give nan.
     return tuple(
         ResidualTest(name=name, statistic=statistic, p_value=p_value, words=_words(name, p_value))
         for name, (statistic, p_value) in found.items()
@@ -123,7 +106,7 @@ def _words(name: str, p_value: float) -> str:
 def _normality(values: FloatArray) -> tuple[float, float]:
     """Test for a normal distribution by skewness and kurtosis (d'Agostino and Pearson)."""
     if len(values) < _FEWEST_FOR_MOMENTS:
-        # A large import that few recordings need.
+        # Lazy import: large, and needed for short recordings only.
         from scipy.stats import shapiro
 
         with warnings.catch_warnings():
@@ -151,7 +134,7 @@ def _skewness_score(skewness: float, n: float) -> float:
 
 
 def _kurtosis_score(kurtosis: float, n: float) -> float:
-    """Transform the kurtosis of n normal values likewise (Anscombe and Glynn)."""
+    """Transform the kurtosis of n normal values to a standard normal (Anscombe and Glynn)."""
     mean = 3.0 * (n - 1) / (n + 1)
     variance = 24.0 * n * (n - 2) * (n - 3) / ((n + 1) * (n + 1.0) * (n + 3) * (n + 5))
     x = (kurtosis - mean) / variance**0.5
@@ -174,7 +157,7 @@ def _trend(times: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def _ranks(values: FloatArray) -> FloatArray:
-    """Rank values from one; equal values have their mean rank."""
+    """Rank values from 1; equal values have their mean rank."""
     _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - (counts - 1) / 2.0)[places])
 
@@ -182,7 +165,7 @@ def _ranks(values: FloatArray) -> FloatArray:
 def _lack_of_fit(
     residual: FloatArray, groups: list[IntArray], parameters: int
 ) -> tuple[float, float]:
-    """Compare the misfit between groups with the noise within them (F test)."""
+    """Compare the misfit between groups with the noise within groups (F test)."""
     between = sum(len(g) * residual[g].mean() ** 2 for g in groups)
     within = sum(((residual[g] - residual[g].mean()) ** 2).sum() for g in groups)
     free = len(groups) - parameters, len(residual) - len(groups)

@@ -1,9 +1,10 @@
 r"""
-Further columns beside those of a least squares fit, tried at little cost.
+Screen additional columns for a least squares fit at little cost.
 
-What further columns Z explain beside X is what the rest :math:`\tilde Z` of their own regression
-on X explains of the residual [Frisch1933]_. The covariance of their coefficients comes from sums
-of scores over parts that are as long as the noise is correlated.
+The explanatory power of additional columns Z to the columns X is the power of the rest
+:math:`\tilde Z` of their own regression on X for the residual [Frisch1933]_. The covariance of
+their coefficients is computed from sums of scores over parts with the correlation length of the
+noise.
 
 References
 ----------
@@ -26,16 +27,16 @@ from scipy.special import fdtrc
 
 class Trial(NamedTuple):
     """
-    Further columns in a fit.
+    Result of additional columns in a fit.
 
     Attributes
     ----------
     values, errors : ndarray, shape (q,)
-        Their coefficients and standard errors.
+        Coefficients of the columns, and standard errors.
     determined : bool
-        Whether the data distinguish them from the other columns.
+        Whether the data distinguish the columns from the other columns.
     misfit : float
-        Sum of squares that is left.
+        Residual sum of squares.
     p_value : float
         p-value of the test that all coefficients are zero.
 
@@ -50,23 +51,23 @@ class Trial(NamedTuple):
 
 class Screening:
     """
-    Tries columns beside those of a least squares fit.
+    Least squares fit to which additional columns are added on trial.
 
     Parameters
     ----------
     regressors : ndarray, shape (n, k)
         Columns of the fit, of the used samples only.
     response : ndarray, shape (n,)
-        Response of these.
+        Response of the used samples.
     parts : Parts
         Parts of the used samples.
 
     Attributes
     ----------
     values, errors : ndarray, shape (k,)
-        Coefficients of the fit, and their standard errors if the noise has no memory.
+        Coefficients of the fit, and their standard errors for uncorrelated noise.
     misfit : float
-        Sum of squares that the fit leaves.
+        Residual sum of squares of the fit.
 
     """
 
@@ -87,20 +88,7 @@ class Screening:
         )
 
     def tried(self, columns: FloatArray) -> Trial:
-        """
-        Add columns to the fit.
-
-        Parameters
-        ----------
-        columns : ndarray, shape (n, q)
-            Further columns, of the used samples.
-
-        Returns
-        -------
-        Trial
-            What they explain.
-
-        """
+        """Fit with additional columns (n, q) of the used samples."""
         norms = _norms(columns)
         z = columns / norms
         k, q = len(self._gram), z.shape[1]
@@ -139,20 +127,7 @@ class Screening:
         return determinable(singular, directions[:, ::-1].T)[1]
 
     def misfit_without(self, columns: Sequence[int]) -> float:
-        """
-        Leave out columns of the fit.
-
-        Parameters
-        ----------
-        columns : sequence of int
-            Their positions.
-
-        Returns
-        -------
-        float
-            Sum of squares that the others leave.
-
-        """
+        """Return the residual sum of squares without some columns of the fit."""
         kept = np.setdiff1d(np.arange(len(self._gram)), columns)
         moment = self._moment[kept]
         inverse = np.linalg.pinv(self._gram[np.ix_(kept, kept)], hermitian=True)

@@ -2,5 +2,5 @@
 
 from typing import Final
 
-#: Stamps that a recording may use: those of the headers of its messages, or the receive times.
+#: Sources of the stamps of a recording: message headers or receive times.
 TIMES: Final = ('header', 'receive')

@@ -1,4 +1,4 @@
-"""What a recording holds, which of it looks like force and motion, and how to identify from it."""
+"""Inspect a recording: list its content, find force and motion, suggest a command."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from needle_ros import wire
 from needle_ros.errors import NeedleError
 import numpy as np
 
-#: Types with the motion of something, and that of a force.
+#: Message types of motions and of forces.
 _MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
 _FORCE: Final = (wire.WRENCH,)
 
-#: Types whose numbers are speeds.
+#: Message types of velocities.
 _SPEEDS: Final = (wire.TWIST,)
 
-#: What counts as motion: this part of the largest speed.
+#: Smallest speed in motion, as a fraction of the largest speed.
 _MOVING: Final = 0.05
 
-#: Part of the force that sign and speed of a motion must explain to look like friction.
+#: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
 _EXPLAINED: Final = 0.3
 
-#: Joints of a topic that are looked at.
+#: Largest number of joints of a topic that are inspected.
 _MAX_JOINTS: Final = 64
 
-#: Samples on which pairs of force and motion are tried.
+#: Largest number of samples on which a pair of force and motion is fitted.
 _TRIED: Final = 20_000
 
 
@@ -59,7 +59,7 @@ class Column(NamedTuple):
     name : str
         Axis, joint, or name of the column.
     low, high : float
-        Its range.
+        Range of its values.
 
     """
 
@@ -76,15 +76,15 @@ class Content:
     Attributes
     ----------
     name, type_name : str
-        Name and type of the topic; of a table ``table``.
+        Name and type of the topic, or file name and ``table``.
     count : int
-        Messages, or rows.
+        Number of messages or rows.
     rate : float
-        Messages per second, by the median of the steps; nan if it was not looked at.
+        Messages per second, from the median step; nan if not inspected.
     gaps : int
         Number of pauses of more than ten steps.
     columns : tuple of Column
-        Its components with their ranges; none if the type is not read.
+        Components with their ranges; none if the type is not supported.
 
     """
 
@@ -99,20 +99,20 @@ class Content:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
     """
-    What a recording holds.
+    Content of a recording, and a command to identify from it.
 
     Attributes
     ----------
     path : str
-        The recording.
+        Path of the recording.
     contents : tuple of Content
-        Its topics, or the table.
+        Topics, or the table.
     losses : tuple of str
-        What is missing or damaged.
+        Missing or damaged parts.
     words : tuple of str
-        What looks like force and motion.
+        Probable force and motion, with the reason.
     command : str
-        The command that identifies friction from it; '' if nothing looks like force and motion.
+        Command for identification; '' if no force and motion were found.
 
     """
 
@@ -125,7 +125,7 @@ class Inspection:
 
 def inspect_recording(path: Path | str) -> Inspection:
     """
-    Look into a recording.
+    Inspect the content of a recording.
 
     Parameters
     ----------
@@ -135,12 +135,12 @@ def inspect_recording(path: Path | str) -> Inspection:
     Returns
     -------
     Inspection
-        What it holds.
+        Content and suggested command.
 
     Raises
     ------
     RecordingError
-        If it cannot be read.
+        If the recording is not readable.
 
     Examples
     --------
@@ -187,7 +187,7 @@ def _column(name: str, values: FloatArray) -> Column:
 
 
 class _Signal(NamedTuple):
-    """A component of a topic over time; `speed` if it is one."""
+    """A component of a topic over time: stamps [ns], values in SI units."""
 
     topic: Topic
     axis: str
@@ -239,7 +239,7 @@ def _presses(path: Path) -> bool:
 
 
 def _joints(bag: Bag, topics: Sequence[Topic]) -> Mapping[Topic, list[str]]:
-    """Return the names of the joints of each JointState, from its first messages."""
+    """Return the joint names of each JointState topic, from its first messages."""
     states = [topic for topic in topics if topic.type_name == wire.JOINT_STATE]
     return {
         topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
@@ -275,7 +275,7 @@ def _signals(topic: Topic, axes: Sequence[str], samples: Samples) -> Iterator[_S
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
-    """Find the pair of force and motion that looks most like friction."""
+    """Find the pair of force and motion that is most similar to friction."""
     forces = [one for one in signals if one.topic.type_name in _FORCE]
     motions = [one for one in signals if one.topic.type_name in _MOTION]
     best: tuple[float, float, _Signal, _Signal] | None = None
@@ -287,15 +287,15 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
     if best is None or best[0] < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
         why = (
-            f'nothing that varies is a {" or a ".join(lacking)}'
+            f'no varying {" or ".join(lacking)}'
             if lacking
-            else ('no force follows the direction of a motion')
+            else ('no force depends on the direction of a motion')
         )
-        return [f'nothing looks like friction: {why}'], ''
+        return [f'no friction found: {why}'], ''
     explained, size, force, motion = best
     what = (
-        f'{force.topic.name} {force.axis} looks like the force, {motion.topic.name} '
-        f'{motion.axis} like the motion: its direction and speed explain '
+        f'{force.topic.name} {force.axis} is probably the force, {motion.topic.name} '
+        f'{motion.axis} the motion: its direction and speed explain '
         f'{100.0 * explained:.0f} % of the force'
     )
     words = [what]
@@ -306,7 +306,7 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
         options += ['--motion-topic', motion.topic.name]
     turned = '-' if size < 0.0 else ''
     if turned:
-        words.append('the force is against the motion: turned around')
+        words.append('the force is opposite to the motion: sign reversed')
     if turned or force.axis != 'y':
         options += ['--force-axis', turned + force.axis]
     is_joint = motion.topic.type_name == wire.JOINT_STATE
@@ -318,7 +318,7 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
 
 
 def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
-    """Return the part of a force that Coulomb and viscous friction explain, and mu_s [N]."""
+    """Return the fraction of a force explained by Coulomb and viscous friction, and mu_s [N]."""
     start = max(force.stamps[0], motion.stamps[0])
     end = min(force.stamps[-1], motion.stamps[-1])
     if end <= start:
@@ -338,7 +338,7 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     variance = float(np.var(y))
     if not variance:
         return 0.0, 0.0
-    # Of motion in one direction nothing tells friction from an offset.
+    # With motion in one direction, friction and an offset are not distinguishable.
     along = float(np.var(x[:, :2] @ solution[:2]))
     left = float(np.var(y - x @ solution))
     return max(0.0, min(along, variance - left) / variance), float(

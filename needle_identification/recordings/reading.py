@@ -1,9 +1,9 @@
 """
-Recordings from bags: the topics of force and motion as arrays on the time base of the force.
+Read recordings from bags: force and motion as arrays on the time base of the force.
 
-Samples are sorted by stamp. Samples denser than 800 Hz are averaged over bins of 1/400 s, stamps
-and values alike, which causes no delay; see `series`. The motion is interpolated to the stamps
-of the force; see `timebase`.
+Samples are sorted by stamp. Samples at more than 800 Hz are averaged over bins of 1/400 s, stamps
+and values alike, which causes no delay; see `series`. The motion is interpolated to the stamps of
+the force; see `timebase`.
 """
 
 from __future__ import annotations
@@ -33,24 +33,12 @@ from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
 
-#: Messages that show the names of joints.
+#: Number of messages that are read for joint names.
 _FIRST: Final = 50
 
 
 class Wanted(NamedTuple):
-    """
-    A topic that is looked for in a bag.
-
-    Attributes
-    ----------
-    option : str
-        The option that names it.
-    types : tuple of str
-        Types it may have.
-    usual : tuple of str
-        Its usual last names.
-
-    """
+    """Criteria for a topic: its option, valid types, and usual last names."""
 
     option: str
     types: tuple[str, ...]
@@ -86,29 +74,29 @@ def read_friction_recording(
     Parameters
     ----------
     path : Path or str
-        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, whose end may be missing; a ``.bag``
+        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, possibly truncated; a ``.bag``
         file of ROS 1; or a table, see `tables`.
     wrench_topic : str, optional
-        Topic of type WrenchStamped; default the only one, or else that with the last name
-        base_wrench.
+        Topic of type WrenchStamped; default the only such topic, else the topic with the last
+        name base_wrench.
     motion_topic : str, optional
         Topic of type JointState, PoseStamped, PointStamped, TwistStamped or Odometry; default the
-        only one, or else that with the last name joint_states or end_effector_pose.
+        only such topic, else the topic with the last name joint_states or end_effector_pose.
     force_axis : str
-        Component of the force that points into the tissue: x, y, z, or one of them after ``-``.
+        Component of the force into the tissue: x, y or z, with ``-`` for the opposite sign.
     motion_axis : str, optional
-        Component of the motion that points into the tissue, likewise; default y. Of a JointState
-        the joint; default insertion, or the only one there is.
+        Component of the motion into the tissue, likewise; default y. For a JointState the joint;
+        default insertion, or the only joint.
     time : str
         Stamps to use, one of `TIMES`.
     columns : mapping of str to str, optional
-        Columns of a table by role, see `tables`; topics, axes and stamps do not apply to it.
+        Columns of a table by role, see `tables`; a table has no topics, axes and stamps.
 
     Returns
     -------
     Recording
-        Force and motion; its ``losses`` say what was left out or repaired. Speeds alone are
-        integrated.
+        Force and motion; ``losses`` lists discarded and repaired data. A velocity without
+        position is integrated.
 
     Raises
     ------
@@ -184,14 +172,15 @@ def read_indentation_recording(
         As in `read_friction_recording`.
     motion_topic : str, optional
         Topic of type PoseStamped, PointStamped or Odometry, or JointState with joints x, y and z;
-        default the only one, or else that with the last name end_effector_pose or joint_states.
+        default the only such topic, else the topic with the last name end_effector_pose or
+        joint_states.
     axes : (str, str)
-        The plane: x, y or z, or one of them after ``-``, which turns both force and position.
+        Axes of the plane: x, y or z; ``-`` reverses the sign of both force and position.
 
     Returns
     -------
     IndentationRecording
-        Force and position; its ``losses`` say what was left out or repaired.
+        Force and position; ``losses`` lists discarded and repaired data.
 
     Raises
     ------
@@ -201,7 +190,7 @@ def read_indentation_recording(
     """
     signs, plane = zip(*(signed_axis(axis, 'axis of the plane') for axis in axes), strict=True)
     if len(set(plane)) != 2:
-        raise RecordingError(f'axes must be two different ones of x, y, z, got {axes!r}')
+        raise RecordingError(f'axes must be two different axes of x, y, z, got {axes!r}')
     across = next(axis for axis in AXES if axis not in plane)
     bag = Bag(path)
     topics = bag.topics()
@@ -228,49 +217,12 @@ def read_indentation_recording(
 
 
 def signed(text: str) -> tuple[float, str]:
-    """
-    Split a name from its sign.
-
-    Parameters
-    ----------
-    text : str
-        A name, perhaps after ``-``.
-
-    Returns
-    -------
-    sign : float
-        1 or -1.
-    name : str
-        The name.
-
-    """
+    """Split a name into its sign (1 or -1, from a leading ``-``) and the rest."""
     return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
 
 
 def signed_axis(text: str, what: str) -> tuple[float, str]:
-    """
-    Split an axis into its sign and its name.
-
-    Parameters
-    ----------
-    text : str
-        x, y or z, or one of them after ``-``.
-    what : str
-        What the axis is, for the message.
-
-    Returns
-    -------
-    sign : float
-        1 or -1.
-    axis : str
-        x, y or z.
-
-    Raises
-    ------
-    RecordingError
-        If it is another.
-
-    """
+    """Split an axis, such as ``-x``, into sign and name; reject names other than x, y, z."""
     sign, axis = signed(text)
     if axis not in AXES:
         raise RecordingError(f'{what} must be x, y, z, -x, -y or -z, got {text!r}')
@@ -278,7 +230,7 @@ def signed_axis(text: str, what: str) -> tuple[float, str]:
 
 
 def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, float]:
-    """Return what to take for a motion along an axis or of a joint, and its sign."""
+    """Return the source of a motion along an axis or of a joint, and its sign."""
     if topic.type_name == wire.JOINT_STATE:
         sign, joint = signed(axis or '')
         return source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
@@ -287,7 +239,7 @@ def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, fl
 
 
 def _only_joint(bag: Bag, topic: Topic) -> str | None:
-    """Return the joint that nearly all of the first messages name alone; None if none is."""
+    """Return the joint named alone by more than 80 % of the first messages, else None."""
     names = Counter(first_names(bag, topic))
     if not names:
         return None
@@ -296,25 +248,10 @@ def _only_joint(bag: Bag, topic: Topic) -> str | None:
 
 
 def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
-    """
-    Return the joints that the first messages of a topic name.
-
-    Parameters
-    ----------
-    bag : Bag
-        The bag.
-    topic : Topic
-        A topic of JointState messages.
-
-    Returns
-    -------
-    list of tuple of str
-        Names of each message that can be read.
-
-    """
+    """Return the joint names of each readable message among the first of a JointState topic."""
     reader = wire.Reader(wire.JOINT_STATE)
     found: list[tuple[str, ...]] = []
-    # The first batch is enough, and all that is read.
+    # Only the first batch is read.
     for batch in islice(bag.batches(lambda other: other == topic), 1):
         for _, data in islice(batch.messages(), _FIRST):
             with suppress(MessageError):
@@ -324,29 +261,9 @@ def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
 
 def chosen_topic(bag: Bag, topics: Sequence[Topic], wanted: Wanted, name: str | None) -> Topic:
     """
-    Return the topic of a name, or the one of the right type.
+    Return the topic with a name, or the only suitable topic by type and usual name.
 
-    Parameters
-    ----------
-    bag : Bag
-        The bag.
-    topics : sequence of Topic
-        Its topics.
-    wanted : Wanted
-        What is looked for.
-    name : str or None
-        Its name, if that is known.
-
-    Returns
-    -------
-    Topic
-        The topic.
-
-    Raises
-    ------
-    RecordingError
-        If there is none, or more than one.
-
+    Raises a RecordingError if there is no such topic, or more than one.
     """
     fitting = [topic for topic in topics if topic.type_name in wanted.types]
     short = ', '.join(type_name.rsplit('/', 1)[-1] for type_name in wanted.types)
@@ -375,29 +292,9 @@ def read_samples(
     bag: Bag, sources: Mapping[Topic, Source], time: str
 ) -> tuple[Mapping[Topic, Gathering], str]:
     """
-    Go through a bag.
+    Gather the samples of topics from a bag, with stamps from `time`, one of `TIMES`.
 
-    Parameters
-    ----------
-    bag : Bag
-        The bag.
-    sources : mapping of Topic to Source
-        What to take from each topic.
-    time : str
-        Stamps to use, one of `TIMES`.
-
-    Returns
-    -------
-    gathered : mapping of Topic to Gathering
-        Samples of each topic.
-    configuration : str
-        Configuration of the plant, '' if there is none.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable.
-
+    Also returns the configuration of the plant, '' if the bag has none.
     """
     if time not in TIMES:
         raise RecordingError(f'time must be one of {", ".join(TIMES)}, got {time!r}')

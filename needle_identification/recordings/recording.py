@@ -1,4 +1,4 @@
-"""Recordings: what identification works on, as arrays on one time base."""
+"""Recordings: force and motion of one experiment as validated arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class _AnyRecording:
-    """What recordings of all experiments have in common."""
+    """Common fields and checks of recordings."""
 
     name: str = 'recording'
     time: FloatArray
@@ -40,7 +40,7 @@ class _AnyRecording:
 
     @property
     def digest(self) -> bytes:
-        """SHA-256 of times and forces: the same for a copy, whatever its file."""
+        """SHA-256 of times and forces, to detect copies of a recording."""
         return sha256(self.time.tobytes() + self.force.tobytes()).digest()
 
     def __repr__(self) -> str:
@@ -48,7 +48,7 @@ class _AnyRecording:
         return f'<{type(self).__name__} {self.name}: {len(self.time)} samples in {duration:.4g} s>'
 
     def _freeze(self, **columns: int | None) -> None:
-        """Replace arrays of (n,) or (n, columns) by read-only copies, and check them."""
+        """Replace arrays (n,) or (n, columns) by validated read-only copies."""
         object.__setattr__(self, 'name', shown(self.name))
         object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
         length = np.shape(self.time)
@@ -83,16 +83,16 @@ class Recording(_AnyRecording):
     force : ndarray, shape (n,)
         Force of the base on the needle f_y [N], positive into the tissue.
     speed : ndarray, shape (n,), or None
-        Insertion speed [m/s], positive into the tissue; None if only positions were recorded.
+        Insertion velocity [m/s], positive into the tissue; None if only positions were recorded.
     depth : ndarray, shape (n,)
-        Inserted length s [m]. If it is not given, it is the integral of the speed from zero.
+        Insertion depth s [m]; default: integral of the velocity from zero.
     losses : tuple of str
-        What was lost, left out or repaired while reading, in words.
+        Lost, discarded or repaired data, one sentence each.
     configuration : str
-        Parameter file of the recorded plant; empty if there is none.
+        Parameter file of the recorded plant; empty if not recorded.
     clock_offset : float
-        Clock of the force minus clock of the motion [s], estimated from the times of reception
-        and already corrected; 0 if they agree.
+        Clock of the force minus clock of the motion [s], estimated from the receive times and
+        already corrected; 0 if equal.
 
     Raises
     ------
@@ -132,7 +132,7 @@ class IndentationRecording(_AnyRecording):
     Attributes
     ----------
     name, time, losses, configuration, clock_offset
-        As those of a `Recording`.
+        As in `Recording`.
     force : ndarray, shape (n, 2)
         Force of the end-effector on the tissue, x and z [N].
     position : ndarray, shape (n, 2)
@@ -158,19 +158,6 @@ class IndentationRecording(_AnyRecording):
 
 
 def integrated(time: FloatArray, speed: FloatArray) -> FloatArray:
-    """
-    Integrate a speed from zero (trapezoidal rule).
-
-    Parameters
-    ----------
-    time, speed : ndarray, shape (n,)
-        Time [s] and speed [m/s].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Distance [m].
-
-    """
+    """Integrate a velocity [m/s], (n,), from zero over time [s] (trapezoidal rule)."""
     steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2.0
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,4 +1,4 @@
-"""Samples of one topic, gathered while its bag is read."""
+"""Gather the samples of one topic while its bag is read."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
 
-#: Axes of a frame, in the order of messages.
+#: Axes of a frame, in the order of message fields.
 AXES: Final = ('x', 'y', 'z')
 
-#: A larger number is no measurement [SI].
+#: Upper limit of a plausible measurement [SI].
 _LARGEST: Final = 1e100
 
-#: Names of joints that are kept, for messages.
+#: Largest number of joint names kept for error messages.
 _MAX_NAMES: Final = 100
 
-#: A longer step between samples is a gap [sampling periods].
+#: Shortest gap between samples [sampling periods].
 _GAP: Final = 10.0
 
-#: A smaller part of messages that name other joints is damaged.
+#: Smaller fractions of messages with other joint names are reported as faults.
 _STRAY: Final = 0.1
 
-#: Latencies that are kept of a batch, and of a topic.
+#: Largest number of latencies kept of a batch, and of a topic.
 _LATENCIES: Final = (64, 2**16)
 
 
 class Source(ABC):
     """
-    What to take from the messages of a topic.
+    Selection of numbers from the messages of a topic.
 
-    It is called with the template of messages, and returns the positions of the numbers to take
-    [bytes], as `wire.decode` needs them.
+    A call with the template of messages returns the positions of the numbers [bytes] for
+    `wire.decode`.
 
     Attributes
     ----------
     columns, width : int
-        How many numbers are taken of each message, and how many values are made of them.
+        Numbers taken from each message, and values computed from them.
 
     """
 
@@ -56,18 +56,18 @@ class Source(ABC):
 
     @abstractmethod
     def __call__(self, template: wire.Template) -> Sequence[int] | None:
-        """Choose numbers; None if the messages are not wanted."""
+        """Return the positions of the numbers; None for messages that are not needed."""
 
     def _measured(self, numbers: FloatArray) -> FloatArray:
-        """Return the values from the numbers, (n, columns), nan where a message lacks one."""
+        """Compute the values from the numbers, (n, columns), nan where missing in a message."""
         return numbers
 
     def _complaint(self) -> str:
-        """Say what is wrong with the topic as a whole."""
+        """Return the fault of the topic as a whole, if any."""
         return ''
 
     def _losses(self) -> list[str]:
-        """Say what the topic lacks."""
+        """Return the missing data of the topic."""
         return []
 
 
@@ -84,7 +84,7 @@ class _Vector(Source):
 
 
 class _Odometry(Source):
-    """Position, speed and whether there is one: the pose is in a frame, the twist in the body."""
+    """Position, velocity and its validity; the pose is in the frame, the twist in the body."""
 
     columns, width = 10, 3
 
@@ -104,7 +104,7 @@ class _Odometry(Source):
 
 
 class _Joint(Source):
-    """Position, speed and whether there is one of a joint; by default that of the plant."""
+    """Position, velocity and its validity of a joint; default: the joint of the plant."""
 
     columns, width = 2, 3
 
@@ -142,7 +142,7 @@ class _Joint(Source):
 
 
 class _PlaneJoints(Source):
-    """Positions of two joints that move an end-effector in a plane, and of one out of it."""
+    """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
 
     columns = width = 3
 
@@ -180,7 +180,7 @@ class _PlaneJoints(Source):
 
 
 class _EachJoint(Source):
-    """Positions of joints by name; nan where a message lacks one."""
+    """Positions of joints by name; nan where missing in a message."""
 
     def __init__(self, *joints: str) -> None:
         self.columns = self.width = len(joints)
@@ -195,20 +195,7 @@ class _EachJoint(Source):
 
 
 def each_joint(joints: Sequence[str]) -> Source:
-    """
-    Take the positions of joints.
-
-    Parameters
-    ----------
-    joints : sequence of str
-        Their names.
-
-    Returns
-    -------
-    Source
-        Its values are the positions.
-
-    """
+    """Return a source of the positions of joints."""
     return _EachJoint(*joints)
 
 
@@ -229,24 +216,12 @@ def _position_and_speed(position: FloatArray, speed: FloatArray) -> FloatArray:
 
 def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> Source:
     """
-    Choose what to take from the messages of a type.
+    Return the source for messages of a type.
 
-    Parameters
-    ----------
-    type_name : str
-        Message type.
-    axes : sequence of str
-        One axis along the motion, or two of a plane and the one across; of `AXES`. Of a
-        JointState with three axes the joints of that name.
-    joint : str, optional
-        Joint along the motion of a JointState; default that of the plant, or the only one.
-
-    Returns
-    -------
-    Source
-        Its values are the components; or, for a motion of a JointState or Odometry, position,
-        speed, and whether there is a speed.
-
+    `axes` has one axis of motion, or two axes of a plane and the off-plane axis; for a JointState
+    with three axes, the joints with these names. `joint` is the moving joint of a JointState
+    (default: the joint of the plant, or the only joint). The values are the components; or, for
+    the motion of a JointState or Odometry, position, velocity, and whether the velocity is valid.
     """
     if type_name == wire.JOINT_STATE:
         return _PlaneJoints(*axes) if len(axes) == 3 else _Joint(joint)
@@ -262,13 +237,13 @@ class Samples(NamedTuple):
     Attributes
     ----------
     topic : str
-        Its name.
+        Name of the topic.
     stamps : ndarray of int64, shape (n,)
         Strictly increasing stamps [ns].
     values : ndarray, shape (n, k)
-        Values of its source.
+        Values of the source.
     latency : ndarray of int64, shape (l,)
-        Some of the receive times minus stamps [ns].
+        A subset of the receive times minus stamps [ns].
 
     """
 
@@ -279,19 +254,7 @@ class Samples(NamedTuple):
 
 
 class Gathering:
-    """
-    Gathers the samples of one topic.
-
-    Parameters
-    ----------
-    topic : Topic
-        The topic.
-    source : Source
-        What to take from its messages.
-    by_header : bool
-        Whether the stamps are those of the headers, or the receive times.
-
-    """
+    """Gathers the samples of one topic, stamped by message headers or by receive times."""
 
     def __init__(self, topic: Topic, source: Source, *, by_header: bool) -> None:
         self._topic = topic
@@ -303,15 +266,6 @@ class Gathering:
         self._fault = ''
 
     def add(self, batch: Batch) -> None:
-        """
-        Add the messages of a batch.
-
-        Parameters
-        ----------
-        batch : Batch
-            Messages of the topic.
-
-        """
         decoded = wire.decode(
             batch.data,
             batch.begin,
@@ -341,23 +295,9 @@ class Gathering:
 
     def samples(self, bag: Bag) -> Samples:
         """
-        Return what was gathered.
+        Return the gathered samples; add the discarded data to the losses of the bag.
 
-        Parameters
-        ----------
-        bag : Bag
-            The bag; what was left out is added to its losses.
-
-        Returns
-        -------
-        Samples
-            The samples.
-
-        Raises
-        ------
-        RecordingError
-            If there are fewer than two, or the source complains.
-
+        Raises a RecordingError for fewer than two samples or a fault of the source.
         """
         name, series = self._topic.name, self._series
         if complaint := self._source._complaint():
@@ -372,7 +312,7 @@ class Gathering:
         ):
             if count:
                 bag.losses.append(f'{count} of {name} {what}')
-        # More of them are another robot on the same topic.
+        # A larger fraction is another robot on the same topic.
         if 0 < self._unwanted < _STRAY * self._messages:
             bag.losses.append(f'{self._unwanted} of {name} name other joints, left out')
         if series.width > FINEST:
@@ -397,39 +337,16 @@ class Gathering:
 
 
 def are_gaps(steps: NDArray[np.int64]) -> BoolArray:
-    """
-    Mark the gaps between samples.
-
-    Parameters
-    ----------
-    steps : ndarray of int64, shape (n,)
-        Steps from one sample to the next [ns].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        Whether the step is a gap, over which nothing is interpolated.
-
-    """
+    """Return which steps between samples [ns], (n,), are gaps, without interpolation."""
     return np.asarray(steps > _GAP * np.median(steps))
 
 
 def position_and_speed(samples: Samples, bag: Bag) -> Samples:
     """
-    Take position and speed as far as they were measured; a speed alone is integrated.
+    Return the position and, if measured, the velocity; a velocity without position is integrated.
 
-    Parameters
-    ----------
-    samples : Samples
-        Values are position, speed, and whether there is a speed; or the speed alone.
-    bag : Bag
-        The bag; what is missing is added to its losses.
-
-    Returns
-    -------
-    Samples
-        Values are position and speed, or position alone.
-
+    Input values are position, velocity and its validity, or the velocity only. Missing data are
+    added to the losses of the bag.
     """
     topic, _, values, _ = samples
     if values.shape[1] == 1:
@@ -446,7 +363,7 @@ def position_and_speed(samples: Samples, bag: Bag) -> Samples:
     else:
         if not known.all():
             bag.losses.append(f'{np.count_nonzero(~known)} of {topic} without velocity, left out')
-        # A bin may hold some samples with a speed and some without.
+        # A bin may contain samples with and without velocity.
         both = np.column_stack([position[known], speed[known] / share[known]])
         return samples._replace(stamps=samples.stamps[known], values=both)
     return samples._replace(values=values[:, :1])

@@ -1,4 +1,4 @@
-"""Samples in order of time, in bounded memory."""
+"""Sort samples by time, in bounded memory."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from needle_dynamics.arrays import FloatArray
 import numpy as np
 from numpy.typing import NDArray
 
-#: Finest bin [ns]: 400 Hz, far more than friction below the cutoff of its filter needs.
+#: Finest bin [ns]: 400 Hz, well above the cutoff frequency of the friction filter.
 FINEST: Final = 2_500_000
 
 #: Largest number of samples that are kept.
 LARGEST: Final = 2**20
 
-#: Smallest number of samples that are gathered before they are sorted in.
+#: Smallest number of added samples that is sorted.
 _GATHERED: Final = 2**16
 
 
@@ -22,25 +22,19 @@ class Series:
     """
     Samples in order of stamp.
 
-    Samples with at most two in a bin are kept as they are. Denser ones are averaged over bins,
-    stamps and values alike, which causes no delay. When there are more than `LARGEST`, neighbors
-    are averaged until there are not.
-
-    Parameters
-    ----------
-    columns : int
-        Number of values of one sample.
+    Up to two samples per bin are kept unchanged. Denser samples are averaged over bins, stamps and
+    values alike, which causes no delay. Above `LARGEST` samples, neighbors are averaged.
 
     Attributes
     ----------
     stamps : ndarray of int64, shape (n,)
-        Strictly increasing stamps [ns]; up to date after `compact`, like all that follow.
+        Strictly increasing stamps [ns]; up to date after `compact`, as all attributes below.
     values : ndarray, shape (n, columns)
         Measured values.
     late : int
-        Number of samples that came after one with a later stamp.
+        Number of samples received after a later stamp.
     repeated : int
-        Number of samples left out because another one had the same stamp.
+        Number of samples discarded because of an equal stamp.
     width : int
         Width of the bins [ns]; 0 for none.
 
@@ -56,29 +50,19 @@ class Series:
         self._last = -(2**63)
 
     def add(self, stamps: NDArray[np.int64], values: FloatArray) -> None:
-        """
-        Add samples in the order in which they came.
-
-        Parameters
-        ----------
-        stamps : ndarray of int64, shape (n,)
-            Stamps [ns].
-        values : ndarray, shape (n, columns)
-            Finite values.
-
-        """
+        """Add samples in order of reception: stamps [ns], (n,), and values, (n, columns)."""
         if len(stamps) == 0:
             return
         self.late += int(np.count_nonzero(stamps[1:] < stamps[:-1])) + int(stamps[0] < self._last)
         self._last = int(stamps[-1])
         self._gathered.append((stamps, values))
         self._count += len(stamps)
-        # In proportion to the samples there are, so that the cost per sample does not grow.
+        # In proportion to the number of samples, for a constant cost per sample.
         if self._count > max(_GATHERED, len(self.stamps)):
             self.compact()
 
     def compact(self) -> None:
-        """Sort in what was gathered, and average where there are too many samples."""
+        """Sort the added samples, and average where the samples are too dense or too many."""
         stamps = np.concatenate([self.stamps, *(stamps for stamps, _ in self._gathered)])
         values = np.concatenate([self.values, *(values for _, values in self._gathered)])
         weights = np.concatenate([self._weights, np.ones(self._count)])
@@ -104,7 +88,7 @@ class Series:
 def _binned(
     stamps: NDArray[np.int64], values: FloatArray, weights: FloatArray, width: int
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Average the samples of each bin; a sample alone in its bin stays as it is."""
+    """Average the samples of each bin; keep a single sample of a bin unchanged."""
     bins = stamps // width
     first = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     if len(first) == len(stamps):

@@ -1,10 +1,10 @@
 """
-Tables with named columns: text (CSV and the like) and MATLAB files.
+Read tables with named columns: text (CSV and similar) and MATLAB files.
 
-A column is named as in the file, or by its number, and takes a role: ``time=t[ms]``,
-``force=-Fz``, ``depth=q[mm]``, ``force=current*35.15[N]``. The unit in brackets is that of the
-numbers; without one it is taken from the name (``q_mm``, ``Force (N)``) or is that of the SI. Two
-columns with the seconds and nanoseconds of a stamp are ``time=sec:nanosec``.
+A column is given by its name in the file or by its number, and has a role: ``time=t[ms]``,
+``force=-Fz``, ``depth=q[mm]``, ``force=current*35.15[N]``. The unit of the numbers is in brackets;
+by default it is taken from the name (``q_mm``, ``Force (N)``), else it is the SI unit. A stamp in
+two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from needle_identification.recordings.series import Series
 from needle_ros.errors import shown
 import numpy as np
 
-#: Endings of the files that are read as tables.
+#: Suffixes of table files.
 MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
 _LENGTHS: Final = {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6}
 _ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
 
-#: Units by role: how many of the SI unit one is.
+#: Units by role, in SI units.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'time': {'s': 1.0, 'sec': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6, 'ns': 1e-9, 'min': 60.0},
     'depth': _LENGTHS,
@@ -54,10 +54,10 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'tip_z': _LENGTHS,
 }
 
-#: Roles of the columns that friction is identified from; a depth or a speed will do.
+#: Roles of the columns for friction; depth or speed is sufficient.
 ROLES: Final = ('time', 'depth', 'speed', 'force')
 
-#: Usual names of columns by role, the most telling first; compared without case and signs.
+#: Usual column names by role, in order of preference; compared without case and signs.
 _USUAL: Final = {
     'time': ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec'),
     'depth': ('depth', 'insertion', 'position', 'pos', 'q', 'qm', 'x', 'displacement', 'joint'),
@@ -65,20 +65,20 @@ _USUAL: Final = {
     'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce'),
 }
 
-#: What SciPy raises at damaged bytes.
+#: Exceptions of SciPy for damaged bytes.
 _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 
-#: Length of the head of a MATLAB file, and the type of its variables that are compressed.
+#: Header length of a MATLAB file [bytes], and type code of its compressed variables.
 _MATLAB_HEAD: Final = 128
 _COMPRESSED: Final = 15
 
-#: Lines among which the first one with numbers must be.
+#: Number of lines searched for the first line of numbers.
 _HEAD: Final = 200
 
-#: A longer line is not that of a sample [characters].
+#: Longest plausible line of a sample [characters].
 _LONGEST_LINE: Final = 2**16
 
-#: Beyond this a depth or speed without a unit is hardly in SI units.
+#: Ranges above which a depth or speed without unit is probably not in SI units.
 _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
 
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
@@ -88,18 +88,18 @@ _SPEC: Final = re.compile(r'^(-?)\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]
 
 class Table(NamedTuple):
     """
-    A table as it is in a file.
+    Content of a table file.
 
     Attributes
     ----------
     path : Path
-        The file.
+        Path of the file.
     columns : dict
-        Columns by name, each of shape (n,); what is no number is nan.
+        Columns by name, each of shape (n,); nan for non-numeric values.
     scalars : dict
         Single numbers by name, for factors.
     losses : list of str
-        What could not be read.
+        Parts that are not readable.
 
     """
 
@@ -110,27 +110,7 @@ class Table(NamedTuple):
 
 
 def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
-    """
-    Read columns by role from one word of a command line.
-
-    Parameters
-    ----------
-    text : str
-        ``role=column,...``.
-    roles : sequence of str
-        Valid roles.
-
-    Returns
-    -------
-    dict
-        Columns by role.
-
-    Raises
-    ------
-    RecordingError
-        If it is not of that form.
-
-    """
+    """Parse ``role=column,...`` of a command line; raise a RecordingError if invalid."""
     found = {}
     for word in text.split(','):
         role, sign, spec = (part.strip() for part in word.partition('='))
@@ -144,43 +124,12 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
 
 
 def is_table(path: Path | str) -> bool:
-    """
-    Tell whether a file is read as a table.
-
-    Parameters
-    ----------
-    path : Path or str
-        A file.
-
-    Returns
-    -------
-    bool
-        By its ending.
-
-    """
+    """Return whether a file is read as a table, by its suffix."""
     return Path(path).suffix.lower() in TABLES
 
 
 def read_table(path: Path) -> Table:
-    """
-    Read a table.
-
-    Parameters
-    ----------
-    path : Path
-        A file of text with one sample a line, or a MATLAB file.
-
-    Returns
-    -------
-    Table
-        Its columns.
-
-    Raises
-    ------
-    RecordingError
-        If it cannot be read as one.
-
-    """
+    """Read a text file with one sample per line, or a MATLAB file."""
     try:
         table = _matlab(path) if path.suffix.lower() == MATLAB else _text(path)
     except OSError as error:
@@ -194,23 +143,8 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     """
     Read force and motion from a table.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    columns : mapping of str to str
-        Columns by role, of `ROLES`; what is not given is found by the usual names.
-
-    Returns
-    -------
-    Recording
-        Force and motion; its ``losses`` say what was taken, left out or repaired.
-
-    Raises
-    ------
-    RecordingError
-        If a column is missing or not usable.
-
+    `columns` are columns by role, of `ROLES`; other roles are found by their usual names. The
+    ``losses`` of the recording list the columns used, and discarded and repaired data.
     """
     table = read_table(path)
     specs = {**guessed(table), **columns}
@@ -220,7 +154,7 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     if missing:
         raise RecordingError(
             f'{path}: which column is {" and ".join(missing)}? It has '
-            f'{", ".join(table.columns)}: say --columns {missing[0].split()[0]}=NAME,...'
+            f'{", ".join(table.columns)}: use --columns {missing[0].split()[0]}=NAME,...'
         )
     losses = list(table.losses)
     values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
@@ -230,22 +164,7 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
 
 
 def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
-    """
-    Find columns by their usual names.
-
-    Parameters
-    ----------
-    table : Table
-        The table.
-    usual_names : mapping of str to sequence of str
-        Names by role, the most telling first, without signs and in small letters.
-
-    Returns
-    -------
-    dict
-        Columns by role.
-
-    """
+    """Find columns by role from usual names, in order of preference, lower case without signs."""
     plain = {name: _plain(name) for name in table.columns}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
@@ -279,7 +198,7 @@ def _plain(name: str) -> str:
 
 
 def _unit_of(name: str, role: str) -> str | None:
-    """Return the unit that a name tells, if it is one of the role."""
+    """Return the unit in a name, if valid for the role."""
     match = _BRACKETS.match(name)
     word = match[2].strip() if match else name.rpartition('_')[2]
     return word if word in UNITS[role] and word != name else None
@@ -287,37 +206,18 @@ def _unit_of(name: str, role: str) -> str | None:
 
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
     """
-    Return the values that a column stands for.
+    Return the values of a column in SI units, shape (n,).
 
-    Parameters
-    ----------
-    table : Table
-        The table.
-    role : str
-        Role of the column, of `UNITS`.
-    spec : str
-        Name with sign, factor and unit.
-    losses : list of str
-        For what looks wrong.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Values in SI units.
-
-    Raises
-    ------
-    RecordingError
-        If there is no such column, or its unit or factor is not valid.
-
+    `spec` is a name with sign, factor and unit. Suspicious values are added to `losses`. Raises a
+    RecordingError for a missing column or an invalid unit or factor.
     """
     if role == 'time' and ':' in spec:
         seconds, _, nanoseconds = spec.partition(':')
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
-        # Together they may need more digits than a float has.
+        # Relative to the start: the sum may exceed the precision of a float.
         return np.asarray((both[0] - both[0][np.isfinite(both[0])][:1].sum()) + 1e-9 * both[1])
     if spec in table.columns:
-        # A name with brackets of its own.
+        # The name itself contains brackets.
         sign, name, factor, unit = '', spec, None, None
     else:
         match = _SPEC.match(spec)
@@ -345,7 +245,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
 
 
 def _column(table: Table, role: str, name: str) -> tuple[str, FloatArray]:
-    """Return a column by its name, its name without the unit, or its number; and its full name."""
+    """Return the full name and the values of a column, given by name (unit optional) or number."""
     names = list(table.columns)
     same = [other for other in names if _BRACKETS.sub(r'\1', other) == name]
     if name not in names and len(same) == 1:
@@ -372,13 +272,13 @@ def _factor(table: Table, role: str, spec: str, factor: str) -> float:
 
 
 def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) -> Recording:
-    """Put samples in order, and leave out what cannot be used."""
+    """Build a recording from columns in SI units: sort samples, discard invalid rows."""
     roles = [role for role in ('force', 'depth', 'speed') if role in values]
     rows = np.column_stack([values[role] for role in roles])
     time = values['time']
     usable = np.isfinite(rows).all(axis=1) & np.isfinite(time)
     if lost := int(np.count_nonzero(~usable)):
-        losses.append(f'{lost} rows with a value that is no number, left out')
+        losses.append(f'{lost} rows with a value that is not a number, left out')
     time, rows = time[usable], rows[usable]
     if len(time) < 2:
         raise RecordingError('; '.join([f'{path} has {len(time)} usable rows', *losses]))
@@ -448,7 +348,7 @@ def _ends_with_a_line(path: Path) -> bool:
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
-    """Read line by line; a word that is no number is nan."""
+    """Parse line by line; a non-numeric word is nan."""
     found, lost = array('d'), 0
     for line in islice(_lines(path), first, None):
         words = _split(line, separator)
@@ -460,18 +360,18 @@ def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[Fl
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a file, none of which may be too long to be one sample."""
+    """Yield the lines of a file; reject a line longer than a plausible sample."""
     with path.open(encoding='utf-8-sig', errors='replace') as stream:
         while line := stream.readline(_LONGEST_LINE):
             if len(line) == _LONGEST_LINE:
                 raise RecordingError(
-                    f'{path} has a line of {_LONGEST_LINE} characters or more: it is no table'
+                    f'{path} has a line of {_LONGEST_LINE} characters or more: it is not a table'
                 )
             yield line
 
 
 def _separator(line: str) -> str | None:
-    """Return what separates the columns; None for blanks."""
+    """Return the separator of columns; None for blanks."""
     return next((mark for mark in (';', '\t', ',') if mark in line), None)
 
 
@@ -480,7 +380,7 @@ def _split(line: str, separator: str | None) -> list[str]:
 
 
 def _numbers(line: str) -> bool:
-    """Whether most words of a line are numbers."""
+    """Return whether at least half of the words of a line are numbers."""
     words = _split(line, _separator(line))
     found = [word for word in words if _number(word) == _number(word)]
     return len(found) > 0 and 2 * len(found) >= len(words) and line.lstrip()[:1] not in '#%'
@@ -497,7 +397,7 @@ def _number(word: str) -> float:
 
 
 def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
-    """Return the names of the columns from the lines before the numbers, else their numbers."""
+    """Return the column names from the lines before the numbers, else column numbers."""
     for k, line in reversed(list(enumerate(head))):
         words = _split(line.lstrip('#% '), separator)
         if len(words) != count or not any(words):
@@ -505,7 +405,7 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
         above = _split(head[k - 1].lstrip('#% '), separator) if k else []
         known = {unit for units in UNITS.values() for unit in units} | {'', '-', '1', 'Nm'}
         if len(above) == count and {word.strip('[]()') for word in words} <= known:
-            # A line of units below that of the names.
+            # A line of units below the line of names.
             units = [word.strip('[]()') for word in words]
             words = [f'{a} [{u}]' if u else a for a, u in zip(above, units, strict=True)]
         return list(_distinct(shown(word) for word in words))
@@ -513,7 +413,7 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    """Give each column a name of its own."""
+    """Make column names unique."""
     seen: set[str] = set()
     for k, name in enumerate(names):
         unique = name if name and name not in seen else f'{name}{k + 1}'
@@ -525,14 +425,14 @@ def _distinct(names: Iterator[str]) -> Iterator[str]:
 
 
 def _spend(path: Path, budget: Budget) -> None:
-    """Count what the compressed variables of a file unfold to."""
+    """Count the decompressed size of the variables of a file."""
     with path.open('rb') as stream:
         head = stream.read(_MATLAB_HEAD)
         order = '>' if head[-2:] == b'MI' else '<'
         while len(tag := stream.read(8)) == 8:
             kind, size = struct.unpack(f'{order}II', tag)
             if kind != _COMPRESSED:
-                # As large as it is.
+                # Not compressed.
                 stream.seek(size, os.SEEK_CUR)
                 continue
             inflater, part = zlib.decompressobj(), stream.read(size)
@@ -543,7 +443,7 @@ def _spend(path: Path, budget: Budget) -> None:
 
 
 def _matlab(path: Path) -> Table:
-    # A large import that few recordings need.
+    # Lazy import: large, and needed for MATLAB files only.
     from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError
 

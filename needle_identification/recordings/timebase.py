@@ -1,11 +1,11 @@
 """
-Force and motion on one time base, that of the force.
+Synchronize force and motion on the time base of the force.
 
-Whether force and motion were stamped by different clocks is seen from the receive times, all by
-the clock of the recorder. A message is received later than it was stamped by its latency, minus
-what its clock is ahead. The latency that 5 % of the messages are below hardly varies. Where that
-of the two topics differs by more than `LARGEST_LATENCY`, their clocks differ, and the stamps of
-the force are shifted. A smaller difference may be one of latency, and the stamps stay.
+Different clocks of force and motion are detected from the receive times, all by the clock of the
+recorder: receive time minus stamp is the latency minus the clock offset. Its 5 % quantile varies
+little. If the quantiles of the two topics differ by more than `LARGEST_LATENCY`, the clocks
+differ, and the stamps of the force are shifted. A smaller difference may be a latency, and the
+stamps stay unchanged.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from needle_identification.recordings.samples import are_gaps, Samples
 import numpy as np
 from numpy.typing import NDArray
 
-#: Largest difference of the latencies of two topics [s]. An optical tracker or an imager takes up
-#: to 0.2 s; clocks that were never set differ by more.
+#: Largest plausible difference of the latencies of two topics [s]. Optical trackers and imagers
+#: have up to 0.2 s; unsynchronized clocks differ by more.
 LARGEST_LATENCY: Final = 0.25
 
-#: Difference of latencies that is worth mentioning [s].
+#: Smallest difference of latencies that is reported [s].
 _NOTABLE_LATENCY: Final = 0.05
 
-#: The clocks must differ by this many times the variation of the latencies.
+#: Smallest clock offset, as a multiple of the variation of the latencies.
 _CERTAINTY: Final = 3.0
 
 
@@ -34,31 +34,11 @@ def merge(
     bag: Bag, force: Samples, motion: Samples
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """
-    Put force and motion on the time base of the force, where the motion is known.
+    Interpolate the motion at the stamps of the force, where both are available.
 
-    Parameters
-    ----------
-    bag : Bag
-        Their bag; what was left out or shifted is added to its losses.
-    force, motion : Samples
-        The samples.
-
-    Returns
-    -------
-    time : ndarray, shape (n,)
-        Time from the first sample [s].
-    force : ndarray, shape (n, k)
-        Values of the force.
-    motion : ndarray, shape (n, m)
-        Values of the motion, interpolated.
-    clock_offset : float
-        Clock of the force minus clock of the motion [s].
-
-    Raises
-    ------
-    RecordingError
-        If force and motion do not overlap in time.
-
+    Returns time from the first sample [s], (n,), force (n, k), motion (n, m) and the clock of the
+    force minus the clock of the motion [s]. Discarded samples and a shift are added to the losses
+    of the bag. Raises a RecordingError if force and motion do not overlap in time.
     """
     offset = _clock_offset(bag, force, motion)
     stamps = force.stamps - offset
@@ -78,7 +58,7 @@ def merge(
         )
     start = stamps[covered][0]
     time = (stamps[covered] - start) * 1e-9
-    # Far from the start, seconds do not distinguish nanoseconds.
+    # A float of seconds does not resolve nanoseconds far from the start.
     distinct = np.diff(time, prepend=-1.0) > 0.0
     time = time[distinct]
     motion_time = (motion.stamps - start) * 1e-9
@@ -87,7 +67,7 @@ def merge(
 
 
 def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:
-    """Estimate how far the clock of the force is ahead [ns]; 0 if latency explains it."""
+    """Estimate the clock offset of force to motion [ns]; 0 if explained by latency."""
     quantiles = [
         np.quantile(samples.latency, (0.05, 0.5), method='lower') for samples in (force, motion)
     ]
@@ -107,7 +87,7 @@ def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:
 
 
 def _covered(stamps: NDArray[np.int64], motion: NDArray[np.int64]) -> BoolArray:
-    """Mark the stamps at which the motion can be interpolated."""
+    """Return which stamps allow an interpolation of the motion."""
     steps = np.diff(motion)
     after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
     inside = (motion[0] <= stamps) & (stamps <= motion[-1])

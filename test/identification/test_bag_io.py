@@ -1,4 +1,4 @@
-"""Bags are read as they were written, open in other tools, and damaged ones cause no traceback."""
+"""Bags are read unchanged, compatible with other tools, and robust against damage."""
 
 from pathlib import Path
 import re
@@ -89,7 +89,7 @@ def grid(
 # Round trip.
 
 
-def test_every_byte_and_nanosecond_is_kept(tmp_path: Path) -> None:
+def test_messages_and_receive_times_are_stored_exactly(tmp_path: Path) -> None:
     written = [(EPOCH + 7 * i, wrench(EPOCH + i, i / 3.0)) for i in range(1000)]
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
@@ -105,7 +105,7 @@ def test_every_byte_and_nanosecond_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
-def test_opens_in_rosbags_with_its_own_definitions_and_hashes(
+def test_rosbags_reads_written_bags_with_definitions_and_hashes(
     tmp_path: Path, compression: str
 ) -> None:
     offered = [OfferedQos('best_effort', 'volatile', 'keep_last', 5)]
@@ -130,7 +130,7 @@ def test_opens_in_rosbags_with_its_own_definitions_and_hashes(
     assert [message.wrench.force.y for message in messages] == [1.5, 2.5]
 
 
-def test_stores_what_rosbag2_and_foxglove_look_for(bag: Path) -> None:
+def test_metadata_required_by_rosbag2_and_foxglove_are_stored(bag: Path) -> None:
     with next(bag.glob('*.mcap')).open('rb') as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == 'ros2'
@@ -152,19 +152,21 @@ def test_stores_what_rosbag2_and_foxglove_look_for(bag: Path) -> None:
     assert '&id' not in (bag / 'metadata.yaml').read_text()
 
 
-def test_arrays_of_a_recording_survive_the_bag(bag: Path, recording: Recording) -> None:
+def test_a_recording_written_to_a_bag_is_read_back_unchanged(
+    bag: Path, recording: Recording
+) -> None:
     read = read_friction_recording(bag)
-    # 2e-9: a stamp is a whole nanosecond, and so is the first one.
+    # 2e-9: stamps, including the first, are rounded to 1 ns.
     assert_allclose(read.time, recording.time, rtol=0.0, atol=2e-9)
     assert_array_equal(read.force, recording.force)
-    # Interpolation to its own stamps leaves rounding.
+    # Rounding of the interpolation at equal stamps.
     assert_allclose(read.speed, recording.speed, rtol=1e-12, atol=1e-12)
     assert_allclose(read.depth, recording.depth, rtol=1e-12)
     assert read.losses == ()
     assert read.truth == {'model.coulomb_friction': 0.56}
 
 
-def test_counts_messages_by_topic(bag: Path, recording: Recording) -> None:
+def test_messages_are_counted_by_topic(bag: Path, recording: Recording) -> None:
     count = len(recording.time)
     assert message_counts(bag) == {
         '/base_wrench': count,
@@ -178,13 +180,13 @@ def test_counts_messages_by_topic(bag: Path, recording: Recording) -> None:
 # Writing.
 
 
-def test_metadata_appears_only_with_close(tmp_path: Path) -> None:
+def test_metadata_is_written_only_on_close(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic('/a', TEXT)
     writer.write('/a', text('x'), EPOCH)
     writer.flush()
     assert [file.name for file in (tmp_path / 'bag').iterdir()] == ['bag_0.mcap']
-    # Another process can read what was flushed.
+    # Another process can read flushed messages.
     assert message_counts(tmp_path / 'bag') == {'/a': 1}
     writer.close()
     assert sorted(file.name for file in (tmp_path / 'bag').iterdir()) == [
@@ -193,7 +195,7 @@ def test_metadata_appears_only_with_close(tmp_path: Path) -> None:
     ]
 
 
-def test_an_error_leaves_an_incomplete_but_readable_bag(tmp_path: Path) -> None:
+def test_a_bag_after_an_error_is_incomplete_but_readable(tmp_path: Path) -> None:
     def fail() -> None:
         with BagWriter(tmp_path / 'bag') as writer:
             writer.add_topic('/a', TEXT)
@@ -226,7 +228,7 @@ def test_an_unknown_message_type_is_rejected(tmp_path: Path) -> None:
         writer.add_topic('/a', 'lab_msgs/msg/Thing')
 
 
-def test_a_full_disk_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
+def test_flushed_messages_survive_a_full_disk(tmp_path: Path) -> None:
     noise = np.random.default_rng(0)
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic('/a', TEXT)
@@ -256,7 +258,7 @@ def test_a_full_disk_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
 
 @pytest.fixture(scope='module')
 def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Path]:
-    """Return a file in several chunks, its messages, and a place for cut-off copies."""
+    """Return a file with several chunks, and a path for truncated copies."""
     folder = tmp_path_factory.mktemp('cut')
     with BagWriter(folder / 'bag') as writer:
         writer.add_topic('/a', TEXT)
@@ -269,7 +271,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Path]:
 
 @settings(max_examples=300, deadline=None)
 @given(data=strategies.data())
-def test_a_bag_cut_off_at_any_byte_gives_its_first_messages(
+def test_a_bag_truncated_at_any_byte_is_read_up_to_the_cut(
     cut: tuple[bytes, Path], data: Any
 ) -> None:
     whole, part = cut
@@ -293,7 +295,7 @@ def test_a_bag_with_a_wrong_byte_is_read_or_rejected(cut: tuple[bytes, Path], da
         messages = read_topic(part, '/a')
     except RecordingError:
         return
-    # Each chunk has a checksum; a whole chunk may be lost.
+    # Each chunk has a checksum; a complete chunk may be lost.
     left = iter(f'message {i}' for i in range(60))
     assert all(message.data in left for _, message in messages)
 
@@ -385,12 +387,12 @@ def test_arbitrary_bytes_are_rejected_in_one_line(cut: tuple[bytes, Path], data:
     assert '\n' not in str(caught.value)
 
 
-def test_the_loss_of_a_cut_off_recording_is_reported(tmp_path: Path, bag: Path) -> None:
+def test_the_loss_of_a_truncated_recording_is_reported(tmp_path: Path, bag: Path) -> None:
     part = tmp_path / 'run_0.mcap'
     whole = next(bag.glob('*.mcap')).read_bytes()
     part.write_bytes(whole[: len(whole) // 2])
     [loss] = read_friction_recording(part).losses
-    # The messages before the cut within a chunk are read too; the index takes some bytes.
+    # Messages before the cut within a chunk are also read; the index takes some bytes.
     count = int(re.fullmatch(r'run_0.mcap is cut off; (\d+) messages read', loss)[1])
     assert 0.4 < count / sum(message_counts(bag).values()) < 0.9
 
@@ -401,7 +403,7 @@ def test_missing_metadata_is_reported(tmp_path: Path, bag: Path) -> None:
     assert loss == 'no readable metadata.yaml: the recording was not closed'
 
 
-def test_parts_of_a_split_bag_are_read_in_order_and_a_missing_one_is_named(tmp_path: Path) -> None:
+def test_split_bags_are_read_in_order_and_missing_parts_are_reported(tmp_path: Path) -> None:
     names = [f'bag_{i}.mcap' for i in range(12)]
     for i, name in enumerate(names):
         with BagWriter(tmp_path / 'one') as writer:
@@ -428,7 +430,7 @@ def test_parts_of_a_split_bag_are_read_in_order_and_a_missing_one_is_named(tmp_p
         (StoragePlugin.MCAP, CompressionMode.MESSAGE),
     ],
 )
-def test_bags_of_another_writer_are_read(
+def test_bags_written_by_rosbags_are_read(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
 ) -> None:
     writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugin)
@@ -448,7 +450,7 @@ def test_bags_of_another_writer_are_read(
 
 @pytest.mark.parametrize('form', ['.mcap', '.db3'])
 @pytest.mark.parametrize('compression', ['', '.zstd', '.zst', '.lz4'])
-def test_single_compressed_and_cut_off_files_are_read(
+def test_single_compressed_and_truncated_files_are_read(
     tmp_path: Path, form: str, compression: str
 ) -> None:
     plugin = {'.mcap': StoragePlugin.MCAP, '.db3': StoragePlugin.SQLITE3}[form]
@@ -465,7 +467,7 @@ def test_single_compressed_and_cut_off_files_are_read(
     assert message_counts(alone) == {'/ft': 3000}
     alone.write_bytes(pack(data)[: len(pack(data)) // 2])
     read = [m.wrench.force.y for _, m in read_topic(alone, '/ft')]
-    # A compressed file is cut between blocks, a database between pages.
+    # A compressed file is truncated between blocks, a database between pages.
     assert 300 < len(read) < 3000
     assert read == list(noise[: len(read)])
 
@@ -529,14 +531,14 @@ def test_a_damaged_chunk_loses_only_its_own_messages(tmp_path: Path) -> None:
     ]
 
 
-def test_files_that_metadata_does_not_list_are_left_out(tmp_path: Path, bag: Path) -> None:
+def test_files_not_listed_in_the_metadata_are_ignored(tmp_path: Path, bag: Path) -> None:
     shutil.copytree(bag, tmp_path / 'run')
     shutil.copy(tmp_path / 'run' / 'run_0.mcap', tmp_path / 'run' / 'copy.mcap')
     read = read_friction_recording(tmp_path / 'run')
     assert read.losses == ('copy.mcap is not part of the recording by metadata.yaml, left out',)
 
 
-def test_a_channel_of_another_encoding_is_not_used(tmp_path: Path) -> None:
+def test_a_channel_with_an_unsupported_encoding_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / 'ros1.mcap'
     with path.open('wb') as stream:
         writer = McapWriter(stream)
@@ -549,7 +551,7 @@ def test_a_channel_of_another_encoding_is_not_used(tmp_path: Path) -> None:
         read_friction_recording(path)
 
 
-def test_an_own_message_type_is_read_by_its_definition_in_the_bag(tmp_path: Path) -> None:
+def test_custom_message_types_are_read_by_their_definition_in_the_bag(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('std_msgs/Header header\nint32 x', 'lab_msgs/msg/Thing'))
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -562,7 +564,7 @@ def test_an_own_message_type_is_read_by_its_definition_in_the_bag(tmp_path: Path
 
 
 def damaged(tmp_path: Path, case: str) -> Path:
-    """Make something that is not a recording."""
+    """Create a path that is not a recording."""
     path = tmp_path / case
     if case == 'missing' or case.startswith('long'):
         return path
@@ -595,13 +597,13 @@ def damaged(tmp_path: Path, case: str) -> Path:
         ('silent', 'silent holds no messages'),
     ],
 )
-def test_what_is_not_a_recording_is_rejected(tmp_path: Path, case: str, complaint: str) -> None:
+def test_invalid_recordings_are_rejected(tmp_path: Path, case: str, complaint: str) -> None:
     with pytest.raises(RecordingError, match=complaint) as caught:
         message_counts(damaged(tmp_path, case))
     assert '\n' not in str(caught.value)
 
 
-def test_an_invalid_message_is_named(tmp_path: Path) -> None:
+def test_an_invalid_message_is_reported_by_its_number(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
         writer.write('/a', wrench(EPOCH, 1.0), EPOCH)

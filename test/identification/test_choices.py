@@ -1,4 +1,4 @@
-"""What the data choose: source of the speed, samples, terms; and what is found in the force."""
+"""Selection of the velocity source, samples and friction terms from the data; punctures."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def insertion(
     punctures: tuple[tuple[float, float, float], ...] = (),
 ) -> Recording:
     """
-    Go in and out by turns, deeper and deeper, for a minute.
+    Simulate one minute of alternating insertion and withdrawal with increasing depth.
 
-    ``layers`` have a depth and the friction per length from there on [N/m]; ``punctures`` a depth,
-    a drop of the force, and the length over which the tissue loads the needle before.
+    ``layers`` are pairs of a depth and the friction per length below it [N/m]; ``punctures`` a
+    depth, a drop of the force, and the length over which the tissue loads the needle before.
     """
     rng = np.random.default_rng(seed)
     step, lasts = 1.0 / 250.0, 60.0
@@ -81,13 +81,13 @@ def insertion(
 
 
 def advised(found: FrictionEstimate) -> list[str]:
-    """Return the terms that are advised."""
+    """Return the suggested terms."""
     words = [w.rpartition('add the term')[2] for w in found.warnings if 'add the term' in w]
     return [term for w in words for term in w.removeprefix('s').strip().split(' and ')]
 
 
 def followed(recording: Recording) -> set[str]:
-    """Return the terms at which following the advice ends."""
+    """Return the terms after following all suggestions."""
     terms = ['coulomb', 'viscous']
     while more := advised(identify_friction(recording, FrictionSettings(terms=tuple(terms)))):
         terms += more
@@ -108,13 +108,13 @@ def followed(recording: Recording) -> set[str]:
         ),
     ],
 )  # fmt: skip
-def test_friction_along_the_needle_is_found(
+def test_friction_along_the_needle_is_identified(
     made: dict[str, Any],
     terms: tuple[str, ...],
     layers: tuple[float, ...],
     truth: dict[str, float],
 ) -> None:
-    """Advice leads to the terms that are missing; with them the truth is met."""
+    """The suggested terms are the missing terms; with them the estimates are correct."""
     right, held, count = 0, 0, 0
     for seed in range(8):
         recording = insertion(seed, **made)
@@ -143,12 +143,12 @@ def test_friction_along_the_needle_is_found(
         ({'terms': ('layers', 'length'), 'layers': (0.0,)}, 'takes the place'),
     ],
 )
-def test_layers_must_be_said_in_order(settings: dict[str, Any], said: str) -> None:
+def test_invalid_layers_are_rejected(settings: dict[str, Any], said: str) -> None:
     with pytest.raises(ParameterError, match=said):
         FrictionSettings(**settings)
 
 
-def test_punctures_are_found_and_located() -> None:
+def test_punctures_are_detected_and_located() -> None:
     where = ((0.025, 0.4, 0.006), (0.06, 0.25, 0.01))
     found_of, false = {depth: 0 for depth, _, _ in where}, 0
     terms = FrictionSettings(terms=('coulomb', 'viscous', 'cutting'))
@@ -158,8 +158,8 @@ def test_punctures_are_found_and_located() -> None:
             near = [p for p in where if abs(p[0] - one.depth.value) < 1e-3]
             false += not near
             for depth, drop, _ in near:
-                # Four standard errors, and what the load of the tissue adds while the filter
-                # looks.
+                # Four standard errors, and the load of the tissue within the window of the
+                # filter.
                 assert abs(one.drop.value - drop) < 4.0 * one.drop.error + 0.25 * drop
                 found_of[depth] += 1
         assert identify_friction(insertion(seed, cutting=0.2)).punctures == ()
@@ -168,8 +168,8 @@ def test_punctures_are_found_and_located() -> None:
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_what_bends_before_it_slides_is_left_out(seed: int) -> None:
-    """Friction that builds up over 0.2 mm after each turn is not that of a needle that slides."""
+def test_presliding_samples_are_discarded(seed: int) -> None:
+    """Friction that builds up over 0.2 mm after each reversal is not sliding friction."""
     found = identify_friction(insertion(seed, presliding=2e-4))
     assert any('presliding' in words for words in found.warnings)
     assert abs(found['coulomb_friction'].value - MU_S) < 0.02 * MU_S
@@ -178,13 +178,13 @@ def test_what_bends_before_it_slides_is_left_out(seed: int) -> None:
     assert not any('presliding' in words for words in plain.warnings)
 
 
-def test_positions_are_taken_where_speeds_are_noisy() -> None:
+def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
     recording, truth = recorded(Kind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
     assert any('took the speed from the positions' in words for words in found.warnings)
     for name, value in truth.items():
         assert abs(found[name].value - value) < 4.0 * found[name].error
-    # The speeds alone: an order of magnitude worse, and said.
+    # Velocities only: an order of magnitude worse, with a warning.
     asked = identify_friction(recording, FrictionSettings(estimator='ordinary'))
     assert abs(asked['viscous_friction'].value - truth['viscous_friction']) > 1.0
     assert any('in the speed reduces mu_v' in words for words in asked.warnings)
@@ -193,7 +193,7 @@ def test_positions_are_taken_where_speeds_are_noisy() -> None:
 @pytest.mark.parametrize(
     'kind', [Kind(), Kind(white=0.005, counts=0.02), Kind(counts=0.01, white=0.0)]
 )
-def test_only_a_sensor_at_its_limit_is_cut_off(kind: Kind) -> None:
+def test_only_saturated_samples_are_detected_as_clipped(kind: Kind) -> None:
     for seed in range(10):
         recording, truth = recorded(kind, np.random.default_rng(seed))
         assert not cut_off(recording.force).any()
@@ -207,8 +207,8 @@ def test_only_a_sensor_at_its_limit_is_cut_off(kind: Kind) -> None:
                 assert abs(found[name].value - value) < 4.0 * found[name].error
 
 
-def test_false_advice_is_rare_over_all_recordings_together() -> None:
-    """Twenty recordings at a time: in at most one of twenty studies is a term advised."""
+def test_false_suggestions_are_rare_over_all_recordings() -> None:
+    """In studies of twenty recordings, at most one of twenty gets a suggested term."""
     wrong = 0
     for study in range(3):
         rng = np.random.default_rng(study)
@@ -218,13 +218,13 @@ def test_false_advice_is_rare_over_all_recordings_together() -> None:
     assert wrong <= 1
 
 
-def test_together_recordings_show_what_none_shows_alone() -> None:
+def test_pooled_recordings_reveal_a_drift_too_small_for_each_recording() -> None:
     drift = Kind(truth={'force_drift': 2.5e-4}, duration=20.0)
     made = [recorded(drift, np.random.default_rng(seed))[0] for seed in range(20)]
     found = [identify_friction(one, among=len(made)) for one in made]
     alone = [one for one in found if advised(one)]
     assert len(alone) < 10
-    # As if none had shown it alone.
+    # Only recordings without a significant drift of their own.
     others = [one for one in found if not advised(one)]
     assert 'add the term drift' in summarize(others).warnings[0]
     assert not alone or not summarize(found).warnings

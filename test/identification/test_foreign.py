@@ -1,4 +1,4 @@
-"""Recordings of other labs give the right result and warnings, or one line and exit status 2."""
+"""Recordings of other laboratories give correct results and warnings, or a one-line error."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -30,7 +30,7 @@ TWIST = 'geometry_msgs/msg/TwistStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 FORCE, MOTION = '/ft_sensor/raw', '/lab/robot'
 SECOND = 1_000_000_000
-#: Receiving takes so long [ns], and so much more from message to message.
+#: Latency of the first message and its increase per message [ns].
 LATENCY, JITTER = 2_000_000, 300_000
 
 
@@ -62,7 +62,7 @@ def joints(
 
 
 def motion(type_name: str, stamp: int, speed: float, **place: float) -> bytes:
-    """Serialize a motion in any type; the speed is along the axes of the place."""
+    """Serialize a motion in any type; the velocity is along the axes of the frame."""
     kinds = STORE.types
     where = triple('Point', **place)
     velocity = triple('Vector3', **dict.fromkeys(place, speed))
@@ -94,7 +94,8 @@ def recorded(
     """
     Return messages in the order of reception: topic, type, receive time [ns], bytes.
 
-    The clock of the force is ahead [s]; with a sign of -1 the force points out of the tissue.
+    `ahead` is the offset of the clock of the force [s]; with a sign of -1 the force points out of
+    the tissue.
     """
     rng = np.random.default_rng(0)
     rows = []
@@ -116,7 +117,7 @@ def write_folder(
     plugin: str = 'mcap',
     mode: CompressionMode | None = None,
 ) -> Path:
-    """Write a rosbag2 folder as rosbags does; return its one file of data."""
+    """Write a rosbag2 folder with rosbags; return its data file."""
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[plugin.upper()])
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
@@ -131,7 +132,7 @@ def write_folder(
 
 
 def write_mcap(path: Path, rows: list[tuple[str, str, int, bytes]], **options: Any) -> Path:
-    """Write an MCAP file; a type that is not in ROS has no definition."""
+    """Write an MCAP file; types that are not in ROS have no definition."""
     with path.open('wb') as stream:
         writer = McapWriter(stream, **options)
         writer.start('ros2')
@@ -159,7 +160,7 @@ def identified(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
         for name, truth in (('coulomb_friction', COULOMB), ('viscous_friction', VISCOUS)):
             low, high = found[name]['interval']
             assert low <= truth <= high
-            # Precise too: 2 % is some times the error of 1 s of motion.
+            # 2 %: a small multiple of the error of 1 s of motion.
             assert high - low < 0.04 * truth
         return said.err
 
@@ -168,7 +169,7 @@ def identified(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
 
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
-    """Return a function that runs the command, expects one line, and returns it."""
+    """Return a function that runs the command, expects a one-line error, and returns it."""
 
     def run(path: Path, *words: str, what: str = 'friction') -> str:
         assert main(['identify', what, str(path), *words]) == 2
@@ -186,7 +187,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('mode', [None, CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_containers_are_read_complete_without_metadata_and_cut_off(
+def test_containers_are_read_complete_without_metadata_and_truncated(
     tmp_path: Path, identified: Callable[..., Any], plugin: str, mode: CompressionMode | None
 ) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin, mode)
@@ -203,7 +204,7 @@ def test_containers_are_read_complete_without_metadata_and_cut_off(
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('share', [0.0, 0.002, 0.03])
-def test_a_file_that_is_cut_off_too_early_is_rejected(
+def test_a_file_truncated_before_any_message_is_rejected(
     tmp_path: Path, refused: Callable[..., Any], plugin: str, share: float
 ) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin)
@@ -219,13 +220,13 @@ def test_a_file_that_is_cut_off_too_early_is_rejected(
         {'use_chunking': False},
     ],
 )
-def test_single_files_of_other_writers_are_read(
+def test_single_mcap_files_of_other_writers_are_read(
     tmp_path: Path, identified: Callable[..., Any], options: dict[str, Any]
 ) -> None:
     assert identified(write_mcap(tmp_path / 'run.mcap', recorded(), **options)) == ''
 
 
-def test_a_split_recording_with_a_part_missing(
+def test_a_missing_part_of_a_split_recording_is_reported(
     tmp_path: Path, identified: Callable[..., Any]
 ) -> None:
     rows, folder = recorded(), tmp_path / 'split'
@@ -277,7 +278,7 @@ def at_position_zero(stamp: int, _depth: float, speed: float) -> bytes:
         (at_position_zero, 'has no position'),
     ],
 )
-def test_joint_states_with_missing_fields_are_used_as_far_as_possible(
+def test_joint_states_with_missing_fields_are_used(
     tmp_path: Path, identified: Callable[..., Any], make: Callable[..., Any], said: str
 ) -> None:
     assert f'{MOTION} {said}' in identified(write_mcap(tmp_path / 'run.mcap', recorded(make=make)))
@@ -301,7 +302,7 @@ def test_joint_states_without_position_and_velocity_are_rejected(
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_a_joint_with_reversed_direction_is_found_among_others(
+def test_a_reversed_joint_is_selected_by_name_and_sign(
     tmp_path: Path, identified: Callable[..., Any]
 ) -> None:
     rows = recorded(make=lambda t, d, v: joints(t, -d, -v, ('rail', 'slide')), sign=-1.0)
@@ -319,7 +320,7 @@ def test_a_joint_with_reversed_direction_is_found_among_others(
     ],
 )
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-z', -1.0)])
-def test_every_type_of_motion_works_along_any_axis(
+def test_all_motion_types_are_read_along_any_axis(
     tmp_path: Path,
     identified: Callable[..., Any],
     type_name: str,
@@ -345,7 +346,7 @@ def test_several_topics_of_one_type_are_listed(
     assert identified(path, *one, '--motion-topic', '/l/arm') == ''
 
 
-def test_other_topics_do_no_harm(tmp_path: Path, identified: Callable[..., Any]) -> None:
+def test_other_topics_are_ignored(tmp_path: Path, identified: Callable[..., Any]) -> None:
     rows = recorded()
     for k, (_, _, received, _) in enumerate(rows[::20]):
         rows += [
@@ -388,7 +389,7 @@ def test_a_latency_of_a_tenth_of_a_second_is_reported(
 
 
 def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
-    """Return the messages of a recording with a fault, and the warning that is expected."""
+    """Return the messages of a recording with a fault, and the expected warning."""
     rows = recorded()
     rng = np.random.default_rng(1)
     if kind == 'gap':
@@ -415,14 +416,14 @@ def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
 
 
 @pytest.mark.parametrize('kind', ['gap', 'lost', 'twice', 'order', 'short', 'nan', 'inf', '1e300'])
-def test_faults_are_reported_and_do_no_harm(
+def test_faults_are_reported_and_do_not_change_the_result(
     tmp_path: Path, identified: Callable[..., Any], kind: str
 ) -> None:
     rows, said = damaged(kind)
     assert said in identified(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-# What cannot be used.
+# Unusable recordings.
 
 
 @pytest.mark.parametrize(
@@ -433,14 +434,14 @@ def test_faults_are_reported_and_do_no_harm(
         ([], 'holds no messages'),
     ],
 )
-def test_missing_topics_are_named(
+def test_missing_topics_are_reported(
     tmp_path: Path, refused: Callable[..., Any], kept: list[str], said: str
 ) -> None:
     rows = [row for row in recorded() if row[0] in kept]
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_the_message_says_what_to_do_with_other_files(
+def test_the_error_for_other_files_gives_instructions(
     tmp_path: Path, refused: Callable[..., Any]
 ) -> None:
     old = tmp_path / 'old.bag'
@@ -458,7 +459,7 @@ def test_the_message_says_what_to_do_with_other_files(
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, JOINTS])
-def test_stiffness_comes_from_every_type_of_motion(
+def test_stiffness_is_identified_from_all_motion_types(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], type_name: str
 ) -> None:
     rows = []
@@ -479,12 +480,14 @@ def test_stiffness_comes_from_every_type_of_motion(
         json.loads(capsys.readouterr().out)['levels'], STIFFNESS.values(), strict=True
     ):
         told = [level['statistics'][name]['mean'] for name in ('k_xx', 'k_xz', 'k_zx', 'k_zz')]
-        # Noise of 1 um and 2 mN over 30 samples and 8 presses: some N/m at most.
+        # Noise of 1 um and 2 mN over 30 samples and 8 presses: at most some N/m.
         assert told == pytest.approx(truth.ravel(), abs=5.0)
 
 
-def test_names_cannot_steer_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whatever a folder, a topic or a joint is called, and a result is written of it."""
+def test_control_characters_in_names_are_escaped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Control characters in names of folders, topics and joints are not printed."""
     evil = '\x1b[31m\x9b2J\u202eevil\u2066\x07\r\n'
     bag, wrenches, motion = tmp_path / f'bag{evil}', f'/w{evil}', f'/j{evil}'
     names = (f'slide{evil}', f'other{evil}')
@@ -495,7 +498,7 @@ def test_names_cannot_steer_a_terminal(tmp_path: Path, capsys: pytest.CaptureFix
         for at, d, v, f in zip(stamps.tolist(), depth, speed, force, strict=True):
             writer.write(wrenches, wrench(at, f), at)
             writer.write(motion, joints(at, d, v, names), at)
-    # Two joints: their names are told.
+    # With two joints, their names are listed.
     assert main(['identify', 'friction', str(bag)]) == 2
     result = tmp_path / 'result.yaml'
     arguments = ['--motion-axis', names[0], '--output', str(result)]

@@ -33,7 +33,7 @@ def law(
     duration: float = 8.0,
     offset: float = 0.0,
 ) -> Recording:
-    """Make a recording of equation (15) with a given absolute speed [m/s] over time [s]."""
+    """Build a recording of equation (15) with absolute speed [m/s] over time [s]."""
     time = np.arange(round(duration * 250)) / 250.0
     way = np.where(time < duration / 2.0, 1.0, -1.0) if both_ways else np.ones_like(time)
     speed = way * size(time)
@@ -75,9 +75,9 @@ def test_the_filter_is_a_hann_window_at_zero_phase() -> None:
 def test_exact_friction_is_recovered(estimator: str) -> None:
     found = identified(FrictionSettings(estimator=estimator))
     for name, truth in TRUTH.items():
-        # 1e-6: the filter has finite length, and what it reaches of a change is left out.
+        # 1e-6: the filter has finite length; samples within its reach of a change are discarded.
         assert_allclose(found[name].value, truth, rtol=1e-6)
-    # The start of motion is known to a sample, 4 ms, in which the push increases by 2.7 mN.
+    # The start of motion is resolved to a sample, 4 ms, in which the force rises by 2.7 mN.
     assert_allclose(found.breakaway.value, COULOMB, atol=2.7e-3)
     assert found.determination > 1.0 - 1e-9
     assert found.warnings == ()
@@ -90,7 +90,7 @@ def test_true_friction_is_within_the_standard_errors(estimator: str) -> None:
     assert within(found.breakaway, COULOMB)
 
 
-def test_strokes_in_one_direction_are_enough() -> None:
+def test_strokes_in_one_direction_are_sufficient() -> None:
     found = identify_friction(law(varied, both_ways=False))
     assert_allclose(found['coulomb_friction'].value, COULOMB, rtol=1e-6)
 
@@ -105,7 +105,7 @@ def test_confidence_intervals_have_their_coverage(recorded: dict[str, float]) ->
         held = [p.interval[0] <= truth <= p.interval[1] for p in found]
         # Three standard deviations of a binomial of 100 trials at 95 % are 6.5 %.
         assert np.mean(held) >= 0.885
-        # A standard deviation from 100 values is good to 7 %: three of these.
+        # A standard deviation from 100 values has an error of 7 %: three of these.
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.21)
 
 
@@ -187,8 +187,8 @@ def test_a_missing_term_is_suggested_and_identified(
         (0.0, 1.2, 'direction'),
     ],
 )
-def test_drift_and_direction_are_told_apart(drift: float, withdrawal: float, term: str) -> None:
-    """Each looks like the other where strokes out follow strokes in: the better fit decides."""
+def test_drift_and_direction_are_distinguished(drift: float, withdrawal: float, term: str) -> None:
+    """If withdrawals follow insertions the two terms are similar; the better fit is selected."""
     advised = 0
     for seed in range(20):
         made = strokes(seed=seed, push=0.0, withdrawal=withdrawal)
@@ -225,7 +225,7 @@ def test_false_alarms_are_rare() -> None:
     # At most 2 % of 40 recordings, and three standard deviations of that.
     assert np.mean(false) <= 0.09
     failed = [test.failed for one in found for test in one.tests]
-    # 0.25 % of 160, and three standard deviations of that: tests are good for many parts.
+    # 0.25 % of 160, and three standard deviations of that: the tests are valid for many parts.
     assert np.mean(failed) <= 0.0145
     assert all(len(one.tests) == 4 for one in found)
     needless = identified(settings('offset'), seed=0).comparison
@@ -259,12 +259,12 @@ def test_a_lag_is_estimated_and_corrected(lag: float) -> None:
     assert within(found.lag, lag)
     assert found.lag.error < 2e-4
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
-    # Below 10 ms filters of sensors explain it.
+    # A lag below 10 ms is explained by sensor filters.
     assert any(' the motion: ' in words for words in found.warnings) == (abs(lag) > 0.01)
 
 
 def steps(rate: float, lag: float) -> Recording:
-    """Make strokes of constant speed, without acceleration, with a delayed force."""
+    """Build strokes of constant speed, without acceleration, with a delayed force."""
     legs = [leg for v in SPEEDS for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))]
     speed = np.repeat([v for v, _ in legs], [round(rate * duration) for _, duration in legs])
     shown = np.roll(speed, round(lag * rate))
@@ -291,7 +291,7 @@ def test_a_large_lag_of_steady_strokes_is_corrected(rate: float, lag: float) -> 
 
 
 def eased(rate: float, lag: float, seed: int) -> Recording:
-    """Make strokes with ramps of the speed of 0.05 s, sampled at arbitrary times."""
+    """Build strokes with velocity ramps of 0.05 s, sampled at arbitrary times."""
     corners = [(0.0, 0.0)]
     for speed in (way * v for v in SPEEDS for way in (1.0, -1.0)):
         start = corners[-1][0]
@@ -317,17 +317,17 @@ def test_the_error_of_the_lag_includes_the_sampling_period(rate: float, surest: 
     assert all(surest < lag.error < 2e-3 for lag in found)
 
 
-def test_jumps_of_the_speed_do_not_determine_the_lag() -> None:
+def test_velocity_steps_do_not_determine_the_lag() -> None:
     # The ringing of the spline after a jump is not an acceleration.
     lags = [identify_friction(steps(250.0, 0.0)).lag, identified(seed=14, push=0.0).lag]
     assert not any(lag.determined for lag in lags)
 
 
-def test_positions_alone_give_no_lag() -> None:
+def test_the_lag_is_not_determined_by_positions_only() -> None:
     recording = strokes(seed=14, lag=0.02)
     found = identify_friction(replace(recording, speed=None))
     assert found.lag is None
-    # It is corrected and reported.
+    # The lag is corrected and reported.
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     assert any(' behind the motion' in words for words in found.warnings)
 
@@ -341,7 +341,7 @@ def test_a_force_independent_of_the_speed_does_not_determine_the_lag() -> None:
     assert within(found['coulomb_friction'], COULOMB)
 
 
-def test_positions_alone_give_the_same_friction() -> None:
+def test_positions_only_give_the_same_friction() -> None:
     recording = strokes(seed=5)
     both = identify_friction(recording)
     counted = 1e-6 * np.round(recording.depth / 1e-6)
@@ -352,8 +352,8 @@ def test_positions_alone_give_the_same_friction() -> None:
         assert alone[name].error < 1.3 * both[name].error
 
 
-def test_total_corrects_for_noise_of_the_speed() -> None:
-    """Speeds that differ little, so that noise is a large part of their variation."""
+def test_total_least_squares_corrects_for_velocity_noise() -> None:
+    """Speeds with small differences, so that noise is a large fraction of their variation."""
     rng = np.random.default_rng(1)
     recording = law(lambda time: 3e-3 + varied(time), duration=80.0)
     speed = recording.speed + 1e-3 * rng.normal(size=20_000)
@@ -425,13 +425,13 @@ def test_the_breakaway_force_needs_a_rest_with_a_rising_force() -> None:
     assert identified(seed=8).breakaway is not None
     assert identified(seed=8, push=0.0).breakaway is None
     sticky = identified(settings('stribeck'), seed=8, breakaway=1.3)
-    # The needle creeps at once in this recording, while the force rises to the breakaway force.
+    # In this recording the needle creeps while the force rises to the breakaway force.
     assert sticky.breakaway is None or sticky.breakaway.error < 0.02
 
 
 @pytest.mark.parametrize('slowest', [2.0e-3, 2.9e-3])
-def test_noise_of_the_speed_is_not_taken_for_stribeck(slowest: float) -> None:
-    """Positions alone, white noise of 1 um, and nothing near rest: 20 of 20 said so once."""
+def test_velocity_noise_does_not_suggest_stribeck_friction(slowest: float) -> None:
+    """Positions only, white noise of 1 um, no samples near rest."""
     advised = 0
     for seed in range(20):
         made = strokes(seed=seed, speeds=(slowest, 5e-3, 10e-3, 20e-3), push=0.0)
@@ -442,19 +442,19 @@ def test_noise_of_the_speed_is_not_taken_for_stribeck(slowest: float) -> None:
         found = identify_friction(recording)
         advised += any('add the term' in words for words in found.warnings)
     assert advised == 0
-    # Who asks for it hears that it is a guess.
+    # If requested, the term has a warning.
     asked = identify_friction(recording, settings('stribeck'))
     assert any('no sample is slow enough' in words for words in asked.warnings)
 
 
-def test_no_term_is_advised_that_physics_forbids() -> None:
-    """A force that is ahead of its motion looks like less friction near rest, or less mass."""
+def test_terms_with_unphysical_values_are_not_suggested() -> None:
+    """A force ahead of its motion has the effect of negative Stribeck friction or mass."""
     for seed in range(10):
         found = identify_friction(strokes(seed=seed, lag=-1e-3))
         assert not any('add the term' in words for words in found.warnings)
 
 
-def test_lost_samples_and_another_start_time_do_no_harm() -> None:
+def test_lost_samples_and_start_time_do_not_change_the_result() -> None:
     recording = strokes(seed=9)
     whole = identify_friction(recording)
     rng = np.random.default_rng(3)
@@ -477,7 +477,7 @@ def test_lost_samples_and_another_start_time_do_no_harm() -> None:
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('rate', [50.0, 1000.0])
-def test_any_sampling_rate_gives_the_same_friction(rate: float) -> None:
+def test_friction_is_independent_of_the_sampling_rate(rate: float) -> None:
     recording = strokes(seed=10)
     time = np.arange(recording.time[0], recording.time[-1], 1.0 / rate)
     changed = Recording(
@@ -504,7 +504,7 @@ def test_the_fit_has_the_reported_residual() -> None:
 
 
 def jump(recording: Recording) -> Recording:
-    """Let the clock jump in the middle, as with simulated and real stamps."""
+    """Insert a clock jump in the middle, as between simulated and real stamps."""
     return replace(recording, time=recording.time + np.where(recording.time < 4.0, 0.0, 1e9))
 
 
@@ -567,12 +567,12 @@ def test_invalid_terms_and_estimators_are_rejected(
         FrictionSettings(**changes)
 
 
-def test_an_unknown_parameter_name_lists_the_valid_ones() -> None:
+def test_the_error_for_an_unknown_parameter_lists_valid_names() -> None:
     with pytest.raises(KeyError, match=r'offset.*valid: coulomb_friction, viscous_friction'):
         identified()['offset']
 
 
-def test_summary_holds_every_parameter_of_every_recording() -> None:
+def test_the_summary_contains_all_parameters_of_all_recordings() -> None:
     one = identified(settings('offset'), seed=12, offset=0.1)
     other = identified(seed=13)
     summary = summarize([one, other])
@@ -588,6 +588,6 @@ def test_summary_holds_every_parameter_of_every_recording() -> None:
         summary['moving_mass']
 
 
-def test_a_summary_needs_estimates() -> None:
+def test_a_summary_without_estimates_is_rejected() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         summarize([])

@@ -1,4 +1,4 @@
-"""What a recording holds is told, and the command that is printed identifies from it."""
+"""Inspection lists the content of a recording and prints a valid command."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WRENCH, JOINTS, POSE = (
 
 
 def ros1(path: Path, *, axis: int = 2, sign: float = -1.0) -> Path:
-    """Write a recording of ROS 1 with a robot of two joints, its pose, and two force sensors."""
+    """Write a ROS 1 recording with a robot of two joints, its pose, and two force sensors."""
     types = ROS1.types
     vector = types['geometry_msgs/msg/Vector3']
     made = strokes(seed=1)
@@ -81,22 +81,22 @@ def run(command: str) -> int:
     ('what', 'bag', 'rate'),
     [('friction', 'bags/friction_03', 100.0), ('stiffness', 'bags/stiffness_01', 40.0)],
 )
-def test_the_command_for_a_shipped_bag_works(
+def test_the_suggested_command_for_a_shipped_bag_succeeds(
     what: str, bag: str, rate: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = inspect_recording(bag)
     assert found.command == f'needle identify {what} {bag}'
     assert run(found.command) == 0
     rates = {one.name: one.rate for one in found.contents}
-    # Samples of the simulated robot come on time.
+    # Samples of the simulated robot are equidistant.
     assert rates['/base_wrench'] == pytest.approx(rate, rel=1e-3)
     capsys.readouterr()
 
 
-def test_force_and_motion_are_told_from_others(
+def test_force_and_motion_are_selected_among_signals(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of two sensors, three axes, two joints and a pose; the sensor is turned around."""
+    """From two sensors, three axes, two joints and a pose; the sensor is reversed."""
     path = ros1(tmp_path / 'lab.bag')
     found = inspect_recording(path)
     assert found.command == (
@@ -115,7 +115,7 @@ def test_force_and_motion_are_told_from_others(
     ]  # fmt: skip
 
 
-def test_a_cut_recording_of_ros_1_ends_in_one_line(
+def test_a_truncated_ros_1_recording_gives_a_one_line_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = ros1(tmp_path / 'lab.bag')
@@ -128,7 +128,7 @@ def test_a_cut_recording_of_ros_1_ends_in_one_line(
         assert 'is damaged' in err
 
 
-def test_a_table_tells_its_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_columns_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = strokes(seed=3)
     path = tmp_path / 'run.csv'
     rows = np.column_stack([made.time, made.depth, made.force])
@@ -141,7 +141,7 @@ def test_a_table_tells_its_columns(tmp_path: Path, capsys: pytest.CaptureFixture
     capsys.readouterr()
 
 
-def test_what_is_not_there_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_recording_gives_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RecordingError, match='does not exist'):
         inspect_recording('nowhere')
     assert main(['inspect', 'nowhere', 'bags/friction_01']) == 2

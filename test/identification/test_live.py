@@ -1,4 +1,4 @@
-"""Friction from running topics: pairing by stamp, for any order of messages."""
+"""Friction from running topics: messages are paired by stamp, in any order."""
 
 from math import inf, nan
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.samples import IDEAL, simulated, TRUTH
 
-#: There and back at two speeds, slow enough for the filter to settle.
+#: Strokes in both directions at two speeds, long enough for the filter to settle.
 LEGS = tuple(
     leg for speed in (3e-3, 8e-3) for leg in ((0.0, 0.3), (speed, 1.2), (0.0, 0.3), (-speed, 1.2))
 )
@@ -26,38 +26,37 @@ def feed(
     shift: int = 0,
     speeds: bool = True,
 ) -> None:
-    """Feed the recording as two topics, the motion arriving a little later."""
+    """Feed a recording as two topics, with a small delay of the motion."""
     for stamp, depth, speed, force in samples:
         live.take_force(stamp, force)
         live.take_motion(stamp + shift, depth, speed if speeds else None)
 
 
 def make() -> LiveFriction:
-    """Return a live identification without forgetting."""
+    """Build a live identification without forgetting."""
     return LiveFriction(FrictionSettings(), 1e6)
 
 
 def values(live: LiveFriction) -> dict[str, ParameterEstimate]:
-    """Return the estimates by name."""
     return {one.name: one for one in live.estimate()}
 
 
 def check(live: LiveFriction, tolerance: float) -> None:
-    """Compare with what was simulated."""
+    """Compare with the simulated parameters."""
     found = values(live)
     for name in ('coulomb_friction', 'viscous_friction'):
         assert found[name].determined
         assert found[name].value == pytest.approx(getattr(TRUTH, name), rel=tolerance)
 
 
-def test_simulated_friction_is_found() -> None:
-    """Stamps that agree are paired one by one."""
+def test_simulated_friction_is_recovered() -> None:
+    """Equal stamps are paired directly."""
     live = make()
     assert live.estimate() == ()
     feed(live)
     assert live.samples == len(SAMPLES)
     assert live.dropped == {}
-    # An ideal sensor: what is left is the transition between the regimes of the filter.
+    # An ideal sensor: the error is the transition between the regimes of the filter.
     check(live, 0.01)
 
 
@@ -70,8 +69,8 @@ def test_motion_between_the_stamps_of_the_force_is_interpolated() -> None:
     check(live, 0.02)
 
 
-def test_positions_alone_are_differentiated() -> None:
-    """Without speeds the slope between two positions is the speed in their middle."""
+def test_positions_without_velocity_are_differentiated() -> None:
+    """The velocity at the middle of two positions is their slope."""
     live = make()
     feed(live, speeds=False)
     check(live, 0.02)
@@ -81,7 +80,7 @@ def test_positions_alone_are_differentiated() -> None:
     ('value', 'kind'),
     [(nan, 'not finite'), (inf, 'not finite'), (-1e300, 'absurd'), (2e4, 'absurd')],
 )
-def test_what_is_not_sane_is_dropped_and_counted(value: float, kind: str) -> None:
+def test_implausible_values_are_discarded_and_counted(value: float, kind: str) -> None:
     """A temporary failure of a sensor does not change the estimate."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
@@ -91,8 +90,7 @@ def test_what_is_not_sane_is_dropped_and_counted(value: float, kind: str) -> Non
     check(live, 0.02)
 
 
-def test_late_and_repeated_stamps_are_dropped() -> None:
-    """Repeated and late messages are not used twice."""
+def test_late_and_repeated_stamps_are_discarded() -> None:
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
         live.take_motion(stamp, depth, speed)
@@ -104,8 +102,8 @@ def test_late_and_repeated_stamps_are_dropped() -> None:
     check(live, 0.01)
 
 
-def test_a_clock_that_is_set_back_restarts_the_estimation() -> None:
-    """Estimation continues with the new stamps as if it had begun with them."""
+def test_a_backward_clock_jump_restarts_the_estimation() -> None:
+    """The result is the result of the new stamps only."""
     live, fresh = make(), make()
     feed(live)
     earlier = [(stamp - 3600 * 10**9, *others) for stamp, *others in SAMPLES]
@@ -117,7 +115,7 @@ def test_a_clock_that_is_set_back_restarts_the_estimation() -> None:
 
 
 def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
-    """The motion of the needle is unknown while the encoder is silent."""
+    """The motion is unknown during a gap of the encoder."""
     live = make()
     gap = range(400, 500)
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
@@ -128,8 +126,8 @@ def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
     check(live, 0.02)
 
 
-def test_memory_is_bounded_if_one_topic_is_missing() -> None:
-    """Samples of the force wait for the motion in a buffer of limited length."""
+def test_the_buffer_is_bounded_if_one_topic_is_missing() -> None:
+    """Force samples without motion are buffered up to a limit."""
     live = make()
     for k in range(30_000):
         live.take_force(1_000_000 * (k + 1), 1.0)
@@ -148,6 +146,5 @@ def test_memory_is_bounded_if_one_topic_is_missing() -> None:
 def test_invalid_settings_are_rejected_at_once(
     settings: FrictionSettings, forgetting: float, complaint: str
 ) -> None:
-    """The settings are checked at once."""
     with pytest.raises(ParameterError, match=complaint):
         LiveFriction(settings, forgetting)

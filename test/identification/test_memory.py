@@ -1,4 +1,4 @@
-"""Noise with a memory: what it does to errors is found from the noise itself."""
+"""Autocorrelated noise: its effect on errors is estimated from the noise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def colored(rng: np.random.Generator, n: int, length: float) -> FloatArray:
 
 
 @given(used=st.lists(st.booleans(), min_size=1, max_size=200), length=st.integers(1, 40))
-def test_parts_hold_each_used_sample_once_and_no_other(used: list[bool], length: int) -> None:
+def test_parts_contain_each_used_sample_exactly_once(used: list[bool], length: int) -> None:
     chosen = np.array(used)
     if not chosen.any():
         return
@@ -37,12 +37,12 @@ def test_parts_hold_each_used_sample_once_and_no_other(used: list[bool], length:
         held[start:end] += 1
     assert_array_equal(held, chosen.astype(int))
     assert_allclose(parts.sums(np.ones(len(chosen))), parts.sizes)
-    # None is longer than it has to be: half as long again, rounded up.
+    # The longest part is half as long again, rounded up.
     assert parts.sizes.max() <= np.ceil(1.5 * length)
 
 
-def test_some_of_the_parts_of_a_long_recording_tell_as_much() -> None:
-    """The memory is as long, and the errors grow as much, as in a recording a tenth as long."""
+def test_a_subset_of_parts_is_sufficient_in_a_long_recording() -> None:
+    """Correlation time and inflation equal the values of a recording of a tenth of the length."""
     found = []
     for n in (10_000, 100_000):
         rng = np.random.default_rng(1)
@@ -50,7 +50,7 @@ def test_some_of_the_parts_of_a_long_recording_tell_as_much() -> None:
         x = np.sign(np.sin(2.0 * np.pi * np.arange(n) / 500.0))[:, np.newaxis]
         found.append(regress(x, noise, correlation=LENGTH, colored=True).memory)
         assert found[-1] is not None
-    # A factor of two is one step of the grid; the short recording leaves more models open.
+    # A factor of two is one step of the grid; the short recording excludes fewer models.
     assert 10.0 < found[1].length < 90.0
     assert_allclose(found[1].inflation, found[0].inflation, rtol=0.3)
 
@@ -58,7 +58,7 @@ def test_some_of_the_parts_of_a_long_recording_tell_as_much() -> None:
 def dense(
     r: FloatArray, x: FloatArray, a: FloatArray, centers: FloatArray, white: FloatArray
 ) -> FloatArray:
-    """Return the inflation with whole matrices, models one by one, and intervals by search."""
+    """Compute the inflation with dense matrices, single models, and intervals by search."""
     m, k = x.shape
     models = [(0.0, 0.0), *((-1.0, g) for g in memory._DIFFERENCES)]
     apart = np.abs(np.subtract.outer(centers, centers))
@@ -105,7 +105,7 @@ def dense(
 
 
 @pytest.mark.parametrize('length', [0.0, 30.0, 1e4])
-def test_the_chain_gives_what_whole_matrices_give(length: float) -> None:
+def test_the_chain_equals_the_dense_solution(length: float) -> None:
     rng = np.random.default_rng(3)
     n = 600
     used = np.ones(n, dtype=np.bool_)
@@ -122,24 +122,24 @@ def test_the_chain_gives_what_whole_matrices_give(length: float) -> None:
         parts.means(residual), parts.means(x), parts.sums(influence), parts.centers,
         parts.length / parts.sizes,
     )  # fmt: skip
-    # Rounding of the sums, and models of less than a millionth that are left out.
+    # Rounding of the sums, and omitted models with a probability below 1e-6.
     assert_allclose(found.inflation, expected, rtol=1e-4)
     assert (found.length > 0.0) == (length > 0.0)
 
 
-def test_what_a_part_takes_from_the_next_shrinks_errors() -> None:
+def test_differenced_noise_reduces_errors() -> None:
     """
-    Differences of white noise, as the speed of noisy positions has them.
+    Differences of white noise, as in the velocity from noisy positions.
 
-    Over a part they are the difference of its ends, so that of a long mean nearly nothing is left.
+    The mean over a part is the difference of its ends, which is small for a long part.
     """
     rng, n = np.random.default_rng(6), 20_000
     parts = divided(np.ones(n, dtype=np.bool_), LENGTH)
-    # Strokes there and back: a slow drift does nothing to them.
+    # Strokes in both directions, insensitive to a slow drift.
     x = np.sign(np.sin(2.0 * np.pi * np.arange(n) / 500.0 + 0.1))[:, np.newaxis]
     steps = 5.0 * np.diff(rng.standard_normal(n + 1))
     found = memory_of(steps, x, x / n, parts)
-    # All of it is differences: the largest share of them that is tried leaves half.
+    # Pure differences: half remains with the largest ratio of the grid.
     assert found.inflation[0] < 0.6
     assert found.length == 0.0
     white = rng.standard_normal(n)
@@ -147,7 +147,7 @@ def test_what_a_part_takes_from_the_next_shrinks_errors() -> None:
 
 
 def test_whitened_noise_is_white() -> None:
-    """Neighbors of colored noise are alike; what is new in each is not."""
+    """Neighbors of colored noise are correlated; their innovations are not."""
     rng = np.random.default_rng(5)
     noise = colored(rng, 20_000, 60.0) + 0.5 * rng.standard_normal(20_000)
     used = np.ones(20_000, dtype=np.bool_)
@@ -158,19 +158,19 @@ def test_whitened_noise_is_white() -> None:
     new = found.whitened(means, parts)
     alike = [np.corrcoef(values[:-1], values[1:])[0, 1] for values in (means, new)]
     assert alike[0] > 0.7
-    # Of 2000 parts: a standard deviation of 0.022. Means of correlated noise are more alike than
-    # values of it (the chain has values): 0.09 here for any grid of times.
+    # Of 2000 parts: a standard deviation of 0.022. Means of correlated noise are more correlated
+    # than values (the chain models values): 0.09 here for any grid of times.
     assert abs(alike[1]) < 0.15
     white = Memory(inflation=np.ones(1), far=np.ones(1), length=0.0, ratio=0.0)
     assert_allclose(white.whitened(means, parts), means)
 
 
 @pytest.mark.parametrize('length', [0.0, 20.0, 100.0, 1e5])
-def test_intervals_hold_the_truth_whatever_the_memory(length: float) -> None:
-    """White noise, two memories, and a random walk; the window alone is confidently wrong."""
+def test_intervals_have_their_coverage_for_any_correlation_time(length: float) -> None:
+    """White noise, two correlation times, and a random walk; the window only is overconfident."""
     n, trials = 3200, 200
     slow = np.sign(np.sin(2.0 * np.pi * np.arange(n) / 400.0))
-    # Of as much motion in as out, as friction needs: an offset is no friction.
+    # Equal motion in both directions, as required for friction: excludes an offset.
     x = np.column_stack([slow, slow * (1.0 + np.arange(n) % 200 / 200.0)])
     truth = np.array([0.5, 2.0])
     held = {False: np.zeros(2), True: np.zeros(2)}
@@ -181,13 +181,13 @@ def test_intervals_hold_the_truth_whatever_the_memory(length: float) -> None:
         for allowed in held:
             low, high = regress(x, y, correlation=LENGTH, colored=allowed).interval().T
             held[allowed] += (low <= truth) & (truth <= high)
-    # 95 % of 200, with three standard deviations of chance (1.5 % each), wide for a walk.
+    # 95 % of 200, with three standard deviations (1.5 % each), too wide for a random walk.
     assert (held[True] / trials >= 0.9).all()
     if length == 100.0:
         assert (held[False] / trials < 0.85).all()
 
 
-def test_exact_and_few_data_are_white() -> None:
+def test_exact_data_and_few_data_give_white_noise() -> None:
     ones = np.ones((40, 1))
     for residual in (np.zeros(40), np.r_[1.0, np.zeros(39)]):
         few = divided(np.arange(40) < (40 if not residual.any() else 5), LENGTH)

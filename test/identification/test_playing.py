@@ -1,4 +1,4 @@
-"""What a player needs of a bag: messages in order of time, their QoS, and when they are due."""
+"""Playback of bags: order of messages, their QoS, and schedule."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +34,7 @@ def everything(_topic: Topic) -> bool:
 
 
 def test_messages_are_in_order_of_time_across_topics(tmp_path: Path) -> None:
-    """Batches come topic by topic; messages do not."""
+    """Batches are sorted by topic, messages by time."""
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
             writer.add_topic(name, TEXT)
@@ -47,7 +47,6 @@ def test_messages_are_in_order_of_time_across_topics(tmp_path: Path) -> None:
 
 
 def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
-    """Messages with equal times come in the order in which they were written."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for k in range(100):
@@ -56,16 +55,16 @@ def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
     assert found == [text(str(k)) for k in range(100)]
 
 
-def test_a_long_recording_is_sorted_piece_by_piece(
+def test_a_long_recording_is_sorted_in_bounded_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only messages of wanted topics wait, no more than the window and one piece."""
+    """Only messages of selected topics are buffered, at most the window and one piece."""
     monkeypatch.setattr(reading, '_WINDOW', 1000)
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
             writer.add_topic(name, TEXT)
         for k in range(1000):
-            # Neighbors are exchanged.
+            # Neighbors are swapped.
             writer.write('/a', text(str(k)), EPOCH + (k ^ 1))
             writer.write('/b', text('other'), EPOCH + k)
             if k % 50 == 49:
@@ -73,14 +72,13 @@ def test_a_long_recording_is_sorted_piece_by_piece(
     bag = Bag(tmp_path / 'bag')
     messages = bag.messages(lambda topic: topic.name == '/a')
     first = next(messages)
-    # Messages read so far: those of the window of 1000 bytes, not the whole recording.
+    # Messages read: the window of 1000 bytes, not the whole recording.
     assert sum(bag.counts.values()) < 500
     times = [first.received, *(message.received for message in messages)]
     assert times == [EPOCH + k for k in range(1000)]
 
 
 def test_a_very_late_message_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is lost, whatever the order."""
     monkeypatch.setattr(reading, '_WINDOW', 0)
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
@@ -93,8 +91,8 @@ def test_a_very_late_message_is_not_lost(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize('damaged', [5, 0], ids=['late', 'early'])
-def test_a_receive_time_that_is_damaged_is_not_waited_for(tmp_path: Path, damaged: int) -> None:
-    """One that is years away ends the playback in one line; what comes before is played."""
+def test_a_damaged_receive_time_ends_the_playback(tmp_path: Path, damaged: int) -> None:
+    """A receive time years ahead ends the playback with an error, after earlier messages."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for k in range(10):
@@ -113,7 +111,7 @@ def test_a_receive_time_that_is_damaged_is_not_waited_for(tmp_path: Path, damage
 
 
 def test_offered_qos_is_stored(tmp_path: Path) -> None:
-    """Profiles are read as they were stored, in both forms of storage."""
+    """Profiles are read back unchanged in both storage formats."""
     weak = OfferedQos('best_effort', 'volatile', 'keep_last', 5)
     latched = OfferedQos('reliable', 'transient_local', 'keep_all', 1)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -137,7 +135,7 @@ def test_offered_qos_is_stored(tmp_path: Path) -> None:
 
 
 def said(field: str, value: str) -> str:
-    """Return the default profile, with another value."""
+    """Return the default profile with one changed value."""
     stored = yaml.safe_dump({**OfferedQos().as_mapping(), field: 'VALUE'}, default_flow_style=True)
     return f'- {stored.replace("VALUE", value)}'
 
@@ -152,7 +150,7 @@ def said(field: str, value: str) -> str:
         ('{', ()),
         ('5', ()),
         ('- [1]', ()),
-        # Whatever a damaged or hostile recording says: then a player offers its own.
+        # Damaged or hostile profiles: the player then offers its default.
         *((said('depth', number), ()) for number in ('.inf', '-.inf', '.nan', '1.0e+400', '[]')),
         *((said('deadline', f'{{sec: {number}, nsec: 0}}'), ()) for number in ('.inf', '.nan')),
         (said('lifespan', '{sec: -5, nsec: 0}'), (OfferedQos(),)),
@@ -161,7 +159,7 @@ def said(field: str, value: str) -> str:
 def test_offered_qos_of_any_version_of_rosbag2_is_read(
     stored: str, found: tuple[OfferedQos, ...]
 ) -> None:
-    """Older recordings have numbers instead of words; unreadable profiles give none."""
+    """Older recordings have numbers instead of names; unreadable profiles are ignored."""
     assert Topic('/a', TEXT, profiles=stored).offered_qos() == found
 
 
@@ -188,7 +186,7 @@ def playback(bag: Bag, **settings: float) -> Playback:
 
 
 def played(made: Playback) -> list[bytes]:
-    """Play to the end, as fast as possible."""
+    """Play to the end as fast as possible."""
     found: list[bytes] = []
     while made.has_next:
         if made.is_due():
@@ -196,15 +194,15 @@ def played(made: Playback) -> list[bytes]:
     return found
 
 
-def test_playback_begins_with_the_last_latched_message(bag: Bag) -> None:
-    """The part from start to end is played; latched messages from before come first."""
+def test_playback_starts_with_the_last_latched_message(bag: Bag) -> None:
+    """The interval from start to end is played, after earlier latched messages."""
     made = playback(bag, rate=0.0, start=0.02, end=0.05)
     assert played(made) == [text('new'), *(text(str(k)) for k in range(2, 6))]
     assert made.take() == []
 
 
-def test_playback_at_a_rate_takes_the_time_of_the_recording(bag: Bag) -> None:
-    """Nothing is due before its time, and delays are measured."""
+def test_playback_keeps_the_recorded_timing(bag: Bag) -> None:
+    """Messages are due at their recorded time, and delays are measured."""
     made = playback(bag, rate=2.0)
     begin = time.monotonic()
     assert len(played(made)) == 12
@@ -212,8 +210,8 @@ def test_playback_at_a_rate_takes_the_time_of_the_recording(bag: Bag) -> None:
     assert 0.0 <= made.late <= made.latest
 
 
-def test_a_paused_playback_stands_still(bag: Bag) -> None:
-    """Messages can be taken one by one; the position is that of the last one."""
+def test_a_paused_playback_is_stepped(bag: Bag) -> None:
+    """Single messages can be taken; the position is the time of the last message."""
     made = playback(bag, rate=1.0)
     made.pause(True)
     assert not made.is_running
@@ -229,7 +227,6 @@ def test_a_paused_playback_stands_still(bag: Bag) -> None:
 
 
 def test_a_playback_loops_or_ends(bag: Bag) -> None:
-    """At the end it begins again, or stays at the last message."""
     made = playback(bag, rate=0.0)
     first = played(made)
     made.finish(loop=True)

@@ -1,4 +1,4 @@
-"""Recordings of any lab give force and motion, or one line with the reason why not."""
+"""Recordings of any laboratory give force and motion, or a one-line error."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -39,7 +39,7 @@ ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
 def pose(position: tuple[float, ...], turn: float = 0.0) -> Any:
-    """Return a pose turned about z [rad]."""
+    """Build a pose rotated about z [rad]."""
     orientation = (0.0, 0.0, np.sin(turn / 2.0), np.cos(turn / 2.0))
     return message_type('geometry_msgs/msg/Pose')(
         message_type('geometry_msgs/msg/Point')(*position),
@@ -128,7 +128,7 @@ def grid(
     ]
 
 
-# Finding force and motion.
+# Selection of force and motion.
 
 
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-y', -1.0), ('x', 0.0)])
@@ -176,7 +176,7 @@ def test_a_missing_speed_is_reported(tmp_path: Path) -> None:
     assert read.losses == ('/joints moves with the velocity 0, which is left out',)
 
 
-def test_samples_without_speed_are_left_out_if_most_have_one(tmp_path: Path) -> None:
+def test_samples_without_velocity_are_discarded_if_most_have_a_velocity(tmp_path: Path) -> None:
     wrenches, motions = grid()
     motions[4] = (40, 0.104, None)
     read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
@@ -184,7 +184,7 @@ def test_samples_without_speed_are_left_out_if_most_have_one(tmp_path: Path) -> 
     assert read.losses == ('1 of /joints without velocity, left out',)
 
 
-def test_unusable_samples_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_unusable_samples_are_discarded_and_counted(tmp_path: Path) -> None:
     wrenches, motions = grid()
     wrenches[3] = (30, float('nan'))
     wrenches[5], wrenches[6] = wrenches[6], wrenches[5]
@@ -200,11 +200,11 @@ def test_unusable_samples_are_left_out_and_counted(tmp_path: Path) -> None:
     )
 
 
-def test_force_without_motion_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_force_without_motion_is_discarded_and_counted(tmp_path: Path) -> None:
     wrenches, motions = grid(count=101)
     path = small_bag(tmp_path / 'bag', wrenches, motions[10:40] + motions[70:])
     read = read_friction_recording(path)
-    # Ten before the motion; thirty in the gap, and the one at its end.
+    # Ten before the motion, thirty in the gap, and its end.
     assert read.losses == (
         '/joints pauses in 1 place, 0.31 s in all',
         '41 of /ft not covered by /joints',
@@ -237,11 +237,11 @@ def test_one_sample_is_not_a_recording(tmp_path: Path) -> None:
         read_friction_recording(path)
 
 
-# Other types and labs.
+# Other types and laboratories.
 
 
 @pytest.mark.parametrize('type_name', [MOTION, POSE, POINT, TWIST, ODOMETRY])
-def test_motion_is_the_same_in_every_type_of_message(tmp_path: Path, type_name: str) -> None:
+def test_motion_is_independent_of_the_message_type(tmp_path: Path, type_name: str) -> None:
     motions = [(t, moving(type_name, at(t), d, v)) for t, d, v in grid()[1]]
     path = write(tmp_path / 'bag', {'/ft': forces(), '/robot': (type_name, motions)})
     axis = '-insertion' if type_name == MOTION else '-y'
@@ -283,13 +283,13 @@ def test_joints_may_change_order_and_publisher(tmp_path: Path) -> None:
     read = read_friction_recording(path, motion_axis='insertion')
     assert_array_equal(read.depth, 0.1 + 0.001 * np.arange(11))
     assert read.losses == ()
-    # The joint of this name is meant unless another is asked for.
+    # Default joint.
     assert_array_equal(read_friction_recording(path).depth, read.depth)
 
 
 @pytest.mark.parametrize('first', [True, False])
-def test_one_broken_name_costs_one_message(tmp_path: Path, first: bool) -> None:
-    """Whether it is the first message or a later one; it is counted."""
+def test_a_corrupted_joint_name_discards_one_message(tmp_path: Path, first: bool) -> None:
+    """For the first and for later messages; the loss is counted."""
     names = ['slide'] * 100
     names[0 if first else 70] = 'sl\x1bde'
     messages = [
@@ -324,7 +324,7 @@ def test_arrays_shorter_than_the_names_are_missing_samples(tmp_path: Path) -> No
     assert read_friction_recording(path).losses == ('1 of /joints not finite, left out',)
 
 
-def test_invalid_messages_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_invalid_messages_are_discarded_and_counted(tmp_path: Path) -> None:
     kind, wrenches = forces()
     wrenches[3] = (30, wrenches[3][1][:-5])
     wrenches[5] = (50, b'')
@@ -340,7 +340,7 @@ def test_invalid_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     assert read.losses == ('3 of /ft not readable, left out: the first one ends after 71 bytes',)
 
 
-def test_topics_of_other_types_do_no_harm(tmp_path: Path) -> None:
+def test_topics_of_other_types_are_ignored(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     file = path / 'bag_0.mcap'
     with file.open('rb') as stream:
@@ -408,7 +408,7 @@ def test_the_last_configuration_of_the_plant_is_read(tmp_path: Path) -> None:
 def two_clocks(
     path: Path, ahead: float, latency: tuple[float, ...] = (0.002, 0.002), count: int = 500
 ) -> Path:
-    """Write force and motion every 4 ms, the force stamped by a clock that is ahead [s]."""
+    """Write force and motion every 4 ms, with an offset of the clock of the force [s]."""
     rng = np.random.default_rng(0)
     with BagWriter(path) as writer:
         writer.add_topic('/ft', WRENCH)
@@ -425,8 +425,8 @@ def two_clocks(
 @pytest.mark.parametrize('ahead', [-3600.0, 0.5, 1e6])
 def test_different_clocks_are_aligned(tmp_path: Path, ahead: float) -> None:
     read = read_friction_recording(two_clocks(tmp_path / 'bag', ahead))
-    # 2e-3: the 5 % quantiles of 500 latencies scatter by 5e-5 s, and a clock of 1e6 s is exact
-    # to the nanosecond; this allows for other random numbers.
+    # 2e-3: the 5 % quantiles of 500 latencies vary by 5e-5 s, and a clock of 1e6 s is exact
+    # to the nanosecond; the rest is margin for other random numbers.
     assert_allclose(read.clock_offset, ahead, rtol=0.0, atol=2e-3)
     assert_allclose(read.depth, 1e-3 * read.force, atol=2e-3 * 0.25)
     assert f'/ft is stamped {read.clock_offset:.3f} s after /joints: clocks' in read.losses[0]
@@ -445,7 +445,7 @@ def test_latency_is_not_corrected_as_a_clock(
     assert len([loss for loss in read.losses if 'may be latency' in loss]) == said
 
 
-def test_meaningless_receive_times_change_no_stamps(tmp_path: Path) -> None:
+def test_invalid_receive_times_do_not_change_stamps(tmp_path: Path) -> None:
     wrenches, motions = grid()
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
@@ -473,7 +473,7 @@ SECONDS = strategies.integers(-(2**31), 2**31 - 1)
     received=strategies.lists(strategies.integers(0, 2**64 - 1), min_size=8, max_size=8),
     value=strategies.floats(),
 )
-def test_any_stamps_and_values_are_read_or_rejected(
+def test_arbitrary_stamps_and_values_are_read_or_rejected(
     tmp_path_factory: pytest.TempPathFactory,
     stamps: list[tuple[int, int]],
     received: list[int],
@@ -520,7 +520,7 @@ def test_dense_samples_are_averaged_without_delay(tmp_path: Path) -> None:
 
 
 def pressed(path: Path, type_name: str) -> Path:
-    """Write an indentation along x, z and a little y; force 100 and 200 N/m."""
+    """Write an indentation along x, z and slightly y; force 100 and 200 N/m."""
     messages = []
     for i in range(11):
         place = (1e-3 * i, 1e-5 * i, 2e-3 * i)
@@ -545,7 +545,7 @@ def pressed(path: Path, type_name: str) -> Path:
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, MOTION])
-def test_an_indentation_is_read_from_every_type_of_message(tmp_path: Path, type_name: str) -> None:
+def test_an_indentation_is_read_from_all_message_types(tmp_path: Path, type_name: str) -> None:
     path = pressed(tmp_path / 'bag', type_name)
     read = read_indentation_recording(path)
     i = np.arange(11)

@@ -1,4 +1,4 @@
-"""Recordings are checked, and cannot be changed."""
+"""Recordings are validated and immutable."""
 
 from typing import Any
 
@@ -42,12 +42,12 @@ def test_without_a_parameter_file_there_are_no_true_values(text: str) -> None:
     assert recording(configuration=text).truth is None
 
 
-def test_true_values_come_from_the_configuration_of_the_plant() -> None:
+def test_true_values_are_read_from_the_plant_configuration() -> None:
     text = '/lab/plant:\n  ros__parameters:\n    model.coulomb_friction: 0.56\n'
     assert recording(configuration=text).truth == {'model.coulomb_friction': 0.56}
 
 
-def test_only_speed_may_be_missing() -> None:
+def test_only_the_velocity_may_be_missing() -> None:
     assert recording(speed=None).speed is None
     with pytest.raises(ShapeError, match='force must have the shape'):
         recording(force=None)
@@ -60,11 +60,11 @@ def test_without_depth_the_speed_is_integrated() -> None:
         Recording(time=np.arange(3.0), force=np.zeros(3))
 
 
-def test_the_repr_is_one_short_line() -> None:
+def test_the_repr_fits_on_a_short_line() -> None:
     assert repr(recording()) == '<Recording it: 3 samples in 2 s>'
 
 
-def test_an_indentation_has_two_components_and_one_across() -> None:
+def test_an_indentation_has_two_components_and_an_off_plane_position() -> None:
     fields: dict[str, Any] = {
         'time': np.arange(3.0),
         'position': np.zeros((3, 2)),

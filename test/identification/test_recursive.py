@@ -1,4 +1,4 @@
-"""Recursive friction equals the estimate from all samples, and follows changes."""
+"""Recursive friction estimates equal the batch estimate and track changes."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,7 +23,7 @@ def fed(
 
 
 def joined(*recordings: Recording) -> Recording:
-    """Play recordings one after the other."""
+    """Concatenate recordings in time."""
     time = np.arange(sum(len(r.time) for r in recordings)) / RATE
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in recordings])
@@ -33,7 +33,7 @@ def joined(*recordings: Recording) -> Recording:
 
 
 class Weighed(RecursiveFriction):
-    """Keep all samples that were used, to solve them at once."""
+    """Keep all used samples for a batch solution."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -54,19 +54,19 @@ def test_recursive_estimates_equal_weighted_least_squares() -> None:
     solution = np.linalg.lstsq(root * rows[:, :3], root[:, 0] * rows[:, 3], rcond=None)[0]
     # 1e-7: the condition number of the products, in rounding errors.
     assert_allclose([p.value for p in running.estimate()], solution[:2], rtol=1e-7)
-    # Both leave out the samples near changes of regime.
+    # Both discard samples near changes of regime.
     assert 0.8 < len(rows) / identify_friction(recording).samples < 1.1
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.004])
 def test_exact_friction_is_recovered_recursively(lag: float) -> None:
     coulomb, viscous = fed(strokes(lag=lag)).estimate()
-    # 1e-4 of the force at the largest speed: the lag is taken up to first order.
+    # 1e-4 of the force at the largest speed: the lag is corrected to first order.
     assert_allclose(coulomb.value, COULOMB, rtol=1e-3)
     assert_allclose(viscous.value, VISCOUS, rtol=1e-4)
 
 
-def test_a_step_is_followed_within_the_forgetting_time() -> None:
+def test_a_step_is_tracked_within_the_forgetting_time() -> None:
     slippery = strokes(seed=2, push=0.0)
     rough = strokes(seed=3, push=0.0)
     rough = replace(rough, force=rough.force + 0.2 * np.sign(rough.speed))
@@ -74,7 +74,7 @@ def test_a_step_is_followed_within_the_forgetting_time() -> None:
     before = fed(slippery, forgetting).estimate()[0]
     after = fed(joined(slippery, rough), forgetting).estimate()[0]
     assert abs(before.value - COULOMB) < 4.0 * before.error
-    # Nine seconds of motion are 4.5 forgetting times: 1 % of the step is still remembered.
+    # Nine seconds of motion are 4.5 forgetting times: 1 % of the old value remains.
     assert abs(after.value - COULOMB - 0.2) < 4.0 * after.error + 0.002
     slow = fed(joined(slippery, rough), 100.0).estimate()[0]
     assert COULOMB + 0.05 < slow.value < COULOMB + 0.15
@@ -87,11 +87,11 @@ def test_intervals_have_their_coverage() -> None:
         held = [e[k].interval[0] <= truth <= e[k].interval[1] for e in estimates]
         # Three standard deviations of a binomial of 40 trials at 95 % are 10.3 %.
         assert np.mean(held) >= 0.847
-        # A standard deviation from 40 values is good to 11 %: three of these.
+        # A standard deviation from 40 values has an error of 11 %: three of these.
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.34)
 
 
-def test_nothing_is_determined_until_the_motion_determines_it() -> None:
+def test_parameters_are_determined_only_after_sufficient_motion() -> None:
     recording = strokes(seed=1, push=0.0)
     running = RecursiveFriction(FrictionSettings(), RATE, 8.0)
     assert not any(p.determined for p in running.estimate())
@@ -109,7 +109,7 @@ def test_nothing_is_determined_until_the_motion_determines_it() -> None:
     assert all(p.interval == (-np.inf, np.inf) for p in one_speed)
 
 
-def test_nothing_is_forgotten_at_rest() -> None:
+def test_there_is_no_forgetting_at_rest() -> None:
     recording = strokes(seed=4)
     rest = replace(
         recording, speed=np.zeros_like(recording.speed), force=np.zeros_like(recording.force)
@@ -118,7 +118,7 @@ def test_nothing_is_forgotten_at_rest() -> None:
     assert_allclose([p.value for p in other], [p.value for p in one], rtol=1e-9)
 
 
-def test_gaps_and_values_that_are_not_finite_do_no_harm() -> None:
+def test_gaps_and_nonfinite_values_are_ignored() -> None:
     recording = strokes(seed=5)
     kept = np.ones(len(recording.time), dtype=bool)
     kept[1500:1700] = False
@@ -130,7 +130,7 @@ def test_gaps_and_values_that_are_not_finite_do_no_harm() -> None:
         assert abs(found.value - truth) < 4.0 * found.error
 
 
-def test_the_chosen_terms_are_estimated() -> None:
+def test_the_selected_terms_are_estimated() -> None:
     settings = FrictionSettings(terms=('coulomb', 'viscous', 'offset', 'direction'))
     found = fed(strokes(seed=6), settings=settings).estimate()
     known = {p.name: p.determined for p in found}

@@ -1,4 +1,4 @@
-"""Regression recovers parameters with valid errors, and marks those it cannot determine."""
+"""Regression recovers parameters with valid errors, and marks undetermined parameters."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ import pytest
 from scipy.signal import lfilter
 
 VALUES = np.array([0.56, 300.0, -2.0])
-#: Columns of very different size, as sgn(v), v and an offset are.
+#: Columns of very different scale, such as sgn(v), v and an offset.
 SIZES = np.array([1.0, 1e-2, 0.1])
 
 
@@ -39,7 +39,7 @@ def extras(n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)) -> dict[str, Any]
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_exactly_without_noise(estimator: str) -> None:
+def test_parameters_are_exact_without_noise(estimator: str) -> None:
     x, y, _ = problem()
     found = regress(x, y, estimator=estimator, **extras(len(y)))
     # 1e-10: rounding times the condition number of the columns.
@@ -85,7 +85,7 @@ def test_huber_is_robust_against_gross_outliers() -> None:
     assert (huber.errors < 0.1 * ordinary.errors).all()
 
 
-def test_total_is_not_attenuated_where_ordinary_is() -> None:
+def test_total_least_squares_has_no_attenuation_bias() -> None:
     noise = 0.3 * SIZES[1]
     total, ordinary = [], []
     for seed in range(50):
@@ -99,11 +99,11 @@ def test_total_is_not_attenuated_where_ordinary_is() -> None:
     # Variance 1 and noise 0.09, with 8 % of the column explained by the others.
     assert means[1] < 0.95 * VALUES[1]
     assert abs(means[0] - VALUES[1]) < 4.0 * errors.mean() / np.sqrt(50.0)
-    # A standard deviation from 50 values is good to 10 %: three of these.
+    # A standard deviation from 50 values has an error of 10 %: three of these.
     assert_allclose(np.std([f.values[1] for f in total]), np.sqrt(np.mean(errors**2)), rtol=0.3)
 
 
-def test_total_rejects_columns_of_noise() -> None:
+def test_total_least_squares_rejects_columns_of_noise() -> None:
     x, y, _ = problem()
     with pytest.raises(IdentificationError, match='noise of the regressors exceeds'):
         regress(x, y, estimator='total', **extras(len(y), (0.0, 1.0, 0.0)))
@@ -120,7 +120,7 @@ def test_weighting_by_group_reduces_the_errors() -> None:
     spread = {e: np.std([f.values for f in found], axis=0) for e, found in values.items()}
     assert (spread['weighted'] < 0.1 * spread['ordinary']).all()
     claimed = np.sqrt(np.mean([f.errors**2 for f in values['weighted']], axis=0))
-    # A standard deviation from 100 values is good to 7 %: three of these.
+    # A standard deviation from 100 values has an error of 7 %: three of these.
     assert_allclose(claimed, spread['weighted'], rtol=0.21)
 
 
@@ -139,7 +139,7 @@ def test_intervals_have_their_coverage_for_correlated_noise(estimator: str) -> N
         )  # fmt: skip
         low, high = found.interval().T
         covered.append((low <= [1.0, 2.0]) & (high >= [1.0, 2.0]))
-    # 400 trials at 95 %: a standard deviation of 1.1 % (they pair up: 1.5 %), three of these.
+    # 400 trials at 95 %: standard deviation 1.1 % (correlated in pairs: 1.5 %), three of these.
     assert abs(np.mean(covered) - 0.95) < 0.045
     independent = regress(x, y)
     assert (independent.errors < 0.5 * found.errors).all()
@@ -195,7 +195,7 @@ def test_the_p_value_of_the_wald_test_is_uniform_under_the_null_hypothesis() -> 
         more = regress(np.column_stack([x, rng.normal(size=(60, 2))]), y)
         chances.append(more.wald([3, 4])[1])
         assert more.wald([0])[1] < 0.05
-    # 400 trials at 5 %: a standard deviation of 1.1 %; scores of 60 samples are a bit too small.
+    # 400 trials at 5 %: standard deviation 1.1 %; scores of 60 samples are slightly too small.
     assert 0.02 < np.mean(np.array(chances) < 0.05) < 0.1
 
 
@@ -220,7 +220,7 @@ def test_invalid_arguments_are_rejected(
         regress(x, y, **changes)
 
 
-def test_values_that_are_not_finite_are_rejected() -> None:
+def test_nonfinite_values_are_rejected() -> None:
     x, y, _ = problem()
     y[7] = np.nan
     with pytest.raises(ShapeError, match='must be finite'):
@@ -253,13 +253,13 @@ def test_the_statistic_is_mean_and_standard_deviation_as_in_table_1() -> None:
     assert (found.name, found.unit, found.count) == ('coulomb_friction', 'N', 4)
 
 
-def test_the_standard_error_is_not_below_that_of_the_recordings() -> None:
+def test_the_standard_error_is_at_least_the_error_within_recordings() -> None:
     found = statistic(estimates([0.6, 0.6], 0.02))
     assert_allclose(found.error, 0.02 / np.sqrt(2.0), rtol=1e-12)
     assert_allclose(found.interval, [0.6 - 2.0 * found.error, 0.6 + 2.0 * found.error])
 
 
-def test_the_statistic_leaves_out_undetermined_parameters() -> None:
+def test_the_statistic_ignores_undetermined_parameters() -> None:
     unknown = ParameterEstimate(name='coulomb_friction', symbol='mu_s', unit='N')
     one = statistic([unknown, *estimates([0.6], 0.02)])
     assert (one.mean, one.deviation, one.error, one.count) == (0.6, None, 0.02, 1)
@@ -268,6 +268,6 @@ def test_the_statistic_leaves_out_undetermined_parameters() -> None:
     assert np.isnan(none.mean)
 
 
-def test_a_statistic_needs_estimates() -> None:
+def test_a_statistic_without_estimates_is_rejected() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         statistic([])

@@ -1,4 +1,4 @@
-"""The tests of the residuals are those of SciPy, and fail for the right reason."""
+"""Residual tests equal the tests of SciPy, and each detects its own fault."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WHITE = Memory(inflation=np.ones(2), far=np.ones(2), length=0.0, ratio=0.0)
 
 
 def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]:
-    """Test a residual that is constant over each part."""
+    """Test a residual with constant values per part."""
     residual, speed = (np.repeat(values, LENGTH) for values in (means, speeds))
     found = residual_tests(
         residual,
@@ -32,7 +32,7 @@ def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]
 
 @pytest.mark.parametrize('seed', range(5))
 @pytest.mark.parametrize('power', [1, 3])
-def test_statistics_and_p_values_are_those_of_scipy(seed: int, power: int) -> None:
+def test_statistics_and_p_values_equal_scipy(seed: int, power: int) -> None:
     rng = np.random.default_rng(seed)
     means, speeds = rng.normal(size=(2, COUNT))
     means = means**power
@@ -63,7 +63,7 @@ def test_few_parts_are_tested_for_normality_by_shapiro_and_wilk() -> None:
 
 
 @pytest.mark.parametrize('name', ['normality', 'trend', 'speed', 'spread'])
-def test_each_test_fails_for_its_own_fault(name: str) -> None:
+def test_each_test_detects_its_own_fault(name: str) -> None:
     rng = np.random.default_rng(1)
     noise, speeds = rng.normal(size=(2, COUNT))
     faulty = {

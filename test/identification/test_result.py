@@ -1,4 +1,4 @@
-"""The result is a complete parameter file, and numbers are rounded to their errors."""
+"""The result is a complete parameter file, with numbers rounded to their errors."""
 
 from math import inf, nan
 from pathlib import Path
@@ -22,7 +22,7 @@ import yaml
 
 
 def found(name: str, mean: float, error: float = 0.01, unit: str = 'N') -> Statistic:
-    """Return a made-up result."""
+    """Return a synthetic result."""
     if mean != mean:
         return Statistic(name=name, symbol=name, unit=unit)
     interval = (mean - 2.0 * error, mean + 2.0 * error)
@@ -33,7 +33,7 @@ def found(name: str, mean: float, error: float = 0.01, unit: str = 'N') -> Stati
 
 
 def friction(*statistics: Statistic) -> FrictionSummary:
-    """Return a made-up result over no recordings."""
+    """Return a synthetic result without recordings."""
     return FrictionSummary(statistics=statistics, estimates=())
 
 
@@ -44,7 +44,7 @@ FRICTION = friction(found('coulomb_friction', 0.5604), found('viscous_friction',
 
 
 def test_the_file_has_the_parameters_of_plant_and_controller() -> None:
-    """Both sections hold the means under the names of the nodes' parameters."""
+    """Both sections have the means under the names of the nodes' parameters."""
     document = yaml.safe_load(result_yaml(FRICTION, STIFFNESS))
     expected = {
         'model.coulomb_friction': 0.5604,
@@ -63,15 +63,15 @@ def test_the_file_has_the_parameters_of_plant_and_controller() -> None:
         ((None, STIFFNESS), {'model.tissue_stiffness'}),
     ],
 )
-def test_the_file_has_only_what_was_identified(
+def test_the_file_has_only_identified_parameters(
     given_: tuple[None, StiffnessSummary] | tuple[FrictionSummary, None], names: set[str]
 ) -> None:
-    """Friction alone leaves the stiffness as it is, and the other way around."""
+    """A friction result does not set the stiffness, and vice versa."""
     assert set(yaml.safe_load(result_yaml(*given_))['/**/plant']['ros__parameters']) == names
 
 
 def test_undetermined_parameters_are_not_set() -> None:
-    """A comment says so, and the node keeps its value."""
+    """They appear in a comment only."""
     text = result_yaml(friction(found('coulomb_friction', 0.5), found('viscous_friction', nan)))
     assert list(yaml.safe_load(text)['/**/plant']['ros__parameters']) == ['model.coulomb_friction']
     assert f'# viscous_friction (viscous_friction) is {UNKNOWN}\n' in text
@@ -79,7 +79,7 @@ def test_undetermined_parameters_are_not_set() -> None:
         result_yaml(friction(found('viscous_friction', nan)))
 
 
-def test_a_mean_outside_the_range_is_moved_to_the_limit() -> None:
+def test_a_mean_outside_the_range_is_set_to_the_limit() -> None:
     """The model rejects negative friction, and breakaway friction below Coulomb friction."""
     values = model_parameters(
         [
@@ -91,7 +91,7 @@ def test_a_mean_outside_the_range_is_moved_to_the_limit() -> None:
     assert values == {
         'model.coulomb_friction': 0.0,
         'model.breakaway_friction': 1.0,
-        # Only this law has breakaway friction.
+        # Only the Stribeck law has breakaway friction.
         'model.friction_law': 'stribeck',
     }
     constants = {name.removeprefix('model.'): value for name, value in values.items()}
@@ -100,8 +100,8 @@ def test_a_mean_outside_the_range_is_moved_to_the_limit() -> None:
 
 @settings(deadline=None)
 @given(st.floats(1e-12, 1e12))
-def test_a_value_survives_the_file(value: float) -> None:
-    """Values have seven digits, and are numbers: YAML reads 5e-05 as text."""
+def test_values_are_read_back_from_the_file(value: float) -> None:
+    """Values have seven digits and are numbers; YAML would parse 5e-05 as text."""
     text = result_yaml(friction(found('viscous_friction', value)))
     read = yaml.safe_load(text)['/**/plant']['ros__parameters']['model.viscous_friction']
     assert isinstance(read, float)
@@ -109,8 +109,8 @@ def test_a_value_survives_the_file(value: float) -> None:
     assert abs(read - value) <= 5e-7 * value
 
 
-def test_the_file_is_replaced_at_once(tmp_path: Path) -> None:
-    """The file is complete, and no draft is left."""
+def test_the_file_is_replaced_atomically(tmp_path: Path) -> None:
+    """The file is complete, without a temporary file."""
     path = tmp_path / 'result.yaml'
     path.write_text('old')
     write_result(path, FRICTION)
@@ -126,8 +126,8 @@ def test_the_file_is_replaced_at_once(tmp_path: Path) -> None:
         ('', 'it is not the name of a file'),
     ],
 )
-def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, name: str, complaint: str) -> None:
-    """The message is one line, and no draft is left."""
+def test_an_unwritable_file_is_reported(tmp_path: Path, name: str, complaint: str) -> None:
+    """A one-line error, without a temporary file."""
     with pytest.raises(ParameterError, match=complaint):
         write_result(tmp_path / name, FRICTION)
     assert not list(tmp_path.iterdir())
@@ -138,7 +138,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, name: str, compl
 def test_a_number_is_rounded_to_two_digits_of_its_error(value: float, error: float) -> None:
     """The rounding error is at most a twentieth of the standard error."""
     told, reach = measured(value, error).split(' ± ')
-    # Half of the second digit of the error, which is 1.0 at least, and rounding of the sum.
+    # Half of the second digit of the error, which is at least 1.0, and rounding of the sum.
     assert abs(float(told) - value) <= max(0.0501 * error, 0.501 if error >= 10.0 else 0.0)
     assert abs(float(reach) - error) <= max(0.0501 * error, 0.501 if error >= 10.0 else 0.0)
     assert rounded(value, error) == told
@@ -158,7 +158,7 @@ def test_a_number_is_rounded_to_two_digits_of_its_error(value: float, error: flo
     ],
 )
 def test_a_number_is_written_with_its_unit(value: float, error: float, text: str) -> None:
-    """An error of zero is written, an unknown one is not, and nan is written in words."""
+    """A zero error is written, an infinite error is not, and nan is written in words."""
     assert measured(value, error, 'N') == text
 
 

@@ -1,4 +1,4 @@
-"""A series keeps its samples or their means, in bounded memory."""
+"""A series keeps samples or their means, in bounded memory."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ def gathered(stamps: NDArray[np.int64], values: FloatArray, batch: int = 7) -> S
 
 @settings(max_examples=100, deadline=None)
 @given(strategies.lists(strategies.integers(-(10**9), 10**9), min_size=1, max_size=50))
-def test_sparse_samples_are_kept_exactly(numbers: list[int]) -> None:
+def test_sparse_samples_are_kept_unchanged(numbers: list[int]) -> None:
     stamps = np.array(numbers) * FINEST
     values = np.random.default_rng(0).normal(size=(len(stamps), 2))
     made = gathered(stamps, values)
@@ -40,7 +40,7 @@ def test_dense_samples_are_averaged() -> None:
     made = gathered(stamps, np.asarray(stamps[:, None] * 1e-9, float), batch=1000)
     assert made.width == FINEST
     assert len(made.stamps) == 100_000 * step // FINEST
-    # The mean of a line is on the line, except for rounding of the stamp to 1 ns.
+    # The mean of a line is on the line, up to rounding of the stamp to 1 ns.
     assert_allclose(made.values[:, 0], made.stamps * 1e-9, rtol=0.0, atol=1e-9)
 
 
@@ -60,7 +60,7 @@ def test_a_long_series_is_averaged_and_keeps_its_mean(small: Any) -> None:
         assert len(made.stamps) <= 64
     made.compact()
     assert 20.0 / 64 < made.width * 1e-9 < 2.1 * 20.0 / 64
-    # Bins begin at multiples of their width: only the first and the last are not full.
+    # Bins start at multiples of their width: only the first and the last are incomplete.
     full = made.values[1:-1, 0]
     assert abs(full.mean() - values.mean()) < 0.02
 

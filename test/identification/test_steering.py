@@ -1,4 +1,4 @@
-"""Identification of a needle that cuts its path."""
+"""Identification of needles that follow the path they cut."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ COLUMNS = (
 
 def write_table(path: Path, one: SteeringRecording, frozen: int = 0) -> None:
     """
-    Write a recording as another laboratory has it.
+    Write a recording in the table format of another laboratory.
 
-    Each row has the tip after the step whose guide stands in the row before, the robot counts out
-    of the tissue, and the last readings of the sensor may be one.
+    Each row has the tip after the step and the guide of the previous row, the robot has the
+    opposite sign, and the last readings of the sensor may be frozen.
     """
     tip = one.tip.copy()
     if frozen:
@@ -65,12 +65,12 @@ def write_table(path: Path, one: SteeringRecording, frozen: int = 0) -> None:
     path.write_text('\n'.join(lines) + '\n')
 
 
-def test_without_noise_it_finds_the_truth() -> None:
-    """From one insertion; what is left is what elements of different lengths differ by."""
+def test_the_identification_is_exact_without_noise() -> None:
+    """From one insertion; the error is from elements of different lengths."""
     found = identify_steering([insertion(1, replace(PLAIN, noise=0.0))], TILTED)
     [gel] = found.media
-    # Elements of 1 and 1.25 mm differ by 0.1 um at the tip; skin and free length, which tell
-    # little of themselves, feel it more.
+    # Elements of 1 and 1.25 mm differ by 0.1 um at the tip; skin and free length, which have small
+    # effects, are more sensitive.
     assert gel['bending_length'].value == pytest.approx(PLAIN.length, rel=1e-4)
     assert gel['skin'].value == pytest.approx(PLAIN.skin, rel=5e-3)
     assert found.free_length.value == pytest.approx(PLAIN.free, rel=1e-3)
@@ -79,7 +79,7 @@ def test_without_noise_it_finds_the_truth() -> None:
 
 
 def test_media_share_the_free_length() -> None:
-    """Each has its own bending length, skin and tilt; all intervals hold the truth."""
+    """Each has its own bending length, skin and tilt; all intervals contain the true values."""
     gel = Truth(length=0.03)
     liver = Truth(length=0.05, skin=0.03, tilt=(0.0, 0.01), medium='liver')
     recordings = [insertion(k, gel) for k in range(10)]
@@ -88,11 +88,11 @@ def test_media_share_the_free_length() -> None:
     for truth in (gel, liver):
         medium, values = truth.medium, (truth.length, truth.skin, *truth.tilt)
         assert found[medium].recordings == 10
-        # Each in 95 of 100; so that all are, twice the interval.
+        # Each interval is 95 %; for all together, twice the interval.
         for one, true in zip(found[medium].parameters, values, strict=True):
             low, high = one.interval
             assert low - (one.value - low) <= true <= high + (high - one.value), one
-        # 210 samples an axis, less what was fitted.
+        # 210 samples per axis, minus fitted parameters.
         assert found[medium].rms == pytest.approx(NOISE, rel=0.1)
     low, high = found.free_length.interval
     assert low < gel.free < high
@@ -100,8 +100,8 @@ def test_media_share_the_free_length() -> None:
         found['fat']
 
 
-def test_what_makes_it_drift_is_not_told_apart_where_it_cannot_be() -> None:
-    """A tilt of the guide and a turn of the frames look alike; a needle that turns tells."""
+def test_indistinguishable_causes_of_drift_are_not_determined() -> None:
+    """Guide tilt and frame rotation are equivalent, except for a needle that rolls."""
     tilted = identify_steering([insertion(k) for k in range(6)])
     [words] = tilted.warnings
     assert 'these explain the drift equally well (rms: tilt 0.1' in words
@@ -121,7 +121,7 @@ def test_what_makes_it_drift_is_not_told_apart_where_it_cannot_be() -> None:
 
 
 @pytest.mark.parametrize('first', [False, True])
-def test_order_of_guide_and_needle_is_seen(first: bool) -> None:
+def test_the_order_of_guide_and_needle_is_detected(first: bool) -> None:
     found = identify_steering(
         [insertion(k, Truth(guide_first=first)) for k in range(4)],
         SteeringSettings(terms=('tilt',)),
@@ -129,7 +129,7 @@ def test_order_of_guide_and_needle_is_seen(first: bool) -> None:
     assert found.order == ('guide first' if first else 'together')
 
 
-def test_a_known_free_length_is_taken() -> None:
+def test_a_given_free_length_is_used() -> None:
     found = identify_steering([insertion(1)], replace(TILTED, free_length=PLAIN.free))
     assert found.free_length.value == PLAIN.free
     assert found.free_length.interval == (PLAIN.free, PLAIN.free)
@@ -142,8 +142,8 @@ def test_a_known_free_length_is_taken() -> None:
     assert width(known['bending_length'].interval) < width(unknown['bending_length'].interval)
 
 
-def test_a_needle_that_does_not_bend_tells_nothing() -> None:
-    """Straight in, with a guide at rest: no length is determined, and none is claimed."""
+def test_a_straight_insertion_determines_no_length() -> None:
+    """Straight insertion with a guide at rest: no length is determined."""
     still = insertion(1)
     still = replace(still, guide=np.zeros_like(still.guide))
     found = identify_steering([still], TILTED)
@@ -151,10 +151,10 @@ def test_a_needle_that_does_not_bend_tells_nothing() -> None:
     assert not gel['bending_length'].determined
 
 
-def test_a_table_of_another_laboratory_reads_with_options(
+def test_a_table_of_another_laboratory_is_read_with_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Units, signs, stamps in two columns, rows that lag, and one sensor that froze."""
+    """Units, signs, stamps in two columns, delayed rows, and a frozen sensor."""
     for k in range(4):
         write_table(tmp_path / f'run_{k}.csv', insertion(k), frozen=8 if k == 2 else 0)
     paths = [str(tmp_path / f'run_{k}.csv') for k in range(4)]
@@ -175,7 +175,7 @@ def test_a_table_of_another_laboratory_reads_with_options(
     assert tmp_path.name in text
 
 
-def test_media_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_media_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k, medium in enumerate(('gel', 'gel', 'fat', 'fat')):
         write_table(tmp_path / f'{medium}_{k}.csv', insertion(k))
     paths = [str(path) for path in sorted(tmp_path.glob('*.csv'))]
@@ -192,7 +192,7 @@ def test_media_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert 'is no regular expression' in capsys.readouterr().err
 
 
-def test_frozen_and_impossible_readings_are_left_out() -> None:
+def test_frozen_and_implausible_readings_are_discarded() -> None:
     depth = np.linspace(0.0, 0.045, 10)
     guide, tip = np.zeros((10, 2)), 1e-4 * np.random.default_rng(1).standard_normal((10, 2))
     good, losses = credible(depth, guide, tip)
@@ -204,12 +204,12 @@ def test_frozen_and_impossible_readings_are_left_out() -> None:
     good, losses = credible(depth, guide, tip)
     assert good.tolist() == [True, False, True, True, True, False, False, False, True, False]
     assert [words.split()[0] for words in losses] == ['3', '1', '1']
-    # A needle at rest may well repeat itself.
+    # A needle at rest may have repeated readings.
     rest = np.zeros((10, 2))
     assert credible(np.full(10, 0.05), guide, rest)[0].all()
 
 
-def test_columns_may_lag_by_rows(tmp_path: Path) -> None:
+def test_columns_may_be_delayed_by_rows(tmp_path: Path) -> None:
     path = tmp_path / 'run.csv'
     path.write_text('depth,gx,gz,tx,tz\n0,1,0,0,0\n0.01,2,0,1,1\n0.02,3,0,2,2\n')
     columns = column_roles('guide_x=gx[mm]@1,guide_z=gz,tip_x=tx[mm],tip_z=tz[mm]', STEERING_ROLES)
@@ -222,7 +222,7 @@ def test_columns_may_lag_by_rows(tmp_path: Path) -> None:
         column_roles('force=f', STEERING_ROLES)
 
 
-def test_bad_input_is_named() -> None:
+def test_invalid_input_is_reported() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         identify_steering([])
     short = SteeringRecording(
@@ -248,9 +248,9 @@ def test_bad_input_is_named() -> None:
 
 def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = None) -> Path:
     """
-    Record a steered plant whose robot follows a guide that moves, with an EM tracker.
+    Record a steered plant with a moving guide and an EM tracker.
 
-    Joints may have other names, of another robot that also counts the other way.
+    Joints may have other names, with the opposite sign of another robot.
     """
     values = {
         'steered': True, 'mode': 'robot', 'model.preset': 'bending_35mm', 'rate': 200.0,
@@ -287,10 +287,10 @@ def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = No
     return path
 
 
-def test_a_bag_of_the_plant_reads_without_options(
+def test_a_bag_of_the_plant_is_read_without_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of ten insertions with a tracker: intervals hold the truth, and only noise is left."""
+    """Ten insertions with a tracker: intervals contain the true values, residuals are noise."""
     bags = [recorded_plant(tmp_path / 'gel', seed) for seed in range(10)]
     result = tmp_path / 'result.yaml'
     words = ['--json', '--terms', 'tilt', '-o', str(result), *map(str, bags)]
@@ -303,11 +303,11 @@ def test_a_bag_of_the_plant_reads_without_options(
     assert high - low < 2e-3
     low, high = found['free_length']['interval']
     assert low < 0.04 < high
-    # 4,500 readings of both axes: a deviation is known to 1.1 %, taken four times.
+    # 4,500 readings of both axes: a deviation has an error of 1.1 %, times four.
     assert gel['rms'] == pytest.approx(NOISE, rel=0.044)
     assert gel['recordings'] == 10
     assert 10 * 400 < gel['samples'] < 10 * 480
-    # The file starts a plant with what was found, and a controller with the same tissue.
+    # The file starts a plant with the result, and a controller with the same tissue.
     sections = yaml.safe_load(result.read_text())
     values = sections['/**/plant']['ros__parameters']
     constants = PlantConstants.of(values)
@@ -328,7 +328,7 @@ def test_a_bag_of_the_plant_reads_without_options(
     }
 
 
-def test_a_parameter_file_is_of_one_medium(
+def test_a_parameter_file_has_one_medium(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ('gel', 'liver'):
@@ -341,13 +341,13 @@ def test_a_parameter_file_is_of_one_medium(
     assert not (tmp_path / 'both.yaml').exists()
 
 
-def test_a_bevel_gives_its_load() -> None:
-    """By the stiffness of the default needle, and with the roll at which it pushes along z."""
+def test_the_load_of_a_bevel_is_identified() -> None:
+    """With the stiffness of the default needle, and the roll of its load along z."""
     truth = replace(PLAIN, noise=1e-7, tilt=(0.0, 0.0), curvature=0.8)
     bevel = SteeringSettings(terms=('bevel',), order='together')
     text = steering_yaml(identify_steering([insertion(2, truth)], bevel))
     values = yaml.safe_load(text)['/**/plant']['ros__parameters']
-    # What elements of different lengths differ by.
+    # Error of elements of different lengths.
     assert values['steering.bevel_load'] == [pytest.approx(0.8 * 0.0256 / 0.035, rel=2e-3)]
     (line,) = (line for line in text.splitlines() if 'pushes along z' in line)
     assert abs(float(line.split()[-2])) < 1e-3

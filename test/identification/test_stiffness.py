@@ -41,7 +41,7 @@ def grid(forces: tuple[float, ...] = (1.1, 1.3, 1.5), angles: ArrayLike = EIGHT)
 
 
 def ofs(table: dict[float, FloatArray]) -> Callable[..., Any]:
-    """Return a function that gives the stiffness of the nearest level."""
+    """Return a function of the stiffness of the nearest level."""
     return lambda force: table[min(table, key=lambda level: abs(level - force))]
 
 
@@ -61,7 +61,7 @@ def pressed(
     off_plane: float = 0.0,
     rests: bool = True,
 ) -> IndentationRecording:
-    """Press with force vectors in turn; stiffness is a matrix or a function of the force."""
+    """Press with force vectors in turn; the stiffness is a matrix or a function of the force."""
     matrix = stiffness if callable(stiffness) else lambda _force: stiffness
     legs = [(rest, (0.0, 0.0), 1.0)]
     for force in forces:
@@ -92,7 +92,7 @@ def pressed(
 
 
 def limited(rng: np.random.Generator, count: int, rate: float) -> FloatArray:
-    """Noise of unit power below 125 Hz, as the sensor's second filter leaves it."""
+    """Return noise of unit power below 125 Hz, filtered as by the sensor's second filter."""
     every = round(2000.0 / rate)
     white = rng.normal(size=((count + 10) * every, 2))
     noise = sosfilt(butter(2, 125.0, fs=2000.0, output='sos'), white, axis=0)
@@ -101,7 +101,7 @@ def limited(rng: np.random.Generator, count: int, rate: float) -> FloatArray:
 
 
 def expected(matrix: FloatArray) -> dict[str, float]:
-    """Return every parameter of a matrix, by name."""
+    """Return all parameters of a matrix, by name."""
     stiffness, directions = np.linalg.eigh((matrix + matrix.T) / 2.0)
     angle = np.arctan2(*directions[::-1, 1])
     return {
@@ -141,7 +141,7 @@ def matrices(draw: Callable[..., Any]) -> FloatArray:
 @hypothesis_settings(max_examples=20, deadline=None)
 def test_any_matrix_is_recovered_from_exact_presses(matrix: FloatArray) -> None:
     (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
-    # 1e-8: noise below this part of a reading is taken as rounding.
+    # 1e-8: noise below this fraction of a reading is treated as rounding.
     assert_allclose(level.matrix, matrix, atol=float(1e-8 * np.linalg.norm(matrix)))
     truth = expected(matrix)
     for name in ('curl', 'spring', 'principal_stiffness_1', 'tissue_stiffness'):
@@ -174,7 +174,7 @@ def test_a_quarter_turn_keeps_the_errors() -> None:
         ('spring', 'spring'),
         ('principal_stiffness_1', 'principal_stiffness_1'),
     ):
-        # 1e-6: a quarter turn exchanges the axes, except for rounding.
+        # 1e-6: a quarter turn swaps the axes, up to rounding.
         assert_allclose(seen[name].value, level[other].value, rtol=1e-6)
         assert_allclose(seen[name].interval, level[other].interval, rtol=1e-6)
 
@@ -185,7 +185,7 @@ def test_units_scale_the_matrix_and_its_errors() -> None:
     larger = replace(recording, force=4.0 * recording.force, position=recording.position / 2.0)
     wide = StiffnessSettings(level_tolerance=0.2, rest_force=0.4)
     (other,) = identify_stiffness(larger, wide).levels
-    # 1e-9: powers of two change only what is rounding.
+    # 1e-9: powers of two change only rounding.
     assert_allclose(other.matrix, 8.0 * level.matrix, rtol=1e-9)
     assert_allclose(other.curl.interval, 8.0 * np.array(level.curl.interval), rtol=1e-9)
     assert_allclose(other.spring.interval, level.spring.interval, rtol=1e-9)
@@ -240,7 +240,7 @@ def test_intervals_have_their_coverage(
 def test_the_variance_is_near_the_cramer_rao_bound(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
-    """The bound is that of whole holds with known zero, without drift."""
+    """The bound is for complete holds with known zero, without drift."""
     table, estimates = repeats
     samples = HOLD * RATE
     rng = np.random.default_rng(1)
@@ -254,11 +254,11 @@ def test_the_variance_is_near_the_cramer_rao_bound(
         bound = np.diag(np.kron(among_rows, np.linalg.inv(displacement @ displacement.T)))
         found = np.var([e.levels[index].matrix.ravel() for e in estimates], axis=0)
         ratios.append(found / bound)
-    # The mean over levels and entries scatters by 6 % over 60 repeats, by 8 % over 30.
+    # The mean over levels and entries varies by 6 % over 60 repeats, by 8 % over 30.
     assert np.mean(ratios) < 1.3
 
 
-def test_the_interval_of_the_asymmetry_holds_zero_where_that_of_the_curl_does(
+def test_the_intervals_of_asymmetry_and_curl_agree_on_zero(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
     for estimate in repeats[1]:
@@ -280,8 +280,8 @@ def test_an_isotropic_tissue_has_no_principal_direction(
         assert determined <= binom.ppf(1.0 - 1e-4, len(estimates) * len(TABLE), 0.01)
 
 
-def test_the_errors_of_presses_are_their_scatter() -> None:
-    """Also where a slow sensor leaves few independent samples in a hold."""
+def test_the_errors_of_presses_equal_their_standard_deviation() -> None:
+    """Also for a slow sensor with few independent samples in a hold."""
     forces = grid((1.3,))
     off, error = [], []
     exact = pressed(TABLE[1.3], forces, hold=1.0, rest=1.0)
@@ -291,7 +291,7 @@ def test_the_errors_of_presses_are_their_scatter() -> None:
         presses = identify_stiffness(replace(exact, force=exact.force + 0.02 * noise)).presses
         off.append(presses.force - forces)
         error.append(presses.force_error)
-    # 15 %: 480 values scatter by 3 %, and 40 correlated samples give their noise to 10 %.
+    # 15 %: 480 values vary by 3 %, and the noise of 40 correlated samples has an error of 10 %.
     assert_allclose(np.sqrt(np.mean(np.square(error))), np.std(off), rtol=0.15)
 
 
@@ -310,7 +310,7 @@ def test_linear_drift_is_removed() -> None:
     assert 'drift' not in ' '.join(still.warnings)
 
 
-def test_the_order_of_presses_does_not_matter() -> None:
+def test_the_result_is_independent_of_the_order_of_presses() -> None:
     forces = grid()
     order = np.random.default_rng(3).permutation(len(forces))
     straight = identify_stiffness(pressed(ofs(TABLE), forces))
@@ -336,7 +336,7 @@ STAIRS = np.array([[f * np.cos(a), f * np.sin(a)] for a in EIGHT for f in (0.5, 
     ],
     ids=['slow', 'fast', 'scattered', 'short rests and bias', 'stairs'],
 )
-def test_presses_of_other_protocols_are_found(
+def test_presses_of_other_protocols_are_detected(
     forces: FloatArray, options: dict[str, Any], levels: int
 ) -> None:
     matrix = TABLE[1.3]
@@ -350,7 +350,7 @@ def test_presses_of_other_protocols_are_found(
         assert level.determination > 0.999
 
 
-def test_uneven_stamps_and_gaps_do_no_harm() -> None:
+def test_uneven_stamps_and_gaps_do_not_change_the_result() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     rng = np.random.default_rng(5)
     kept = (rng.random(len(recording.time)) < 0.8) & (np.abs(recording.time - 3.35) > 0.2)
@@ -367,7 +367,7 @@ def test_uneven_stamps_and_gaps_do_no_harm() -> None:
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_a_recording_may_begin_and_end_anywhere() -> None:
+def test_a_recording_may_start_and_end_at_any_time() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     kept = (recording.time > 0.6) & (recording.time < 7.9)
     cut = IndentationRecording(
@@ -382,7 +382,7 @@ def test_a_recording_may_begin_and_end_anywhere() -> None:
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_a_press_without_a_hold_is_left_out_and_reported() -> None:
+def test_a_press_without_a_hold_is_discarded_and_reported() -> None:
     forces = grid((1.3,))
     exact = pressed(TABLE[1.3], forces)
     force, position = exact.force.copy(), exact.position.copy()
@@ -433,7 +433,7 @@ def test_motion_along_x_determines_one_column(noise: float) -> None:
     ids=['one oblique direction', 'a narrow fan', 'two presses'],
 )
 @pytest.mark.parametrize('noise', [0.0, 1.0])
-def test_too_few_directions_determine_nothing(
+def test_too_few_directions_determine_no_parameter(
     forces: FloatArray | list[tuple[float, float]], noise: float
 ) -> None:
     (level,) = identify_stiffness(pressed(TABLE[1.3], forces, noise=noise)).levels
@@ -444,14 +444,14 @@ def test_too_few_directions_determine_nothing(
 
 
 @pytest.mark.parametrize('estimator', ['ordinary', 'weighted', 'huber', 'total'])
-def test_every_estimator_finds_the_matrix(estimator: str) -> None:
+def test_all_estimators_recover_the_matrix(estimator: str) -> None:
     recording = pressed(ofs(TABLE), grid(), noise=1.0)
     settings = StiffnessSettings(estimator=estimator)
     for level, matrix in zip(
         identify_stiffness(recording, settings).levels, TABLE.values(), strict=True
     ):
         errors = np.array([p.error for p in level.parameters]).reshape(2, 2)
-        # Five standard errors, themselves known to about a third.
+        # Five standard errors, which have an error of about a third.
         assert (np.abs(level.matrix - matrix) < 5.0 * errors).all()
         assert errors.max() < 2.0
 
@@ -471,7 +471,7 @@ def test_huber_is_robust_against_one_press() -> None:
     assert off['huber'] < off['ordinary'] / 2.0
 
 
-def test_weighted_gives_noisy_presses_less_weight() -> None:
+def test_the_weighted_estimator_reduces_the_weight_of_noisy_presses() -> None:
     forces = grid((1.3,), np.tile(EIGHT, 2))
     off: dict[str, list[float]] = {'ordinary': [], 'weighted': []}
     for seed in range(12):
@@ -519,7 +519,7 @@ def test_doubtful_results_have_warnings() -> None:
     assert identify_stiffness(pressed(ROUND[1.1], grid((1.1,)), noise=1.0)).warnings == ()
 
 
-def test_presses_that_do_not_follow_one_matrix_are_reported() -> None:
+def test_presses_inconsistent_with_a_matrix_are_reported() -> None:
     forces = grid((1.1,))
     stiffer = {1.08: 900.0 * np.eye(2), 1.12: 800.0 * np.eye(2)}
     forces[:4] *= 1.08 / 1.1

@@ -1,4 +1,4 @@
-"""Tables are read as their users wrote them, or refused in one line that says what to do."""
+"""Tables of other tools are read, or rejected by a one-line error with instructions."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize('form', FORMS)
-def test_the_same_friction_comes_from_each_form(
+def test_all_table_formats_give_the_same_friction(
     form: str, run: tuple[Any, Any, Any], tmp_path: Path
 ) -> None:
     make, columns = FORMS[form]
@@ -108,7 +108,7 @@ def test_matlab_files_have_columns_and_factors(run: tuple[Any, Any, Any], tmp_pa
     assert_allclose(read.depth, depth)
 
 
-def test_speeds_alone_are_integrated(tmp_path: Path) -> None:
+def test_velocities_without_depth_are_integrated(tmp_path: Path) -> None:
     made = strokes(seed=2)
     path = written(tmp_path, lines('time,vel_mm/s,force', made.time, 1e3 * made.speed, made.force))
     read = read_friction_recording(path)
@@ -123,10 +123,8 @@ def test_speeds_alone_are_integrated(tmp_path: Path) -> None:
     ),
     separator=st.sampled_from([',', ';', '\t', ' ']),
 )
-def test_numbers_come_back_as_they_were_written(
-    values: list[tuple[float, float]], separator: str
-) -> None:
-    # A file of its own for each example.
+def test_numbers_are_read_back_exactly(values: list[tuple[float, float]], separator: str) -> None:
+    # A separate file for each example.
     from tempfile import TemporaryDirectory
 
     first, second = np.transpose(values)
@@ -137,7 +135,7 @@ def test_numbers_come_back_as_they_were_written(
     assert_allclose(table.columns['beta'], second, rtol=0.0)
 
 
-def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
+def test_unusable_rows_are_counted(tmp_path: Path) -> None:
     time = np.arange(500) / 100.0
     text = lines('time,depth,force', time, np.sin(time), np.cos(time)).splitlines()
     text[10] = 'n/a,1,2'
@@ -149,13 +147,13 @@ def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
     assert read.losses == (
         '1 lines not readable, left out',
         'columns by their names: time=time, depth=depth, force=force',
-        '1 rows with a value that is no number, left out',
+        '1 rows with a value that is not a number, left out',
         '1 rows out of order, sorted by time',
         '1 rows with the time of another, left out',
     )
 
 
-def test_millimeters_without_a_unit_are_suspected(tmp_path: Path) -> None:
+def test_probable_millimeters_without_unit_are_reported(tmp_path: Path) -> None:
     time = np.arange(500) / 100.0
     path = written(tmp_path, lines('time,depth,force', time, 30.0 * np.sin(time), np.cos(time)))
     assert any('depth[mm]' in words for words in read_friction_recording(path).losses)
@@ -179,7 +177,7 @@ def test_millimeters_without_a_unit_are_suspected(tmp_path: Path) -> None:
         ('t,q,F\n1,2,3\n1e30,3,4\n', {}, 'is its unit right'),
     ],
 )
-def test_bad_tables_are_refused(
+def test_invalid_tables_are_rejected(
     text: str, columns: dict[str, str], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(RecordingError, match=said):
@@ -187,7 +185,7 @@ def test_bad_tables_are_refused(
 
 
 @pytest.mark.parametrize('words', ['', 'time', 'time=', 'tyme=t', 'time=t,force'])
-def test_bad_roles_are_refused(words: str) -> None:
+def test_invalid_roles_are_rejected(words: str) -> None:
     with pytest.raises(RecordingError, match='--columns takes ROLE='):
         column_roles(words)
     assert column_roles('time=sec:nsec, force=-F*2[mN]') == {
@@ -196,7 +194,7 @@ def test_bad_roles_are_refused(words: str) -> None:
     }
 
 
-def test_options_of_bags_are_not_ignored(tmp_path: Path) -> None:
+def test_options_of_bags_are_rejected_for_tables(tmp_path: Path) -> None:
     path = written(tmp_path, 't,q,F\n1,2,3\n2,3,4\n')
     with pytest.raises(RecordingError, match='--columns takes the place of --force-axis'):
         read_friction_recording(path, force_axis='-z')
@@ -204,7 +202,7 @@ def test_options_of_bags_are_not_ignored(tmp_path: Path) -> None:
         read_friction_recording('bags/friction_01', columns={'time': 't'})
 
 
-def test_damaged_and_new_matlab_files_are_refused(tmp_path: Path) -> None:
+def test_damaged_and_new_matlab_files_are_rejected(tmp_path: Path) -> None:
     for content in (b'', b'MATLAB 5.0 MAT-file' + bytes(500), bytes(range(256)) * 4):
         (tmp_path / 'run.mat').write_bytes(content)
         with pytest.raises(RecordingError):
@@ -216,7 +214,7 @@ def test_damaged_and_new_matlab_files_are_refused(tmp_path: Path) -> None:
         read_table(tmp_path / 'run.mat')
 
 
-def test_usual_names_are_found_whatever_their_case_and_unit(tmp_path: Path) -> None:
+def test_usual_names_are_found_with_any_case_and_unit(tmp_path: Path) -> None:
     path = written(tmp_path, 'Timestamp (s),Insertion [mm],Velocity,Fz_N\n1,2,3,4\n2,3,4,5\n')
     assert guessed(read_table(path)) == {
         'time': 'Timestamp (s)',
