@@ -13,7 +13,7 @@ import tracemalloc
 from typing import Final
 
 from benchmarks.measure import Bar, least_times
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
 from needle_dynamics import (
@@ -133,7 +133,7 @@ def compare(tick: Tick) -> Answer:
         )
         for name, gain in (('insertions', ratio), ('ceiling', ceiling))
     ]
-    section = Section(
+    section = PageSection(
         'Batches',
         ('what', '1 thread [ms]', '2 threads [ms]', 'speed-up', 'per second'),
         rows,
@@ -148,7 +148,7 @@ def compare(tick: Tick) -> Answer:
         f'{together:.3g} times as long: in a batch each instruction takes several needles. '
         f'Depths and velocities at the end differ by at most {apart:.1g} of themselves.',
     )
-    memory = Section(
+    memory = PageSection(
         'Memory of batches',
         ('simulated [ms]', 'states kept', 'peak memory [MB]'),
         [

@@ -18,7 +18,7 @@ from needle_dynamics import (
     NeedleParameters,
 )
 from needle_identification import FrictionSettings, StiffnessSettings
-from needle_identification.friction.terms import columns_of, Motion, regressors
+from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 from needle_insertion.experiment.protocol import DIRECTIONS, HOLD_TIME
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +111,7 @@ def friction_truth(
     }
     names = [column.name for column in columns_of(settings.terms, settings)]
     still = np.zeros_like(time)
-    motion = Motion(speed, np.gradient(speed, time), time - time[0], still, still > 0.0)
+    motion = NeedleMotion(speed, np.gradient(speed, time), time - time[0], still, still > 0.0)
     known = information(
         regressors(motion, settings.terms, settings),
         reading_noise(sensor, 1),

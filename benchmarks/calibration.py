@@ -19,7 +19,7 @@ from unittest import mock
 
 from benchmarks.bounds import friction_truth, RATE, stiffness_truth, Truth
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import (
     FloatArray,
     ForceSensor,
@@ -46,8 +46,8 @@ from needle_identification import (
 )
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
+    ExperimentProtocol,
     indenter_name,
-    Protocol,
     PROTOCOLS,
     START_DEPTH,
 )
@@ -75,7 +75,7 @@ _BASIC: Final = ('coulomb', 'viscous')
 _Result = TypeVar('_Result')
 
 
-class Found(NamedTuple):
+class CalibrationResult(NamedTuple):
     """Estimate of one parameter from one recording, with the true value."""
 
     case: str
@@ -166,7 +166,7 @@ class _Felt(ForceSensor):
         return np.array([sensor.measure(wrench, **how)[1] for wrench, how in self.wrenches])
 
 
-class Motion(NamedTuple):
+class RobotMotion(NamedTuple):
     """Time [s], measured depth [m] and velocity [m/s], (n,), and true wrenches of an insertion."""
 
     time: FloatArray
@@ -175,7 +175,7 @@ class Motion(NamedTuple):
     felt: _Felt
 
 
-def insertion(parameters: NeedleParameters) -> Motion:
+def insertion(parameters: NeedleParameters) -> RobotMotion:
     """Run the friction protocol on a plant in robot mode."""
     protocol = PROTOCOLS['friction']
     base = BaseMotion(BaseParameters(), START_DEPTH, (parameters.minimum_depth, parameters.length))
@@ -184,7 +184,7 @@ def insertion(parameters: NeedleParameters) -> Motion:
     plant = Plant(Integrator(parameters, start, _STEP), felt, RATE, base)
     _command(plant, protocol)
     samples = [plant.advance() for _ in range(_samples(protocol))]
-    return Motion(
+    return RobotMotion(
         np.arange(1, len(samples) + 1) / RATE,
         np.array([sample.joint_position for sample in samples]),
         np.array([sample.speed for sample in samples]),
@@ -192,11 +192,11 @@ def insertion(parameters: NeedleParameters) -> Motion:
     )
 
 
-def _samples(protocol: Protocol) -> int:
+def _samples(protocol: ExperimentProtocol) -> int:
     return round(protocol.duration * RATE) + 1
 
 
-def _command(machine: Plant | Indenter, protocol: Protocol) -> None:
+def _command(machine: Plant | Indenter, protocol: ExperimentProtocol) -> None:
     points = protocol.points
     machine.follow(
         protocol.joints,
@@ -253,7 +253,7 @@ FRICTION_CASES: Final[Mapping[str, FrictionCase]] = {
 }
 
 
-def friction(seed: int, number: int) -> list[Found]:
+def friction(seed: int, number: int) -> list[CalibrationResult]:
     """Identify a friction recording, every n-th in all cases; seed and number define all noise."""
     drawn = draw_friction(_DRAWN, seed + number // _DRAWN)[number % _DRAWN]
     rng = np.random.default_rng([seed, number])
@@ -281,7 +281,7 @@ def friction(seed: int, number: int) -> list[Found]:
         for name, (_, motion) in motions.items()
         if name in {case.kind for case in cases.values()}
     }
-    found: list[Found] = []
+    found: list[CalibrationResult] = []
     for name, case in cases.items():
         needle, motion = motions[case.kind]
         sensor = sensors[case.kind]
@@ -309,13 +309,13 @@ def friction(seed: int, number: int) -> list[Found]:
     return found
 
 
-def _compared(case: str, found: ParameterEstimate, truth: Truth) -> Found:
-    return Found(
+def _compared(case: str, found: ParameterEstimate, truth: Truth) -> CalibrationResult:
+    return CalibrationResult(
         case, found.name, found.unit, *truth[found.name], found.value, found.error, *found.interval
     )
 
 
-def stiffness(seed: int, number: int) -> list[Found]:
+def stiffness(seed: int, number: int) -> list[CalibrationResult]:
     """Identify a stiffness recording, every n-th by all estimators; see `friction`."""
     drawn = draw_stiffness(_DRAWN, seed + number // _DRAWN)[number % _DRAWN]
     entropy = int(np.random.default_rng([seed, number]).integers(2**32))
@@ -342,7 +342,7 @@ def stiffness(seed: int, number: int) -> list[Found]:
         stiffness_truth(matrix, force, sensor, tissue)
         for matrix, force in zip(tissue.matrices, FORCE_LEVELS, strict=True)
     ]
-    found: list[Found] = []
+    found: list[CalibrationResult] = []
     for estimator in ESTIMATORS[: None if number % _SIDE == 0 else 1]:
         levels = identify_stiffness(recording, StiffnessSettings(estimator=estimator)).levels
         if len(levels) != len(truths):
@@ -354,16 +354,16 @@ def stiffness(seed: int, number: int) -> list[Found]:
     return found
 
 
-def summarized(found: Iterable[Found]) -> list[Row]:
+def summarized(found: Iterable[CalibrationResult]) -> list[Row]:
     """Combine the estimates of each parameter in each case, in order of first appearance."""
-    groups: dict[tuple[str, str], list[Found]] = {}
+    groups: dict[tuple[str, str], list[CalibrationResult]] = {}
     for one in found:
         groups.setdefault((one.case, one.name), []).append(one)
     cases = list(dict.fromkeys(case for case, _ in groups))
     return [_row(groups[key]) for key in sorted(groups, key=lambda key: cases.index(key[0]))]
 
 
-def _row(group: list[Found]) -> Row:
+def _row(group: list[CalibrationResult]) -> Row:
     first = group[0]
     truth, bound, value, error, low, high = np.array([one[3:] for one in group]).T
     known = np.isfinite(value)
@@ -394,7 +394,7 @@ def _root_mean_square(values: FloatArray) -> float:
     return sqrt(float(np.mean(values**2))) if len(values) else float('nan')
 
 
-STUDIES: Final[Mapping[str, Callable[[int, int], list[Found]]]] = {
+STUDIES: Final[Mapping[str, Callable[[int, int], list[CalibrationResult]]]] = {
     'friction': friction,
     'stiffness': stiffness,
 }
@@ -429,13 +429,13 @@ def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
     workers = os.cpu_count() or 1
     rows: list[Row] = []
     for name, study in STUDIES.items():
-        found: list[Found] = []
+        found: list[CalibrationResult] = []
         for number, part in enumerate(studied(study, recordings, seed, workers), 1):
             tick(f'{name}, {number} of {recordings}')
             found += part
         rows += summarized(found)
     wrong = sum(not row.holds for row in rows)
-    section = Section(
+    section = PageSection(
         'Estimates and true values',
         (
             'case',

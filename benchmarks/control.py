@@ -8,7 +8,7 @@ from math import exp, inf
 from typing import Final
 
 from benchmarks.measure import Bar, least_times
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_controller import (
     Adaptive,
     AdaptiveGains,
@@ -146,7 +146,7 @@ def compare(tick: Tick) -> Answer:
         plain = times.get(f'{name.replace(", with observer", "")}, NumPy')
         ratio = f'{plain / value:.1f} x' if plain and 'observer' not in name else ''
         rows.append((name, f'{1e6 * value:.2f}', f'{100.0 * value / PERIOD:.2f} %', ratio))
-    section = Section(
+    section = PageSection(
         'Cost of a control step',
         ('control step', 'cost [us]', 'of 1 ms', 'NumPy takes'),
         rows,

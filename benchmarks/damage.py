@@ -16,7 +16,7 @@ import time
 from typing import Any, Final
 
 from benchmarks.measure import Bar, peak_memory
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray
 from needle_identification import (
     BagWriter,
@@ -213,7 +213,7 @@ def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
                          for fate in fates))
         for form, damage in cases
     ]  # fmt: skip
-    section = Section(
+    section = PageSection(
         'Damaged recordings',
         ('form', 'damage', *fates),
         rows,

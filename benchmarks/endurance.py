@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from benchmarks.bare import PERIOD, RATE, STREAMS
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import cpu_seconds, Pair, PAIRS
 from needle_identification import Bag
 from needle_insertion.experiment.node_process import GraphError
@@ -67,7 +67,7 @@ def record(folder: Path, duration: float) -> Answer:
         ('duplicates', f'{sum(len(n) - len(np.unique(n)) for n in numbers.values())}'),
         *((f'CPU of the {name} [%]', f'{share:.1f}') for name, share in shares.items()),
     ]
-    section = Section(
+    section = PageSection(
         'Recorder', ('figure', 'found'), rows, f'{len(_TOPICS)} topics, {duration:g} s.'
     )
     total = float(sum(lost.values()))
@@ -140,7 +140,7 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     shown = [around(share) for share in _SHOWN]
     growth = around(1.0) - around(0.0)
     columns = [around(0.0), *shown, growth]
-    section = Section(
+    section = PageSection(
         'Memory',
         ('[MB]', 'warm', *(f'{100 * share:.0f} %' for share in _SHOWN), 'growth'),
         [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)],

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Final
 
 from benchmarks.measure import least_times, number
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 import gymnasium
 
 #: Environments of the suite, and two of classic control.
@@ -58,7 +58,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
         single = STEPS['single'] / times[f'{name} single']
         many_at_once = MANY * STEPS['vector'] / times[f'{name} vector']
         rows.append((name.rpartition(':')[2], number(single), number(many_at_once)))
-    section = Section(
+    section = PageSection(
         'Environments of Gymnasium: steps per second',
         ('environment', 'one', f'{MANY} at once'),
         rows,

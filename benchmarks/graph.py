@@ -26,7 +26,7 @@ from typing import Final
 from benchmarks.bare import PERIOD, RATE, Sender, STREAMS
 from benchmarks.endurance import record, watch_memory
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import Figures, Pair, PAIRS, TARGETS
 from geometry_msgs.msg import WrenchStamped
 from needle_insertion.experiment.node_process import GraphError
@@ -41,7 +41,7 @@ PLANT_CPU: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class GraphPlan:
     """Rounds, and duration of a turn, of the recording and of the memory measurement [s]."""
 
     rounds: int = 8
@@ -51,9 +51,9 @@ class Plan:
 
 
 PLANS: Final = {
-    'default': Plan(),
-    'quick': Plan(rounds=1, turn=0.5, recording=2.0, memory=2.0),
-    'full': Plan(recording=60.0, memory=600.0),
+    'default': GraphPlan(),
+    'quick': GraphPlan(rounds=1, turn=0.5, recording=2.0, memory=2.0),
+    'full': GraphPlan(recording=60.0, memory=600.0),
 }
 
 
@@ -76,7 +76,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
     return [section, *recorded, *watched], [*bars, *losses, *growth]
 
 
-def compare_pairs(folder: Path, plan: Plan, tick: Tick) -> dict[str, list[Figures]]:
+def compare_pairs(folder: Path, plan: GraphPlan, tick: Tick) -> dict[str, list[Figures]]:
     """Start the pairs, let them take turns, and return the metrics of each round by pair."""
     with ExitStack() as stack:
         pairs = {}
@@ -111,7 +111,7 @@ def _take_turns(
     stage: str,
     pairs: Mapping[str, Pair],
     job: Callable[[Pair, float], Figures],
-    plan: Plan,
+    plan: GraphPlan,
     tick: Tick,
 ) -> dict[str, list[Figures]]:
     """Return the metrics of the rounds by pair; the first pair rotates between rounds."""
@@ -199,7 +199,9 @@ def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> floa
     return float(np.median(ratios)) if ratios else float('nan')
 
 
-def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Section, list[Bar]]:
+def side_by_side(
+    found: Mapping[str, list[Figures]], plan: GraphPlan
+) -> tuple[PageSection, list[Bar]]:
     """Return a table of the metrics of the pairs with ratios, and the bars."""
     ours, bare, usual, steered = (found[name] for name in PAIRS)
 
@@ -243,7 +245,7 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
             'x',
         )
     )
-    section = Section(
+    section = PageSection(
         'Nodes and bare nodes',
         (f'{RATE} Hz', PAIRS[0], PAIRS[1], 'ratio', PAIRS[2], 'ratio', PAIRS[3], 'over bare'),
         rows,

@@ -20,7 +20,7 @@ import time
 from typing import Any, Final
 
 from benchmarks.measure import Bar, NOT_INSTALLED, number, optional, peak_memory
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_identification import (
     BagWriter,
     encode,
@@ -258,7 +258,7 @@ def _told(
         for times, one in lengths.items()
     ]
     sections = [
-        Section(
+        PageSection(
             'From a bag to a result',
             ('what', 'task', 'messages per second', 'time', 'peak memory'),
             speeds,
@@ -266,7 +266,7 @@ def _told(
             f'{_RATE:g} Hz. Each reader has its own process, and the least time of {_REPEATS} '
             f'counts.',
         ),
-        Section(
+        PageSection(
             'Longer bags',
             ('length', 'messages', 'size', 'time', 'per second', 'peak memory', 'for the bag'),
             memories,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_controller import (
     Adaptive,
     AdaptiveGains,
@@ -147,7 +147,7 @@ def laws() -> dict[str, Law]:
 
 
 @dataclass(frozen=True)
-class Cell:
+class LawCell:
     """
     Results of a law in one cell.
 
@@ -169,7 +169,7 @@ class Cell:
     lost: int
 
     @classmethod
-    def of(cls, batch: LoopBatch, goal: FloatArray, direction: float) -> Cell:
+    def of(cls, batch: LoopBatch, goal: FloatArray, direction: float) -> LawCell:
         """Evaluate runs for a reference (k + 1,) [m] and the sign of its motion."""
         lost = (batch.completed < len(goal) - 1) | (batch.largest > _LOST)
         end = batch.depths[:, -round(_END / PERIOD) :]
@@ -195,7 +195,7 @@ class Cell:
 
 def study(
     situation: Situation, law: Law, width: float, delay: int, carriage: float, needles: int
-) -> Cell:
+) -> LawCell:
     """
     Run one law in one cell.
 
@@ -233,7 +233,7 @@ def study(
     goal = np.array(
         [situation.reference.at(k * PERIOD).position for k in range(batch.depths.shape[1])]
     )
-    return Cell.of(batch, goal, float(np.sign(goal[len(goal) // 4] - goal[0])))
+    return LawCell.of(batch, goal, float(np.sign(goal[len(goal) // 4] - goal[0])))
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:
@@ -252,7 +252,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                 tick(f'{situation.name}, {100.0 * width:g} %, {name}')
                 cells[name] = [study(situation, law, width, *at, needles) for at in grid]
             sections.append(
-                Section(
+                PageSection(
                     f'{situation.name.capitalize()}, up to {100.0 * width:g} % off',
                     heads,
                     [[name, *map(str, row)] for name, row in cells.items()],
@@ -280,7 +280,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
         'in micrometers. Bold: needles with an error above 5 mm (lost) or with a '
         'limit cycle at the end (cycle).',
     )
-    sections.append(Section('Largest overshoot after the puncture [mm]', heads, beyond))
+    sections.append(PageSection('Largest overshoot after the puncture [mm]', heads, beyond))
     return sections, [
         Bar(
             f'{default}, 30 %: median of the final error, worst cell', max(medians), _MEDIAN, 'um'

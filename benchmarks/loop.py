@@ -8,9 +8,9 @@ from heapq import heappop, heappush
 from typing import Final, NamedTuple
 
 from needle_controller import (
-    Answer,
     Controller,
     ControllerSettings,
+    ForceCommand,
     ObserverSettings,
     SafetyLimits,
     Supervisor,
@@ -20,7 +20,7 @@ from needle_dynamics.simulated.run import PlantRun
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reader
+from needle_ros.wire import MessageReader
 
 #: Start time [ns].
 EPOCH: Final = 1_700_000_000 * NANOSECONDS
@@ -47,7 +47,7 @@ class Commanded(NamedTuple):
     frame: str = 'needle_base'
 
 
-class Fault:
+class LoopFault:
     """Fault of a topic; the base class transmits everything unchanged."""
 
     def measured(self, sent: Sent) -> Iterable[Sent]:
@@ -92,7 +92,8 @@ class Loop:
             JOINT_STATES.name: self.supervisor.encoders,
         }
         self._ends = {
-            name: (topic, Reader(topic.type_name).read) for name, topic in self.run.topics.items()
+            name: (topic, MessageReader(topic.type_name).read)
+            for name, topic in self.run.topics.items()
         }
         #: Messages in transmission: time of arrival, order, and content.
         self._waiting: list[tuple[int, int, str | None, bytes | Commanded]] = []
@@ -102,7 +103,7 @@ class Loop:
         """Set a target depth [m]."""
         self.supervisor.target(0, '', depth, 0.0, self.now)
 
-    def step(self, topic: str = '', fault: Fault | None = None) -> None:
+    def step(self, topic: str = '', fault: LoopFault | None = None) -> None:
         """Take a sample, transmit it with a fault on a topic, and apply the commands."""
         self.now += self._period
         told = {name: values for name, _, values in self.run.take(self.now)}
@@ -132,7 +133,7 @@ class Loop:
         self._order += 1
         heappush(self._waiting, (self.now + late, self._order, name, what))
 
-    def _arrive(self, name: str | None, what: bytes | Commanded, fault: Fault | None) -> None:
+    def _arrive(self, name: str | None, what: bytes | Commanded, fault: LoopFault | None) -> None:
         if isinstance(what, Commanded):
             self.run.commands.offer(what.stamp, what.frame, what.force, 0.0, self.now)
         elif name is not None:
@@ -142,7 +143,7 @@ class Loop:
                 return
             self._answer(self._take[name](reading, self.now), fault)
 
-    def _answer(self, answer: Answer | None, fault: Fault | None) -> None:
+    def _answer(self, answer: ForceCommand | None, fault: LoopFault | None) -> None:
         if answer is None:
             return
         command = Commanded(answer.stamp, answer.force)

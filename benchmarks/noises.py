@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 
 from benchmarks.calibration import COVERAGE, studied
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray
 from needle_identification import FrictionSettings, identify_friction, Recording
 import numpy as np
@@ -40,7 +40,7 @@ _JUDGED: Final = ('coulomb_friction', 'viscous_friction')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kind:
+class NoiseKind:
     """
     A kind of recording: noise of force and motion, and true effects in addition to (15).
 
@@ -83,7 +83,7 @@ class Kind:
 
 
 def recorded(
-    kind: Kind, rng: np.random.Generator, name: str = ''
+    kind: NoiseKind, rng: np.random.Generator, name: str = ''
 ) -> tuple[Recording, Mapping[str, float]]:
     """Simulate a recording, with its true parameters by name; `rng` draws strokes and noise."""
     truth = {
@@ -143,7 +143,7 @@ def _force(truth: Mapping[str, float], time: FloatArray, speed: FloatArray) -> F
     return np.asarray(force)
 
 
-def _noise(kind: Kind, rng: np.random.Generator, n: int) -> FloatArray:
+def _noise(kind: NoiseKind, rng: np.random.Generator, n: int) -> FloatArray:
     noise = kind.white * rng.standard_normal(n)
     if kind.colored:
         kept = exp(-1.0 / (kind.rate * kind.memory))
@@ -161,14 +161,14 @@ def _counted(values: FloatArray, step: float) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
+class NoiseRow:
     """
     A row of the table.
 
     Attributes
     ----------
-    kind : Kind
-        Kind of recording.
+    kind : NoiseKind
+        NoiseKind of recording.
     terms : tuple of str
         Terms in addition to Coulomb and viscous friction.
     effect : str
@@ -178,37 +178,37 @@ class Line:
 
     """
 
-    kind: Kind
+    kind: NoiseKind
     terms: tuple[str, ...] = ()
     effect: str = ''
     is_hard: bool = False
 
 
 #: Rows by name: first kinds of noise, then effects without their term.
-LINES: Final[Mapping[str, Line]] = {
-    'white': Line(kind=Kind()),
-    'AR(1), 20 ms': Line(kind=Kind(white=0.005, colored=0.03, memory=0.02)),
-    'AR(1), 0.2 s': Line(kind=Kind(white=0.005, colored=0.03, memory=0.2)),
-    'AR(1), 1 s': Line(kind=Kind(white=0.005, colored=0.03, memory=1.0), is_hard=True),
-    'random walk': Line(kind=Kind(white=0.005, walk=0.02), is_hard=True),
-    'mains, 250 Hz': Line(kind=Kind(white=0.005, mains=0.03)),
-    'mains, 100 Hz': Line(kind=Kind(white=0.005, mains=0.03, rate=100.0)),
-    'drift and its term': Line(kind=Kind(truth={'force_drift': 0.01}), terms=('drift',)),
-    'offset and its term': Line(kind=Kind(truth={'offset': 0.2}), terms=('offset',)),
-    'counts': Line(kind=Kind(white=0.01, counts=0.02)),
-    'positions only, counts': Line(kind=Kind(positions_only=True)),
-    'positions only, 1 um': Line(
-        kind=Kind(positions_only=True, position_noise=1e-6, position_counts=0.0)
+LINES: Final[Mapping[str, NoiseRow]] = {
+    'white': NoiseRow(kind=NoiseKind()),
+    'AR(1), 20 ms': NoiseRow(kind=NoiseKind(white=0.005, colored=0.03, memory=0.02)),
+    'AR(1), 0.2 s': NoiseRow(kind=NoiseKind(white=0.005, colored=0.03, memory=0.2)),
+    'AR(1), 1 s': NoiseRow(kind=NoiseKind(white=0.005, colored=0.03, memory=1.0), is_hard=True),
+    'random walk': NoiseRow(kind=NoiseKind(white=0.005, walk=0.02), is_hard=True),
+    'mains, 250 Hz': NoiseRow(kind=NoiseKind(white=0.005, mains=0.03)),
+    'mains, 100 Hz': NoiseRow(kind=NoiseKind(white=0.005, mains=0.03, rate=100.0)),
+    'drift and its term': NoiseRow(kind=NoiseKind(truth={'force_drift': 0.01}), terms=('drift',)),
+    'offset and its term': NoiseRow(kind=NoiseKind(truth={'offset': 0.2}), terms=('offset',)),
+    'counts': NoiseRow(kind=NoiseKind(white=0.01, counts=0.02)),
+    'positions only, counts': NoiseRow(kind=NoiseKind(positions_only=True)),
+    'positions only, 1 um': NoiseRow(
+        kind=NoiseKind(positions_only=True, position_noise=1e-6, position_counts=0.0)
     ),
-    'noisy speed, 1 mm/s': Line(kind=Kind(speed_noise=1e-3)),
-    'offset': Line(kind=Kind(truth={'offset': 0.02}), effect='offset'),
-    'drift': Line(kind=Kind(truth={'force_drift': 1e-3}), effect='drift'),
-    'direction': Line(
-        kind=Kind(truth={'withdrawal_coulomb': 0.02, 'withdrawal_viscous': 10.0}),
+    'noisy speed, 1 mm/s': NoiseRow(kind=NoiseKind(speed_noise=1e-3)),
+    'offset': NoiseRow(kind=NoiseKind(truth={'offset': 0.02}), effect='offset'),
+    'drift': NoiseRow(kind=NoiseKind(truth={'force_drift': 1e-3}), effect='drift'),
+    'direction': NoiseRow(
+        kind=NoiseKind(truth={'withdrawal_coulomb': 0.02, 'withdrawal_viscous': 10.0}),
         effect='direction',
     ),
-    'Stribeck': Line(
-        kind=Kind(truth={'stribeck_friction': 0.3}, speeds=(5e-4, 15e-3)), effect='stribeck'
+    'Stribeck': NoiseRow(
+        kind=NoiseKind(truth={'stribeck_friction': 0.3}, speeds=(5e-4, 15e-3)), effect='stribeck'
     ),
 }
 
@@ -216,7 +216,7 @@ LINES: Final[Mapping[str, Line]] = {
 RIGHT, FALSE = 0.90, 0.02
 
 
-class Outcome(NamedTuple):
+class NoiseOutcome(NamedTuple):
     """
     Result of one recording.
 
@@ -241,7 +241,7 @@ class Outcome(NamedTuple):
     advised: str
 
 
-def outcomes(seed: int, number: int) -> list[Outcome]:
+def outcomes(seed: int, number: int) -> list[NoiseOutcome]:
     """Identify one recording of each kind; seed and number define the noise."""
     return [
         _outcome(name, line, np.random.default_rng([seed, number, k]))
@@ -249,7 +249,7 @@ def outcomes(seed: int, number: int) -> list[Outcome]:
     ]
 
 
-def _outcome(name: str, line: Line, rng: np.random.Generator) -> Outcome:
+def _outcome(name: str, line: NoiseRow, rng: np.random.Generator) -> NoiseOutcome:
     recording, truth = recorded(line.kind, rng, name)
     settings = FrictionSettings(terms=('coulomb', 'viscous', *line.terms))
     found = identify_friction(recording, settings)
@@ -257,7 +257,7 @@ def _outcome(name: str, line: Line, rng: np.random.Generator) -> Outcome:
     advice = [
         words.rpartition('add the term')[2] for words in found.warnings if 'add the term' in words
     ]
-    return Outcome(
+    return NoiseOutcome(
         name,
         tuple(one.value - truth[one.name] for one in judged),
         tuple(one.error for one in judged),
@@ -269,7 +269,7 @@ def _outcome(name: str, line: Line, rng: np.random.Generator) -> Outcome:
 
 def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
     """Compare estimates and suggested terms with the true parameters."""
-    found: dict[str, list[Outcome]] = {name: [] for name in LINES}
+    found: dict[str, list[NoiseOutcome]] = {name: [] for name in LINES}
     workers = os.cpu_count() or 1
     for number, part in enumerate(studied(outcomes, recordings, seed, workers), 1):
         tick(f'noises, {number} of {recordings}')
@@ -324,7 +324,7 @@ def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
         ),
         Bar('highest coverage of mu_s and mu_v', 100.0 * max(coverages), 100.0 * high, '%'),
     ]
-    section = Section(
+    section = PageSection(
         'Other noise, another simulator',
         ('noise or effect', 'coverage mu_s and mu_v', 'made over given', 'warned', 'advice'),
         rows,

@@ -25,7 +25,7 @@ _TOOLS: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class PageSection:
     """
     Part of a page: a table with its heading.
 
@@ -56,7 +56,7 @@ class Section:
 Tick: TypeAlias = Callable[[str], None]
 
 #: Result of a benchmark: sections of the page, and bars.
-Answer: TypeAlias = tuple[list[Section], list[Bar]]
+Answer: TypeAlias = tuple[list[PageSection], list[Bar]]
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -116,7 +116,7 @@ def conclusion(bars: Iterable[Bar], seconds: float) -> str:
     )
     if absent:
         verdict += f', {absent} not measured'
-    section = Section(
+    section = PageSection(
         'Bars',
         ('figure', 'wanted', 'found', 'verdict'),
         [bar.row() for bar in bars],

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from benchmarks.kills import kill_workers, Losses
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_insertion.study.engine import chunk, order, TABLE
 from needle_insertion.study.study import made
 from needle_ros.errors import ParameterError
@@ -57,7 +57,7 @@ def compare(tick: Tick, kills: int = 500, samples: int = _SAMPLES) -> Answer:
             found.append(losses)
     taken = time.monotonic() - begin
     killed, young, errors, hangs = (sum(column) for column in zip(*found, strict=True))
-    section = Section(
+    section = PageSection(
         'Workers that are killed',
         ('studies', 'workers killed', 'younger than 0.2 s', 'errors', 'hangs', 'time [s]'),
         [tuple(map(str, (len(found), killed, young, errors, hangs, round(taken))))],

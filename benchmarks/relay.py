@@ -20,7 +20,7 @@ from time import monotonic
 from typing import Any, Final, NamedTuple
 
 from needle_controller.controller_node import ControllerNode
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering.executive import Phase
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.experiment.node_process import GraphError
@@ -93,7 +93,7 @@ _CONTROLLER: Final[dict[str, object]] = {
 }
 
 
-class Link(NamedTuple):
+class TopicLink(NamedTuple):
     """A topic from one node (source) to another (sink)."""
 
     source: str
@@ -108,29 +108,29 @@ _STATES: Final = (contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFL
 
 #: All links between the nodes of a steered insertion.
 LINKS: Final = (
-    *(Link('plant', 'controller', topic) for topic in (*_STATES, contract.CLOCK)),
+    *(TopicLink('plant', 'controller', topic) for topic in (*_STATES, contract.CLOCK)),
     *(
-        Link('plant', 'steering', topic)
+        TopicLink('plant', 'steering', topic)
         for topic in (contract.JOINT_STATES, contract.TIP_DEFLECTION, contract.CLOCK)
     ),
-    Link('controller', 'plant', contract.WRENCH_COMMAND),
-    Link('steering', 'controller', contract.JOINT_TRAJECTORY),
-    Link('steering', 'plant', contract.JOINT_TRAJECTORY),
-    Link('user', 'steering', contract.TARGET),
-    Link('plant', 'steering', contract.DIAGNOSTICS),
-    Link('controller', 'steering', contract.DIAGNOSTICS),
-    Link('steering', 'user', contract.DIAGNOSTICS),
-    Link('plant', 'user', contract.CLOCK),
+    TopicLink('controller', 'plant', contract.WRENCH_COMMAND),
+    TopicLink('steering', 'controller', contract.JOINT_TRAJECTORY),
+    TopicLink('steering', 'plant', contract.JOINT_TRAJECTORY),
+    TopicLink('user', 'steering', contract.TARGET),
+    TopicLink('plant', 'steering', contract.DIAGNOSTICS),
+    TopicLink('controller', 'steering', contract.DIAGNOSTICS),
+    TopicLink('steering', 'user', contract.DIAGNOSTICS),
+    TopicLink('plant', 'user', contract.CLOCK),
 )
 
 
-class Fault(NamedTuple):
+class MessageFault(NamedTuple):
     """
     A fault of one message.
 
     Attributes
     ----------
-    link : Link
+    link : TopicLink
         Link of the message.
     number : int
         Number of the message on the link since the target was sent, from 1.
@@ -141,7 +141,7 @@ class Fault(NamedTuple):
 
     """
 
-    link: Link
+    link: TopicLink
     number: int
     kind: str
     delay: float
@@ -169,7 +169,7 @@ class Relay(Node):
 
     Attributes
     ----------
-    fault : Fault or None
+    fault : MessageFault or None
         Fault to insert.
     counts : Counter
         Number of messages of each link since the target was sent.
@@ -182,8 +182,8 @@ class Relay(Node):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('relay', **node_options)
-        self.fault: Fault | None = None
-        self.counts: Counter[Link] = Counter()
+        self.fault: MessageFault | None = None
+        self.counts: Counter[TopicLink] = Counter()
         self.armed = False
         self.now = 0.0
         self.struck: float | None = None
@@ -210,7 +210,9 @@ class Relay(Node):
     def _on_clock(self, message: Any) -> None:
         self.now = message.clock.sec + message.clock.nanosec / NANOSECONDS
 
-    def _take(self, sinks: Sequence[tuple[Link, Callable[[bytes], None]]], data: bytes) -> None:
+    def _take(
+        self, sinks: Sequence[tuple[TopicLink, Callable[[bytes], None]]], data: bytes
+    ) -> None:
         for link, publish in sinks:
             self.counts[link] += self.armed
             fault = self.fault
@@ -232,7 +234,7 @@ class Relay(Node):
             deliver()
 
 
-class Outcome(NamedTuple):
+class InsertionOutcome(NamedTuple):
     """
     End of an insertion.
 
@@ -255,7 +257,7 @@ class Outcome(NamedTuple):
     end: str
     line: str
     after: float
-    counts: Counter[Link]
+    counts: Counter[TopicLink]
     struck: bool
 
     @property
@@ -264,7 +266,9 @@ class Outcome(NamedTuple):
         return self.end in ('target', 'stopped', 'rejected')
 
 
-def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outcome:
+def insert(
+    fault: MessageFault | None, logs: Path, *, continuous: bool = False
+) -> InsertionOutcome:
     """Insert a needle with one fault, in steps or continuously (without rests)."""
     with Graph(logs) as graph:
 
@@ -306,7 +310,7 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
             graph.spin_until(lambda: relay.now > later, 'the last message', _HANGS)
         except GraphError as error:
             line = f'{loop.phase.value}; {error}'
-            return Outcome('hangs', line, np.inf, relay.counts, relay.struck is not None)
+            return InsertionOutcome('hangs', line, np.inf, relay.counts, relay.struck is not None)
         struck = relay.struck is not None
         after = end - relay.struck if relay.struck is not None else 0.0
         if loop.phase is Phase.DONE:
@@ -314,18 +318,22 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
             off = float(np.hypot(x - TARGET[0], z - TARGET[2]))
             there = off < LARGEST_MISS and abs(y - TARGET[1]) < LARGEST_MISS
             line = f'{1e3 * off:.2f} mm from the target'
-            return Outcome('target' if there else 'missed', line, after, relay.counts, struck)
+            return InsertionOutcome(
+                'target' if there else 'missed', line, after, relay.counts, struck
+            )
         if loop.phase is Phase.STOPPED:
             kind = 'stopped' if after <= LONGEST_STOP else 'late'
-            return Outcome(kind, loop.fault, after, relay.counts, struck)
-        return Outcome('rejected', pending.outcome[1], after, relay.counts, struck)
+            return InsertionOutcome(kind, loop.fault, after, relay.counts, struck)
+        return InsertionOutcome('rejected', pending.outcome[1], after, relay.counts, struck)
 
 
-def choose(counts: Mapping[Link, int], rng: np.random.Generator) -> Fault:
+def choose(counts: Mapping[TopicLink, int], rng: np.random.Generator) -> MessageFault:
     """Draw a link, one of its messages, and a fault; `counts` is from an undisturbed insertion."""
     link = LINKS[int(rng.integers(len(LINKS)))]
     number = 1 + int(rng.integers(max(1, counts[link])))
-    return Fault(link, number, str(rng.choice(KINDS)), float(rng.uniform(0.0, LONGEST_DELAY)))
+    return MessageFault(
+        link, number, str(rng.choice(KINDS)), float(rng.uniform(0.0, LONGEST_DELAY))
+    )
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -26,7 +26,7 @@ from benchmarks.measure import (
     optional,
     seconds,
 )
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import (
     FloatArray,
     Integrator,
@@ -466,7 +466,7 @@ def compare(tick: Tick) -> Answer:
         return None if value is None else value / own
 
     modal = mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
-    section = Section(
+    section = PageSection(
         'Free vibration',
         (
             'tool',

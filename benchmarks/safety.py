@@ -15,9 +15,9 @@ import os
 from typing import Final, NamedTuple, TypeAlias
 
 from benchmarks import strangers
-from benchmarks.loop import Commanded, Fault, Loop, MEASURED, Sent
+from benchmarks.loop import Commanded, Loop, LoopFault, MEASURED, Sent
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION, WRENCH_COMMAND
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
@@ -56,7 +56,7 @@ _UNSAFE: Final = 0.5
 _Alter: TypeAlias = Callable[[int, Sent, Sent, np.random.Generator], Iterable[Sent]]
 
 
-class Lies(Fault):
+class Lies(LoopFault):
     """Sensor fault; `alter` maps the measurement to the received measurements."""
 
     def __init__(
@@ -72,7 +72,7 @@ class Lies(Fault):
         return self._alter(self._count - 1, sent, self._first, self._rng)
 
 
-class Orders(Fault):
+class Orders(LoopFault):
     """Command fault; `alter` maps the message number and the command to received commands."""
 
     def __init__(self, alter: Callable[[int, Commanded], Iterable[Commanded]]) -> None:
@@ -178,7 +178,7 @@ _RIVALS: Final = {(WRENCH_COMMAND.name, 'a second commander')} | {
 }
 
 
-class Cell(NamedTuple):
+class FaultCell(NamedTuple):
     """A fault, its topic, start and duration."""
 
     topic: str
@@ -188,7 +188,7 @@ class Cell(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class MotionResult:
     """
     Outcome of a motion.
 
@@ -214,13 +214,13 @@ class Found:
     recovery: float
 
 
-def cells() -> list[Cell]:
+def cells() -> list[FaultCell]:
     """Return each fault of each topic in each phase, and for a single message in motion."""
     kinds = [(topic, fault) for topic in MEASURED for fault in _lies(topic)]
     orders = [(WRENCH_COMMAND.name, fault) for fault in _ORDERS]
     return [
-        *(Cell(*kind, moment) for kind in (*kinds, *orders) for moment in MOMENTS),
-        *(Cell(*kind, 'moving', 1.0 / _RATE) for kind in kinds),
+        *(FaultCell(*kind, moment) for kind in (*kinds, *orders) for moment in MOMENTS),
+        *(FaultCell(*kind, 'moving', 1.0 / _RATE) for kind in kinds),
     ]
 
 
@@ -242,13 +242,13 @@ def _undisturbed() -> tuple[float, ...]:
     return tuple(depths)
 
 
-def measure(cell: Cell) -> Found:
+def measure(cell: FaultCell) -> MotionResult:
     """Simulate a motion with a fault."""
     own, loop = _undisturbed(), Loop(rate=_RATE)
     begin = round(MOMENTS[cell.moment] * _RATE)
     end = begin + max(1, round(cell.lasts * _RATE))
     if cell.topic == WRENCH_COMMAND.name:
-        fault: Fault = Orders(_ORDERS[cell.fault])
+        fault: LoopFault = Orders(_ORDERS[cell.fault])
     else:
         fault = Lies(_lies(cell.topic)[cell.fault], seed=begin)
     last = end + round(_WATCHED * _RATE)
@@ -271,7 +271,7 @@ def measure(cell: Cell) -> Found:
             outcome = STOPPED
         elif outcome == BORNE and loop.acting == 0.0 and loop.supervisor.fault is not None:
             outcome = LET_GO
-    return Found(outcome, force, beyond, (unsafe - begin) / _RATE, _recovery(loop))
+    return MotionResult(outcome, force, beyond, (unsafe - begin) / _RATE, _recovery(loop))
 
 
 def _recovery(loop: Loop) -> float:
@@ -311,12 +311,14 @@ def compare(tick: Tick, fault: str = '') -> Answer:
         bars.insert(0, Bar('cells', float(len(chosen)), 500.0, at_least=True))
         rows, more = strangers.measure(tick)
         comes = ('what comes', 'tries', 'moved by', 'bar', 'afterwards')
-        sections.append(Section('Real nodes', comes, rows))
+        sections.append(PageSection('Real nodes', comes, rows))
         bars += more
     return sections, bars
 
 
-def _section(topic: str, chosen: Sequence[Cell], found: Sequence[Found]) -> Section:
+def _section(
+    topic: str, chosen: Sequence[FaultCell], found: Sequence[MotionResult]
+) -> PageSection:
     """Return the table of a topic: one row per fault, over all phases."""
     rows = []
     for fault in dict.fromkeys(cell.fault for cell in chosen if cell.topic == topic):
@@ -343,7 +345,7 @@ def _section(topic: str, chosen: Sequence[Cell], found: Sequence[Found]) -> Sect
                 f'{max(one.recovery for _, one in own):.1f}',
             )
         )
-    return Section(
+    return PageSection(
         f'`{topic}`',
         (
             'fault', BORNE, LET_GO, STOPPED, 'worst force [N]', 'motion beyond its own [mm]',

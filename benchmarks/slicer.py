@@ -10,7 +10,7 @@ from typing import Any, Final
 from benchmarks.endurance import GROWTH, resident_memory
 from benchmarks.igtl_peer import free_port, Peer, SENT, Told
 from benchmarks.measure import Bar, number
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import cpu_seconds
 from geometry_msgs.msg import PointStamped
 from needle_insertion.experiment.ros_graph import Graph
@@ -167,7 +167,7 @@ def _answer(
         ('first shape after the node was killed, and started again [s]', number(again[0])),
         ('first shape after the peer was killed, and started again [s]', number(again[1])),
     ]
-    section = Section(
+    section = PageSection(
         'Node slicer with a peer',
         ('figure', 'found'),
         rows,

@@ -17,7 +17,7 @@ from unittest import mock
 import warnings
 
 from benchmarks.measure import Bar, geometric, least_times, number, seconds
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled import step as compiled_step
 from needle_dynamics.compiled.integrals import (
@@ -226,7 +226,7 @@ class Candidate:
     run: Callable[[RightHandSide], Any]
 
 
-class OpenLoop:
+class OpenLoopCase:
     """Open-loop run with its reference solution, and the search for settings."""
 
     def __init__(self) -> None:
@@ -344,7 +344,7 @@ class OpenLoop:
 def compare(tick: Tick) -> Answer:
     """Compare our integrator with SciPy solvers on the open-loop run."""
     tick('reference')
-    case = OpenLoop()
+    case = OpenLoopCase()
     ours, uniform = case.ours(graded=True), case.ours(graded=False)
     candidates = []
     for method in METHODS:
@@ -390,7 +390,7 @@ def compare(tick: Tick) -> Answer:
     rows.append(row(first, adaptive_time, 'NumPy, quad'))
     fastest = min(compiled_times[item.name] for item in candidates)
     beside = compiled_times[uniform.name]
-    section = Section(
+    section = PageSection(
         'Open-loop run',
         (
             'solver',

@@ -11,18 +11,18 @@ from time import perf_counter
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
-from needle_controller.steering import trial
+from benchmarks.page import Answer, PageSection, Tick
+from needle_controller.steering import simulation
 from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
-from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
-    Guidance,
+    GuideSetpoint,
     OutOfReachError,
     SteeringController,
     SteeringFaultError,
 )
+from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.trial import drawn
+from needle_controller.steering.simulation import drawn
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 from needle_ros.process_pool import processes
@@ -48,7 +48,7 @@ MEDIA: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
 PATH_NOISE: Final = 1e-4
 
 #: Unknown parameters of the needles: drift of about 6 mm without steering.
-TRUE: Final = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1, path_noise=PATH_NOISE)
+TRUE: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1, path_noise=PATH_NOISE)
 
 #: Standard deviation of a tip reading [m], readings during a rest, and lost fraction.
 SENSORS: Final = {'EM': (1.8e-4, 20, 0.0), 'ultrasound': (3e-4, 12, 0.05)}
@@ -98,7 +98,7 @@ class End(NamedTuple):
     time: float
 
 
-class Outcome(NamedTuple):
+class SteeringOutcome(NamedTuple):
     """
     Results of a needle.
 
@@ -149,7 +149,7 @@ def _model(
 ) -> SteeringModel:
     sigma, count, lost = SENSORS[sensor]
     noise = sigma / sqrt(count * (1.0 - lost))
-    belief = SteeringBelief(spread=spread, path_noise=PATH_NOISE, noise=noise)
+    belief = SteeringPrior(spread=spread, path_noise=PATH_NOISE, noise=noise)
     return SteeringModel(*believed(medium, bevel), STEP * np.arange(steps + 1), belief)
 
 
@@ -173,7 +173,9 @@ class MeanPlan(SteeringController):
 class _Trial:
     """A needle with its target, inserted under one controller after the other."""
 
-    def __init__(self, truth: trial.Truth, depths: FloatArray, sensor: str, seed: int) -> None:
+    def __init__(
+        self, truth: simulation.GroundTruth, depths: FloatArray, sensor: str, seed: int
+    ) -> None:
         self.truth, self.depths = truth, depths
         self._sensor, self._seed = sensor, seed
         self.target = np.zeros(2)
@@ -182,14 +184,14 @@ class _Trial:
 
     def known(self) -> SteeringModel:
         """Return the true parameters except the path."""
-        truth, known = self.truth, SteeringBelief(spread=0.0)
+        truth, known = self.truth, SteeringPrior(spread=0.0)
         return SteeringModel(truth.needle, truth.steering, self.depths, known)
 
     def end(self, controller: SteeringController | OpenLoop) -> tuple[FloatArray, End]:
         """Return the final tip position and the end of the insertion."""
         times, said = list[float](), list[str]()
 
-        def follow(tip: FloatArray | None) -> Guidance:
+        def follow(tip: FloatArray | None) -> GuideSetpoint:
             begin = perf_counter()
             to = controller.next(tip)
             times.append(perf_counter() - begin)
@@ -199,7 +201,7 @@ class _Trial:
 
         look = _look(self._sensor, self._seed)
         try:
-            done = trial.insert(self.truth, self.depths, look, follow)
+            done = simulation.insert(self.truth, self.depths, look, follow)
         except SteeringFaultError as error:
             # The insertion stopped before the target depth.
             self.said = str(error)
@@ -230,7 +232,7 @@ def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[s
     return medium, found
 
 
-def insert(sensor: str, spread: float, seed: int) -> Outcome:
+def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     """
     Insert one needle under each controller that moves the guide.
 
@@ -266,10 +268,10 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
     }
     ends |= {name: one.end(controller)[1] for name, controller in others.items()}
     reachable = bool((np.abs(target - drift) <= could).all())
-    return Outcome(medium, reachable, ends, refused, warned, held, look)
+    return SteeringOutcome(medium, reachable, ends, refused, warned, held, look)
 
 
-def turn(seed: int) -> Outcome:
+def turn(seed: int) -> SteeringOutcome:
     """Insert one needle with a bevel under controllers with and without rotation."""
     sensor, spread = CASES[0]
     medium, one = _drawn(spread, sensor, seed, BEVEL)
@@ -293,7 +295,7 @@ def turn(seed: int) -> Outcome:
         refused = True
     ends = {name: one.end(controller)[1] for name, controller in controllers.items()}
     reachable = bool(np.hypot(*(one.target - drift)) <= WITHIN * could)
-    return Outcome(medium, reachable, ends, refused, False, False, one.look)
+    return SteeringOutcome(medium, reachable, ends, refused, False, False, one.look)
 
 
 def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
@@ -371,7 +373,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
         'turns', 'load on the guide [N]', 'a step [ms]',
     )  # fmt: skip
     return [
-        Section(
+        PageSection(
             'Distance of the tip from its target [mm]',
             ('case', 'medium', *heads),
             rows,
@@ -382,7 +384,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             'parameters known except the path, and that ours did not reject. Way, turns and load '
             'are means, of the load the mean of the largest value of each insertion.',
         ),
-        Section(
+        PageSection(
             'Ours',
             (
                 'case', 'within reach', 'refused', 'refused within reach', 'warned',
@@ -390,7 +392,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             ),
             others,
         ),
-        Section(
+        PageSection(
             'With a bevel: distance of the tip from its target [mm]',
             heads,
             [(name, *_figures(every, name)) for name in TURNING],
@@ -410,17 +412,17 @@ def _statistic(values: FloatArray, what: str) -> float:
     return float(np.quantile(values, 0.95 if what == '95 %' else 0.5))
 
 
-def _misses(of: Sequence[Outcome], name: str) -> FloatArray:
+def _misses(of: Sequence[SteeringOutcome], name: str) -> FloatArray:
     return np.array([1e3 * one.ends[name].miss for one in of])
 
 
-def _times(of: Sequence[Outcome], name: str) -> tuple[float, float]:
+def _times(of: Sequence[SteeringOutcome], name: str) -> tuple[float, float]:
     """Return the median times of a step and of a tip measurement update [ms]."""
     step = float(np.median([1e3 * one.ends[name].time for one in of]))
     return step, float(np.median([1e3 * one.look for one in of]))
 
 
-def _figures(of: Sequence[Outcome], name: str) -> tuple[str, ...]:
+def _figures(of: Sequence[SteeringOutcome], name: str) -> tuple[str, ...]:
     miss = _misses(of, name)
     ends = [one.ends[name] for one in of]
     return (
@@ -436,7 +438,7 @@ def _figures(of: Sequence[Outcome], name: str) -> tuple[str, ...]:
     )
 
 
-def _best(of: Sequence[Outcome], medium: str) -> list[Bar]:
+def _best(of: Sequence[SteeringOutcome], medium: str) -> list[Bar]:
     """Return the bars of our controller against the best of the others."""
     bars = []
     for what in ('mean', '95 %'):

@@ -10,7 +10,7 @@ from typing import Final
 
 from benchmarks.calibration import COVERAGE
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import NeedleParameters, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import identify_steering, SteeringRecording, SteeringSettings
@@ -31,7 +31,7 @@ _LIMIT: Final = 6e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Truth:
+class FitTruth:
     """
     True parameters of an insertion.
 
@@ -66,14 +66,14 @@ class Truth:
 
 
 def insertion(
-    seed: int, truth: Truth | None = None, roll: Callable[[float], float] | None = None
+    seed: int, truth: FitTruth | None = None, roll: Callable[[float], float] | None = None
 ) -> SteeringRecording:
     """
     Insert to 100 mm in steps of 5 mm with random guide motion within 6 mm; measure the tip.
 
     `roll` is the roll of the base [rad] by depth [m].
     """
-    truth = truth or Truth()
+    truth = truth or FitTruth()
     rng = np.random.default_rng(seed)
     tissue = tissue_of(EI, truth.length)
     steering = SteeringParameters(
@@ -113,11 +113,11 @@ def insertion(
 
 #: Cases: name, true parameters, and number of insertions per fit.
 _CASES: Final = (
-    ('one insertion', Truth(), 1),
-    ('one insertion, no skin', Truth(skin=0.0), 1),
-    ('one insertion, lambda 50 mm', Truth(length=0.05), 1),
-    ('ten insertions', Truth(), 10),
-    ('ten insertions, paths that wander', Truth(path_noise=3e-5), 10),
+    ('one insertion', FitTruth(), 1),
+    ('one insertion, no skin', FitTruth(skin=0.0), 1),
+    ('one insertion, lambda 50 mm', FitTruth(length=0.05), 1),
+    ('ten insertions', FitTruth(), 10),
+    ('ten insertions, paths that wander', FitTruth(path_noise=3e-5), 10),
 )
 
 
@@ -163,7 +163,7 @@ def compare(tick: Tick, recordings: int = 1000) -> Answer:
         'fitted', 'fits', 'coverage', 'not determined', 'rms error of lambda',
         'median width of its interval', 'rms of the fit',
     )  # fmt: skip
-    section = Section(
+    section = PageSection(
         'Bending length from insertions with a moved guide',
         heads,
         rows,

@@ -7,7 +7,7 @@ import os
 from typing import Final
 
 from benchmarks.measure import Bar, least_times
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import (
     FloatArray,
     insert_batch,
@@ -159,7 +159,7 @@ def compare(tick: Tick) -> Answer:
         ('two cores over one', f'{cores:.2f} times'),
         ('difference of the tips', f'{1e6 * off:.2f} um'),
     ]
-    section = Section(
+    section = PageSection(
         'A needle that cuts its path',
         ('', 'found'),
         rows,

@@ -19,7 +19,7 @@ from typing import Any, cast, Final, TypeVar
 from unittest import mock
 
 from benchmarks.measure import Bar, least_times
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.step import advance, Sums
 import numba
@@ -338,7 +338,7 @@ def compare(tick: Tick) -> Answer:
     ]
     rows.append(('bound', '', '', f'{bound * 1e9:.3g}'))
     rows.append(('measured', '', '', f'{step * 1e9:.3g}'))
-    section = Section(
+    section = PageSection(
         'Cost of a step',
         ('operation', 'in a step', 'ns each', 'ns in a step'),
         rows,

@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from benchmarks.kills import kill_again_and_again, Kills
 from benchmarks.measure import Bar, least_times, number, seconds
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 import dask
 from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
@@ -64,7 +64,7 @@ _SETTINGS: Final = {
 _Factory: TypeAlias = Callable[[], AbstractContextManager[Executor]]
 
 
-class Plan(NamedTuple):
+class StudyPlan(NamedTuple):
     """
     Size of the benchmark.
 
@@ -94,8 +94,8 @@ class Plan(NamedTuple):
 
 
 PLANS: Final = {
-    'default': Plan(100_000, 8000, 6, (1000, 10_000, _MILLION), 10, 2000),
-    'quick': Plan(800, 400, 2, (100, 1000, 2000), 2, 100),
+    'default': StudyPlan(100_000, 8000, 6, (1000, 10_000, _MILLION), 10, 2000),
+    'quick': StudyPlan(800, 400, 2, (100, 1000, 2000), 2, 100),
 }
 
 
@@ -128,7 +128,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
         return _compare(Path(name), chosen, tick)
 
 
-def _compare(folder: Path, plan: Plan, tick: Tick) -> Answer:
+def _compare(folder: Path, plan: StudyPlan, tick: Tick) -> Answer:
     study = _study(plan.closed)
     tick('closed loop, in turns')
     least = take_turns(folder / 'timed', _study(plan.timed), plan.rounds)
@@ -329,7 +329,7 @@ def _checksum(path: Path) -> str:
 
 
 def _answer(
-    plan: Plan,
+    plan: StudyPlan,
     least: dict[str, float],
     tables: dict[str, str],
     watched: dict[int, Watched],
@@ -344,7 +344,7 @@ def _answer(
     start = watched[small].taken - small * each
     million = start + _MILLION * each
     sections = [
-        Section(
+        PageSection(
             'Insertions under our controller',
             ('who computes', 'per second', 'per second and worker'),
             [(name, number(rate), number(rate / WAYS[name][1])) for name, rate in rates.items()],
@@ -354,7 +354,7 @@ def _answer(
             f'The parent takes {1e3 / fed:.2f} ms for a chunk and its part of the table, and a '
             'chunk is a second of a worker.',
         ),
-        Section(
+        PageSection(
             'Open loop: the command, with two workers',
             ('insertions', 'time [s]', 'peak of the parent [MB]', 'peak of a worker [MB]'),
             [
@@ -366,7 +366,7 @@ def _answer(
             f'{million:.0f} s, by the line through {small} and {large}. '
             'Peaks are from the kernel (`VmHWM`).',
         ),
-        Section(
+        PageSection(
             'Equal tables',
             ('who computes', 'SHA-256 of the table'),
             [(name, f'`{table[:16]}`') for name, table in tables.items()],

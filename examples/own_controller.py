@@ -5,7 +5,7 @@ A law is any object with a sample period, a delay and a method `command`. The sh
 is one, too, so that both run in the same loop.
 """
 
-from needle_controller import Command, Controller, Measurement, run_controller
+from needle_controller import Controller, ControllerOutput, Measurement, run_controller
 from needle_dynamics import NeedleModel, NeedleParameters
 
 #: Depth to reach [m].
@@ -17,9 +17,9 @@ class Spring:
 
     period, delay = 1e-3, 1
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         """Return the force for a measurement; `load` is the known force of a bent needle."""
-        return Command(force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.speed)
+        return ControllerOutput(force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.speed)
 
 
 def main() -> None:

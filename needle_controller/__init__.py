@@ -5,15 +5,15 @@ Units are SI throughout; signs and frames follow docs/architecture.md.
 """
 
 from needle_controller.admittance import Admittance
-from needle_controller.answer import Answer
 from needle_controller.controller import (
-    Command,
     Controller,
+    ControllerOutput,
     ControllerSettings,
     DEFAULT_GAINS,
     LAWS,
     Measurement,
 )
+from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import HardwareSettings, Robot
 from needle_controller.in_loop.continuous import run_continuous
 from needle_controller.in_loop.run import LoopRun
@@ -31,14 +31,14 @@ from needle_controller.laws.pid import Pid, PidGains
 from needle_controller.observer.consistency import Consistency
 from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
-from needle_controller.reference.guide import REFERENCES
+from needle_controller.reference.generator import REFERENCES
 from needle_controller.reference.quintic import MinimumJerk
 from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
 from needle_controller.reference.trapezoid import Trapezoid
 from needle_controller.safety.guard import Guard
+from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.safety import Safety
-from needle_controller.safety.stream import Stream
 from needle_controller.stability import (
     check_stability,
     Limit,
@@ -46,17 +46,17 @@ from needle_controller.stability import (
     stability_limit,
     transition_matrix,
 )
-from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
-    Guidance,
+    GuideSetpoint,
     OutOfReachError,
     SteeringController,
     SteeringFaultError,
     TipEstimate,
 )
-from needle_controller.steering.outer_loop import OuterLoop
+from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import OuterLoopSettings
+from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
 
@@ -67,19 +67,21 @@ __all__ = [
     'Adaptive',
     'AdaptiveGains',
     'Admittance',
-    'Answer',
     'Axis',
-    'Command',
     'Commander',
     'Consistency',
     'ContinuousInverseDynamics',
     'ContinuousLaw',
     'ContinuousPid',
     'Controller',
+    'ControllerOutput',
     'ControllerSettings',
+    'ExecutiveSettings',
+    'ForceCommand',
     'Guard',
-    'Guidance',
+    'GuideSetpoint',
     'HardwareSettings',
+    'InputMonitor',
     'InverseDynamics',
     'InverseDynamicsGains',
     'Law',
@@ -91,8 +93,6 @@ __all__ = [
     'Observer',
     'ObserverSettings',
     'OutOfReachError',
-    'OuterLoop',
-    'OuterLoopSettings',
     'Pid',
     'PidGains',
     'Reference',
@@ -102,11 +102,11 @@ __all__ = [
     'SafetyLimits',
     'SampledLoop',
     'Setpoint',
-    'SteeringBelief',
     'SteeringController',
+    'SteeringExecutive',
     'SteeringFaultError',
     'SteeringModel',
-    'Stream',
+    'SteeringPrior',
     'Supervisor',
     'TipEstimate',
     'Trapezoid',

@@ -12,7 +12,7 @@ from needle_controller.laws.axis import Axis, require_complete
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
 from needle_controller.laws.law import Law, SampledLoop
 from needle_controller.laws.pid import Pid, PidGains
-from needle_controller.reference.guide import Guide
+from needle_controller.reference.generator import ReferenceGenerator
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
@@ -155,7 +155,7 @@ NO_SETPOINT: Final = Setpoint(nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class ControllerOutput:
     """
     Command of a controller in response to a measurement.
 
@@ -211,7 +211,7 @@ class Controller:
     ----------
     parameters, law, settings
         As given.
-    guide : Guide
+    guide : ReferenceGenerator
         The reference generator: targets, paths, pauses.
     limits : dict of str to Limit
         Stability limit of each axis.
@@ -253,7 +253,9 @@ class Controller:
         self._uncertainty = uncertainty or Uncertainty()
         self.settings = settings = settings or ControllerSettings()
         self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
-        self.guide = Guide(reference, limits or ReferenceLimits(), settings.depths(parameters))
+        self.guide = ReferenceGenerator(
+            reference, limits or ReferenceLimits(), settings.depths(parameters)
+        )
         self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
@@ -335,7 +337,7 @@ class Controller:
 
     def set_target(self, depth: float) -> None:
         """
-        Set the target insertion depth; see `Guide.aim`.
+        Set the target insertion depth; see `ReferenceGenerator.aim`.
 
         Parameters
         ----------
@@ -359,12 +361,12 @@ class Controller:
         speeds: Sequence[float] | None = None,
     ) -> None:
         """
-        Follow a path of insertion depths from now on; see `Guide.follow`.
+        Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`.
 
         Parameters
         ----------
         times, positions, speeds
-            As for `Guide.follow`.
+            As for `ReferenceGenerator.follow`.
 
         Raises
         ------
@@ -436,7 +438,7 @@ class Controller:
             )
         return None
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         """
         Return the command that answers a measurement.
 
@@ -447,7 +449,7 @@ class Controller:
 
         Returns
         -------
-        Command
+        ControllerOutput
             Zero force without a target, or on a fault of the measurement: a value is not finite,
             or the displacement is inconsistent with the velocity. After a gap or a step back in
             time the motion restarts from the measured depth.
@@ -465,7 +467,7 @@ class Controller:
         else:
             notice = self._returned(measured) or notice
         if fault is not None or self.target is None:
-            return Command(
+            return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
             )
         now = self.guide.at(measured.time, measured.depth)
@@ -474,7 +476,7 @@ class Controller:
         if self.settings.rotation:
             still = Setpoint(0.0)
             torque = self._rotation.command(measured.angle, measured.angular_speed, still)
-        return Command(
+        return ControllerOutput(
             force=self._insertion.command(measured.depth, measured.speed, ahead, load),
             torque=torque,
             setpoint=now,

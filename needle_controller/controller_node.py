@@ -9,7 +9,6 @@ from time import sleep
 from typing import Any
 
 from geometry_msgs.msg import PointStamped
-from needle_controller.answer import Answer, Reply
 from needle_controller.controller import (
     Controller,
     ControllerSettings,
@@ -17,10 +16,11 @@ from needle_controller.controller import (
     Gains,
     LAWS,
 )
+from needle_controller.force_command import ForceCommand, ServiceResult
 from needle_controller.hardware import HardwareSettings
 from needle_controller.hardware_node import CONTRACT, Driver
 from needle_controller.observer.settings import ObserverSettings
-from needle_controller.reference.guide import REFERENCES
+from needle_controller.reference.generator import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
@@ -28,7 +28,7 @@ from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.errors import NeedleError, ParameterError
-from needle_ros.journal import Severity
+from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
@@ -296,7 +296,9 @@ class ControllerNode(ModelNode):
 
     # Inputs.
 
-    def _passing(self, take: Callable[[Reading, int], Answer | None]) -> Callable[[Reading], None]:
+    def _passing(
+        self, take: Callable[[Reading, int], ForceCommand | None]
+    ) -> Callable[[Reading], None]:
         """Return a callback that processes a measurement and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
@@ -304,7 +306,7 @@ class ControllerNode(ModelNode):
 
         return on_reading
 
-    def _serve(self, kind: Any, name: str, act: Callable[[Any], Reply]) -> None:
+    def _serve(self, kind: Any, name: str, act: Callable[[Any], ServiceResult]) -> None:
         """Offer a service that executes a request and publishes the command."""
 
         def on_request(request: Any, response: Any) -> Any:
@@ -364,7 +366,7 @@ class ControllerNode(ModelNode):
 
     # Outputs.
 
-    def _act(self, answer: Answer | None) -> None:
+    def _act(self, answer: ForceCommand | None) -> None:
         """Publish a command, lines for the log, and answers to requests."""
         if answer is not None:
             stamp, force, torque, reference, error = answer

@@ -8,8 +8,8 @@ from math import isfinite, isnan, nan
 from typing import Any, Final
 
 from needle_controller.admittance import Admittance
-from needle_controller.answer import Answer
 from needle_controller.controller import Controller, Measurement
+from needle_controller.force_command import ForceCommand
 from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import INSERTION, ROTATION
@@ -420,14 +420,14 @@ class Robot:
     # To the robot.
 
     def command(
-        self, answer: Answer, load: float = 0.0, *, stopped: bool = False
+        self, answer: ForceCommand, load: float = 0.0, *, stopped: bool = False
     ) -> list[float] | None:
         """
         Return the joint commands for a force command.
 
         Parameters
         ----------
-        answer : Answer
+        answer : ForceCommand
             Force command of the controller.
         load : float
             Load against insertion that the force must overcome [N].

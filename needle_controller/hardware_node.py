@@ -8,8 +8,8 @@ from time import monotonic, sleep
 from typing import Any, Final, NamedTuple
 
 from builtin_interfaces.msg import Duration
-from needle_controller.answer import Answer
 from needle_controller.controller import Controller
+from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import (
     BY_TYPE,
     COMMAND_TYPES,
@@ -249,7 +249,7 @@ class Driver:
         whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
         self._period = Duration(sec=whole, nanosec=part)
 
-    def message(self, answer: Answer, load: float, *, stopped: bool) -> Any:
+    def message(self, answer: ForceCommand, load: float, *, stopped: bool) -> Any:
         """Return the message for a command, see `Robot.command`, or None."""
         settings, stamp = self._settings, answer.stamp
         kind, joints = settings.command_type, list(settings.joints)

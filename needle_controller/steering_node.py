@@ -10,13 +10,13 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import TipEstimate
-from needle_controller.steering.motion import Move
-from needle_controller.steering.outer_loop import OuterLoop
+from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
+from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
-from needle_controller.steering.settings import OuterLoopSettings
+from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.compiled_node import CompiledNode
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
@@ -67,15 +67,15 @@ class SteeringNode(CompiledNode):
     implausible, when a node rejects a motion, when a joint does not arrive, and by ``~/stop``.
     ``tip_expected`` is the expected position of the tip at the target depth.
 
-    The node passes messages to an `OuterLoop`, which decides, and publishes its motions.
+    The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
 
     KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.superposition')
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('steering', **node_options)
-        self.declare_settings('', OuterLoopSettings())
-        self.declare_settings('belief.', SteeringBelief())
+        self.declare_settings('', ExecutiveSettings())
+        self.declare_settings('belief.', SteeringPrior())
         # Fixed at start: it determines the other defaults.
         self.declare_parameter(
             'model.preset',
@@ -86,15 +86,15 @@ class SteeringNode(CompiledNode):
         for prefix, names in (('model.', OF_NEEDLE), ('steering.', OF_STEERING)):
             self.declare_settings(prefix, defaults_of(prefix, preset), names)
 
-        self._loop: OuterLoop | None = None
+        self._loop: SteeringExecutive | None = None
         #: Expected tip of the last publication.
         self._told: TipEstimate | None = None
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
         self._tip_expected = self.publisher(contract.TIP_EXPECTED)
         for topic, take in (
-            (contract.JOINT_STATES, OuterLoop.joints),
-            (contract.TIP_DEFLECTION, OuterLoop.tip),
+            (contract.JOINT_STATES, SteeringExecutive.joints),
+            (contract.TIP_DEFLECTION, SteeringExecutive.tip),
         ):
             self.listen(topic, self._passing(take), self._watch)
         self.subscribe(contract.TARGET, self._on_target)
@@ -121,11 +121,11 @@ class SteeringNode(CompiledNode):
 
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
-        belief = self.settings('belief.', SteeringBelief)
+        belief = self.settings('belief.', SteeringPrior)
         # Load or compile the functions before any motion; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
-        settings = self.settings('', OuterLoopSettings)
-        self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)
+        settings = self.settings('', ExecutiveSettings)
+        self._loop = SteeringExecutive(needle, steering, belief, settings, start=ThreadJob)
 
     def cleanup(self) -> None:
         """Discard the steering executive."""
@@ -159,14 +159,14 @@ class SteeringNode(CompiledNode):
     # Inputs.
 
     def _passing(
-        self, take: Callable[[OuterLoop, Reading, int], Move | None]
+        self, take: Callable[[SteeringExecutive, Reading, int], JointMotion | None]
     ) -> Callable[[Reading], None]:
         """Return a callback that processes a measurement and publishes the motion."""
 
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:
                 self._act(take(self._loop, reading, self.now()))
-                if take is OuterLoop.joints:
+                if take is SteeringExecutive.joints:
                     self._unreported = reading.stamp
                     self._report_processed()
 
@@ -236,7 +236,7 @@ class SteeringNode(CompiledNode):
 
     # Outputs.
 
-    def _act(self, move: Move | None) -> None:
+    def _act(self, move: JointMotion | None) -> None:
         """Publish a motion, the expected tip, lines for the log and answers to requests."""
         loop = self._loop
         if loop is None:
@@ -252,7 +252,7 @@ class SteeringNode(CompiledNode):
         if loop.requests.due():
             self.publish_diagnostics()
 
-    def _message(self, move: Move) -> JointTrajectory:
+    def _message(self, move: JointMotion) -> JointTrajectory:
         message = JointTrajectory(joint_names=list(move.joints))
         stamp = message.header.stamp
         stamp.sec, stamp.nanosec = divmod(move.stamp, NANOSECONDS)

@@ -6,23 +6,23 @@ from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
 from typing import Final
 
-from needle_controller.answer import Answer, Reply
-from needle_controller.bending import Bending
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
+from needle_controller.force_command import ForceCommand, ServiceResult
 from needle_controller.hardware import Robot, STAMPS
+from needle_controller.load_estimator import LoadEstimator
 from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
-from needle_controller.safety.following import Following
-from needle_controller.safety.lateness import Lateness
+from needle_controller.safety.input_monitor import REPEATED
+from needle_controller.safety.latency_monitor import LatencyMonitor
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.pace import Pace
+from needle_controller.safety.rate_monitor import RateMonitor
+from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.safety.safety import Safety
-from needle_controller.safety.stream import REPEATED
 from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, ENTRY, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.status import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
@@ -46,11 +46,11 @@ class Supervisor:
     Parameters
     ----------
     steady : callable
-        As for `Journal`.
+        As for `EventLog`.
 
     Attributes
     ----------
-    journal : Journal
+    journal : EventLog
         Lines for the log.
     requests : RequestLog
         Targets and trajectories, and the answers to them.
@@ -58,7 +58,7 @@ class Supervisor:
         Inputs, limits and the stop.
     controller : Controller or None
         Reference and laws, while configured.
-    bending : Bending
+    bending : LoadEstimator
         Load of the bent needle.
     fault : str or None
         Why no force is commanded, apart from a stop.
@@ -69,19 +69,19 @@ class Supervisor:
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
         self._steady = steady
-        self.journal = Journal(steady)
+        self.journal = EventLog(steady)
         self.receive(targets=True)
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
         self.retract_depth = 0.0
         self.fault: str | None = None
-        self._lateness = Lateness()
-        self._pace: Pace | None = None
+        self._lateness = LatencyMonitor()
+        self._pace: RateMonitor | None = None
         self._off_pace = False
         self._robot: Robot | None = None
         self._read = read_encoders
         self._deflection_ignored = False
-        self._last = Answer(0)
-        self._following = Following()
+        self._last = ForceCommand(0)
+        self._following = ResponseMonitor()
         #: Stamp of a request that waits for the next sample [ns], its topic and its execution.
         self._due: tuple[int, Topic, Callable[[Controller], None]] | None = None
         self.controller: Controller | None = None
@@ -126,7 +126,7 @@ class Supervisor:
             noise['base_wrench'] = observed.force_noise, observed.torque_noise
             noise['tip_deflection'] = (observed.tip_noise,)
         self.controller = controller
-        self.bending = Bending(controller.parameters, observer, limits.axial_load)
+        self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
         self._robot = robot
         self._read = robot.measurement if robot is not None else read_encoders
         stop = self.safety.stop
@@ -143,7 +143,7 @@ class Supervisor:
     def cleanup(self) -> None:
         """Discard controller and load estimate."""
         self.controller = None
-        self.bending = Bending(NeedleParameters())
+        self.bending = LoadEstimator(NeedleParameters())
         #: The controller while measurements are answered.
         self._active: Controller | None = None
 
@@ -195,17 +195,17 @@ class Supervisor:
         """
         self.fault = _WAITING
         if self.controller is not None:
-            self._lateness = Lateness(self.controller.delay, self.controller.period)
+            self._lateness = LatencyMonitor(self.controller.delay, self.controller.period)
             settings, robot = self.controller.settings, self._robot
             # Receive times do not resolve single periods.
             stamped = robot is None or robot.settings.stamps == STAMPS[0]
-            pace = Pace(settings.rate, settings.measurement_timeout)
+            pace = RateMonitor(settings.rate, settings.measurement_timeout)
             self._pace = pace if stamped else None
         self._begin(now)
         self.safety.count_publishers(publishers)
         self._active = self.controller
 
-    def deactivate(self, now: int) -> Answer:
+    def deactivate(self, now: int) -> ForceCommand:
         """
         Command zero force, and discard the motion and its target.
 
@@ -219,7 +219,7 @@ class Supervisor:
             self.controller.forget()
         self._active = None
         self._drop_due('the controller is not active')
-        return self._command(Answer(now))
+        return self._command(ForceCommand(now))
 
     def _begin(self, now: int) -> None:
         """Discard all measurements and requests."""
@@ -230,7 +230,7 @@ class Supervisor:
         if self._robot is not None:
             self._robot.begin()
 
-    def _check_clock(self, now: int) -> Answer | None:
+    def _check_clock(self, now: int) -> ForceCommand | None:
         """Command zero force and discard measurements and requests if the clock was set back."""
         back = self.safety.clock_went_back(now)
         if not back:
@@ -256,7 +256,7 @@ class Supervisor:
 
     def target(
         self, stamp: int, frame: str, depth: float, deflection: float, now: int
-    ) -> Answer | None:
+    ) -> ForceCommand | None:
         """
         Take a target insertion depth [m]; its deflection [m] is ignored.
 
@@ -273,7 +273,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -299,7 +299,7 @@ class Supervisor:
         positions: Sequence[Sequence[float]],
         velocities: Sequence[Sequence[float]],
         now: int,
-    ) -> Answer | None:
+    ) -> ForceCommand | None:
         """
         Take a path: times from now [s], positions [m] of the joints, velocities [m/s] or none.
 
@@ -316,7 +316,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -334,7 +334,7 @@ class Supervisor:
 
     def _request(
         self, topic: Topic, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
-    ) -> Answer | None:
+    ) -> ForceCommand | None:
         """Execute a request if it is new and valid, and acknowledge it."""
         answer = self._check_clock(now) if self._active is not None else None
         known = self.requests.check(topic, stamp, now, frame, (INSERTION,))
@@ -374,7 +374,7 @@ class Supervisor:
             (sent, topic, _), self._due = self._due, None
             self.requests.answer(topic, sent, verdict, reason)
 
-    def emergency_stop(self, now: int) -> Reply:
+    def emergency_stop(self, now: int) -> ServiceResult:
         """
         Stop until it is cleared.
 
@@ -386,9 +386,9 @@ class Supervisor:
         """
         self.requests.supersede(now)
         answer = self._stop_for('emergency stop', now)
-        return Reply(True, 'stopped; ~/clear_stop releases', answer)
+        return ServiceResult(True, 'stopped; ~/clear_stop releases', answer)
 
-    def clear_stop(self, now: int) -> Reply:
+    def clear_stop(self, now: int) -> ServiceResult:
         """
         Release the stop, unless a measurement is still beyond a limit.
 
@@ -399,24 +399,24 @@ class Supervisor:
 
         Returns
         -------
-        Reply
+        ServiceResult
             Whether it is released, or why not.
 
         """
         if self.safety.stop is None:
-            return Reply(True, 'there was no stop')
+            return ServiceResult(True, 'there was no stop')
         answer = self._check_clock(now)
         reason = self.safety.clear(now)
         if reason is not None:
             message = f'clear_stop refused: {reason}'
             self.journal.refuse(message)
-            return Reply(False, message, answer)
+            return ServiceResult(False, message, answer)
         self.fault = _WAITING
         self.bending.forget()
         self.journal.say(Severity.INFO, 'the stop is cleared')
-        return Reply(True, 'cleared; the motion restarts', answer)
+        return ServiceResult(True, 'cleared; the motion restarts', answer)
 
-    def pause(self, hold: bool) -> Reply:
+    def pause(self, hold: bool) -> ServiceResult:
         """
         Brake the reference to rest and hold it, or let it continue.
 
@@ -427,18 +427,18 @@ class Supervisor:
 
         Returns
         -------
-        Reply
+        ServiceResult
             Rejected unless the controller is active.
 
         """
         if self._active is None:
-            return Reply(False, 'pause refused: the controller is not active')
+            return ServiceResult(False, 'pause refused: the controller is not active')
         guide = self._active.guide
         (guide.pause if hold else guide.resume)()
         self.journal.say(Severity.INFO)
-        return Reply(True, 'paused' if hold else 'resumed')
+        return ServiceResult(True, 'paused' if hold else 'resumed')
 
-    def retract(self, now: int) -> Reply:
+    def retract(self, now: int) -> ServiceResult:
         """
         Retract to `retract_depth`.
 
@@ -449,22 +449,22 @@ class Supervisor:
 
         Returns
         -------
-        Reply
+        ServiceResult
             Rejected during a stop, and unless the controller is active.
 
         """
         if self._active is None or self.safety.stop is not None:
             why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
-            return Reply(False, f'retract refused: the controller is {why}')
+            return ServiceResult(False, f'retract refused: the controller is {why}')
         self.requests.supersede(now)
         self._drop_due('the needle is retracted', Verdict.SUPERSEDED)
         self._active.guide.resume()
         self._active.set_target(self.retract_depth)
-        return Reply(True, f'retracting to {self.retract_depth:g} m')
+        return ServiceResult(True, f'retracting to {self.retract_depth:g} m')
 
     # Sensors.
 
-    def tip(self, reading: Reading, now: int) -> Answer | None:
+    def tip(self, reading: Reading, now: int) -> ForceCommand | None:
         """
         Take a `tip_deflection` measurement.
 
@@ -477,7 +477,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -491,7 +491,7 @@ class Supervisor:
                 self.bending.take_tip(reading.stamp, deflection)
         return answer
 
-    def wrench(self, reading: Reading, now: int) -> Answer | None:
+    def wrench(self, reading: Reading, now: int) -> ForceCommand | None:
         """
         Take a `base_wrench` measurement.
 
@@ -502,7 +502,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -520,7 +520,7 @@ class Supervisor:
                 self.bending.take_wrench(reading.stamp, lateral, moment, newest)
         return answer
 
-    def truth(self, reading: Reading, now: int) -> Answer | None:
+    def truth(self, reading: Reading, now: int) -> ForceCommand | None:
         """
         Take the load of the bent needle from `ground_truth` of the simulation.
 
@@ -531,7 +531,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -556,7 +556,7 @@ class Supervisor:
     def _warn(self, kind: str, line: str) -> None:
         self.journal.say(Severity.WARNING, line, kind)
 
-    def encoders(self, reading: Reading, now: int) -> Answer | None:
+    def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
         """
         Answer `joint_states`; a repeated message gets the same command, a late one none.
 
@@ -567,7 +567,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, with the stamp of the reading.
 
         """
@@ -591,7 +591,7 @@ class Supervisor:
             if self.safety.guard.is_beyond('joint_states'):
                 # A single reading is a sensor fault: neither law nor observer uses it.
                 if self.safety.stop is not None:
-                    return self._command(Answer(stamp))
+                    return self._command(ForceCommand(stamp))
                 return self._let_go('joint_states is beyond a limit', stamp)
             try:
                 self.bending.update(stamp, measured)
@@ -601,17 +601,19 @@ class Supervisor:
                 self._warn('doubt', self.bending.warning)
         return self._answer(controller, stamp, measured)
 
-    def _again(self, stamp: int) -> Answer:
+    def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
         last = self._last
         if last.stamp == stamp:
-            return Answer(stamp, last.force, last.torque)
-        return self._command(Answer(stamp))
+            return ForceCommand(stamp, last.force, last.torque)
+        return self._command(ForceCommand(stamp))
 
-    def _answer(self, controller: Controller, stamp: int, measured: Measurement) -> Answer | None:
+    def _answer(
+        self, controller: Controller, stamp: int, measured: Measurement
+    ) -> ForceCommand | None:
         safety = self.safety
         if safety.stop is not None:
-            return self._command(Answer(stamp))
+            return self._command(ForceCommand(stamp))
         if safety.rivals is not None:
             return self._let_go(safety.rivals, stamp)
         command = controller.command(measured, self.bending.load)
@@ -654,9 +656,9 @@ class Supervisor:
             )
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
-        return self._command(Answer(stamp, force, torque, aim[:2], error))
+        return self._command(ForceCommand(stamp, force, torque, aim[:2], error))
 
-    def watch(self, now: int, publishers: Mapping[str, int]) -> Answer | None:
+    def watch(self, now: int, publishers: Mapping[str, int]) -> ForceCommand | None:
         """
         Check for missing inputs, and for duplicate publishers of commands and measurements.
 
@@ -669,7 +671,7 @@ class Supervisor:
 
         Returns
         -------
-        Answer or None
+        ForceCommand or None
             The command, if there is a new value.
 
         """
@@ -704,7 +706,7 @@ class Supervisor:
 
     # Zero force.
 
-    def _stop_for(self, reason: str | None, stamp: int) -> Answer | None:
+    def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
         """Latch a stop, if there is a reason and no stop yet."""
         if not self.safety.latch(reason):
             return None
@@ -713,7 +715,7 @@ class Supervisor:
         self.journal.say(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
         return self._release(stamp)
 
-    def _let_go(self, fault: str, stamp: int) -> Answer:
+    def _let_go(self, fault: str, stamp: int) -> ForceCommand:
         """Command zero force on a fault, and log its beginning."""
         self._say_fault(fault, 'no force is commanded')
         return self._release(stamp)
@@ -726,15 +728,15 @@ class Supervisor:
             self.journal.say(Severity.ERROR, f'{fault}; {consequence}', kind)
         self.fault = fault
 
-    def _release(self, stamp: int) -> Answer:
+    def _release(self, stamp: int) -> ForceCommand:
         self._drop_due(self.fault or 'no force is commanded')
         self._following.forget()
         if self.controller is not None:
             self.controller.guide.wait(False)
             self.controller.release()
-        return self._command(Answer(stamp))
+        return self._command(ForceCommand(stamp))
 
-    def _command(self, answer: Answer) -> Answer:
+    def _command(self, answer: ForceCommand) -> ForceCommand:
         self._last = answer
         return answer
 

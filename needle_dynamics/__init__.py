@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from needle_dynamics.buckling import euler_loads, EulerLoads
     from needle_dynamics.compiled.friction import FRICTION_LAWS
     from needle_dynamics.compiled.integrals import ModeIntegrals
-    from needle_dynamics.errors import InsertedLengthError, ToleranceError
+    from needle_dynamics.errors import InsertionDepthError, ToleranceError
     from needle_dynamics.friction import Friction
     from needle_dynamics.linearization import linearize, LinearSystem, operating_point
     from needle_dynamics.model import NeedleModel
@@ -60,8 +60,8 @@ __all__ = [
     'Friction',
     'Indenter',
     'IndenterParameters',
-    'InsertedLengthError',
     'Insertion',
+    'InsertionDepthError',
     'Integrator',
     'Interval',
     'JobError',

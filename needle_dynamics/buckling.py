@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, pi
 from typing import Final, NamedTuple
 
-from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.parameters import NeedleParameters
 
 #: First root of tan(x) = x: column clamped at one end and pinned at the other.
@@ -49,7 +49,7 @@ def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
 
     Raises
     ------
-    InsertedLengthError
+    InsertionDepthError
         If the insertion depth is negative or not finite.
 
     Examples
@@ -61,7 +61,7 @@ def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
 
     """
     if not 0.0 <= depth < inf:
-        raise InsertedLengthError(f'insertion depth must be finite and >= 0, got {depth!r} m')
+        raise InsertionDepthError(f'insertion depth must be finite and >= 0, got {depth!r} m')
     outside = parameters.length - depth
     if outside <= 0.0:
         return EulerLoads(inf, inf)

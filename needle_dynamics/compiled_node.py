@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from needle_dynamics.compiled.cache import prepare, reports, where_kept
 from needle_ros.base_node import BaseNode
-from needle_ros.preparation import imports, Progress
+from needle_ros.preparation import imports, PreparationProgress
 
 
 class CompiledNode(BaseNode):
@@ -37,11 +37,11 @@ class CompiledNode(BaseNode):
         self._listening = reports(self._on_function)
         self._listening.__enter__()
 
-    def preparation(self) -> Iterable[Progress]:
+    def preparation(self) -> Iterable[PreparationProgress]:
         """Import modules, then load or compile kernels."""
         yield from imports(self.IMPORTS)
         for step in prepare(self.KERNELS):
-            yield Progress(*step)
+            yield PreparationProgress(*step)
         if self._compiled:
             self.get_logger().info(f'{self._compiled} functions compiled: {where_kept()}')
 

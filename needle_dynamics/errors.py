@@ -7,5 +7,5 @@ class ToleranceError(NeedleError):
     """The requested accuracy cannot be reached."""
 
 
-class InsertedLengthError(NeedleError):
+class InsertionDepthError(NeedleError):
     """The insertion depth left the range in which the equations are regular."""

@@ -19,8 +19,8 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.integrals import ModeIntegrals, tip_deflections
 from needle_dynamics.compiled.normal_modes import coupling
-from needle_dynamics.compiled.step import Needle
-from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.compiled.step import CompiledNeedle
+from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.friction import Friction
 from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters
@@ -91,10 +91,10 @@ class NeedleModel:
         return self.parameters.friction
 
     @cached_property
-    def compiled(self) -> Needle:
+    def compiled(self) -> CompiledNeedle:
         """Needle constants in the layout of the compiled functions."""
         p = self.parameters
-        return Needle(
+        return CompiledNeedle(
             length=p.length,
             linear_density=p.linear_density,
             bending_stiffness=p.bending_stiffness,
@@ -141,7 +141,7 @@ class NeedleModel:
         ------
         ShapeError
             If the shape is wrong or a number is not finite.
-        InsertedLengthError
+        InsertionDepthError
             If the insertion depth is outside its range.
 
         """
@@ -160,7 +160,7 @@ class NeedleModel:
         high = self.modes.reach * p.length
         # The insertion depth is a difference, so its limits hold up to rounding.
         if not p.minimum_depth - ROUNDING * p.length <= depth <= high:
-            raise InsertedLengthError(
+            raise InsertionDepthError(
                 f'insertion depth {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
                 '(minimum_depth to the hub)'
             )
@@ -207,7 +207,7 @@ class NeedleModel:
 
         Raises
         ------
-        InsertedLengthError
+        InsertionDepthError
             If ``depth`` is outside its range.
         ShapeError
             If a number is not finite, or the number of modal coordinates is not n.

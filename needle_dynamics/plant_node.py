@@ -17,9 +17,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamped, Vector3
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
-from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
+from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
-from needle_dynamics.simulated.measured import Outline
+from needle_dynamics.simulated.measured import MeasuredShape
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
 from needle_ros.base_node import profile
@@ -82,7 +82,7 @@ def _line(name: str, width: float, shade: float) -> Marker:
     return line
 
 
-def _transform(seen: Outline, stamp: int) -> TransformStamped:
+def _transform(seen: MeasuredShape, stamp: int) -> TransformStamped:
     """Return the transform from the base to the tip."""
     (x, y, z), (i, j, k, w) = seen.tip
     made = TransformStamped(child_frame_id=contract.TIP)
@@ -175,7 +175,7 @@ class PlantNode(ModelNode):
         #: Number of samples taken before the latest configuration.
         self._number = 0
         self._halted: str | None = None
-        self._fault: Fault | None = None
+        self._fault: SensorFault | None = None
         self._faulty = ''
         #: Graph checks during which the same sample has waited for its answers, and its stamp.
         self._looks = 0
@@ -347,7 +347,7 @@ class PlantNode(ModelNode):
         self._fault, self._faulty = None, topic
         if kind != _NO_FAULT:
             rate, seed = self.get_parameter('rate').value, self.get_parameter('seed').value
-            self._fault = Fault(kind, parameters, float(rate), seed)
+            self._fault = SensorFault(kind, parameters, float(rate), seed)
 
     def activate(self) -> None:
         """Start sampling."""

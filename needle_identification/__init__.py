@@ -21,14 +21,14 @@ if TYPE_CHECKING:
         Recorded,
     )
     from needle_identification.bags.messages import deserialize, encode, message_type
-    from needle_identification.bags.topics import OfferedQos, Topic
+    from needle_identification.bags.topics import BagTopic, OfferedQos
     from needle_identification.bags.writer import BagWriter, COMPRESSIONS
     from needle_identification.errors import IdentificationError, RecordingError
     from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
     from needle_identification.estimation.estimators import ESTIMATORS
     from needle_identification.estimation.regression import regress, Regression
     from needle_identification.estimation.residual_tests import ResidualTest
-    from needle_identification.friction.comparison import Comparison
+    from needle_identification.friction.comparison import CandidateFit
     from needle_identification.friction.estimate import Fit, FrictionEstimate
     from needle_identification.friction.identify import identify_friction
     from needle_identification.friction.punctures import Puncture
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from needle_identification.friction.settings import FrictionSettings, TERMS
     from needle_identification.friction.summary import FrictionSummary, summarize
     from needle_identification.recordings.inspection import (
-        Column,
+        ColumnSummary,
         Content,
         inspect_recording,
         Inspection,
@@ -69,9 +69,10 @@ __all__ = [
     'ESTIMATORS',
     'TERMS',
     'Bag',
+    'BagTopic',
     'BagWriter',
-    'Column',
-    'Comparison',
+    'CandidateFit',
+    'ColumnSummary',
     'Content',
     'Fit',
     'FrictionEstimate',
@@ -100,7 +101,6 @@ __all__ = [
     'StiffnessEstimate',
     'StiffnessSettings',
     'StiffnessSummary',
-    'Topic',
     'asymmetry',
     'deserialize',
     'encode',

@@ -11,7 +11,7 @@ from needle_ros.status import no_answer
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
-class Answer(Protocol):
+class ParameterFuture(Protocol):
     """Future of the response of a node to a SetParameters request."""
 
     def done(self) -> bool:
@@ -25,7 +25,7 @@ class Application:
     """Parameters sent to other nodes, and their responses (None: no such node), by name."""
 
     def __init__(
-        self, values: Mapping[str, float | str], answers: Mapping[str, Answer | None]
+        self, values: Mapping[str, float | str], answers: Mapping[str, ParameterFuture | None]
     ) -> None:
         self._values, self._answers = values, answers
         self._needed = [name for name in _COEFFICIENTS if name in values] or list(values)
@@ -45,7 +45,7 @@ class Application:
         verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
         return bool(verdicts) and all(verdicts), '; '.join(words for _, words in outcomes)
 
-    def _of_node(self, node: str, answer: Answer | None) -> tuple[bool | None, str]:
+    def _of_node(self, node: str, answer: ParameterFuture | None) -> tuple[bool | None, str]:
         if answer is None:
             return None, f'{node}: no such node'
         response = answer.result()

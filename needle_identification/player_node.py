@@ -12,8 +12,8 @@ from typing import Any, Final
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.bag import Bag, Recorded
-from needle_identification.bags.playback import Playback, PlaybackSettings
-from needle_identification.bags.topics import OfferedQos, Topic, UNLIMITED
+from needle_identification.bags.playback import BagPlayback, PlaybackSettings
+from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class
@@ -116,15 +116,15 @@ class PlayerNode(BaseNode):
             for name, qos in profiles.items()
             if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         }
-        self._playback = Playback(bag, profiles.keys(), latched, settings)
+        self._playback = BagPlayback(bag, profiles.keys(), latched, settings)
         for name, qos in profiles.items():
             self._outputs[name] = self.create_publisher(kinds[name], name, qos)
         if publishes:
             self._clock_publisher = self.create_publisher(ClockMessage, '/clock', _CLOCK)
 
     def _chosen(
-        self, path: Path, topics: Sequence[Topic], publishes: bool
-    ) -> dict[str, list[Topic]]:
+        self, path: Path, topics: Sequence[BagTopic], publishes: bool
+    ) -> dict[str, list[BagTopic]]:
         """Return the topics to play by name; reject names that are not in the recording."""
         words = self.get_parameter('topics').value
         named = {self.resolve_topic_name(word) for word in words if word != '*'}
@@ -138,13 +138,13 @@ class PlayerNode(BaseNode):
         named.discard(self.resolve_topic_name('~/configuration'))
         if publishes:
             named.discard('/clock')
-        chosen: dict[str, list[Topic]] = {}
+        chosen: dict[str, list[BagTopic]] = {}
         for topic in topics:
             if topic.name in named:
                 chosen.setdefault(topic.name, []).append(topic)
         return chosen
 
-    def _imported(self, name: str, topics: list[Topic]) -> Any:
+    def _imported(self, name: str, topics: list[BagTopic]) -> Any:
         """Return the message class of a topic; None, with a warning, if not installed."""
         try:
             return message_class(*(topic.type_name for topic in topics))
@@ -325,7 +325,7 @@ class PlayerNode(BaseNode):
         return DiagnosticStatus.OK, f'{state} {playback.bag.path}', values
 
 
-def _profile(topics: list[Topic]) -> QoSProfile:
+def _profile(topics: list[BagTopic]) -> QoSProfile:
     """Return the strongest QoS offered by any publisher, which is compatible with each reader."""
     offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)

@@ -17,7 +17,7 @@ from needle_ros.contract import BASE_WRENCH, JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.run_node import run
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reader
+from needle_ros.wire import MessageReader
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -79,7 +79,7 @@ class RecorderNode(BaseNode):
         self._reports = self.publisher(RECORDED, always=True)
         #: Readers of the topics that contain each sample.
         self._sampled = {
-            self.resolve_topic_name(topic.name): Reader(topic.type_name).read
+            self.resolve_topic_name(topic.name): MessageReader(topic.type_name).read
             for topic in (JOINT_STATES, BASE_WRENCH)
         }
         #: Publication sequence number of the newest message of each topic.

@@ -15,7 +15,7 @@ import sys
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, NeedleError
 
@@ -72,7 +72,7 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
 
 def _run(words: list[str]) -> int:
     chosen = next((word for word in words if not word.startswith('-')), '')
-    command: Command | None = None
+    command: Subcommand | None = None
     COMMAND.set(shlex.join(['needle', *words]))
     if chosen in COMMANDS:
         command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
@@ -111,7 +111,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
+def _parser(chosen: str, command: Subcommand | None) -> argparse.ArgumentParser:
     """Return a parser with the options of the chosen command only: other commands cost imports."""
     parser = _Parser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')

@@ -9,7 +9,7 @@ import os
 from typing import Final
 
 from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
-from needle_insertion.experiment.progress import Progress
+from needle_insertion.experiment.progress import ProgressLine
 from needle_ros.process_pool import processes
 
 #: Modules with kernels, the slowest to compile first.
@@ -44,7 +44,10 @@ def compile_kernels(names: Sequence[str] = MODULES) -> int:
     missing = [name for name in kernels(names) if not is_kept(name)]
     if not missing:
         return 0
-    with Progress('compiling for this machine') as show, processes(os.cpu_count() or 1) as pool:
+    with (
+        ProgressLine('compiling for this machine') as show,
+        processes(os.cpu_count() or 1) as pool,
+    ):
         show(where_kept())
         futures = [pool.submit(_compile, name) for name in missing]
         for done, future in enumerate(as_completed(futures), 1):

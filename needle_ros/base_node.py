@@ -21,11 +21,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import MessageError, NeedleError, ParameterError, printable
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import LifeCycle
-from needle_ros.preparation import imports, Preparation, Progress
+from needle_ros.preparation import imports, Preparation, PreparationProgress
 from needle_ros.settings import from_values, unknown_name
-from needle_ros.wire import Reader, Reading
+from needle_ros.wire import MessageReader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -154,7 +154,7 @@ class BaseNode(LifecycleNode):
 
     # Hooks of subclasses.
 
-    def preparation(self) -> Iterable[Progress]:
+    def preparation(self) -> Iterable[PreparationProgress]:
         """
         Return the slow steps before `configure`: imports, loading or compiling functions.
 
@@ -214,7 +214,7 @@ class BaseNode(LifecycleNode):
         `matched` receives the number of new publishers, before their first message, and zero after
         a publisher has left.
         """
-        name, read = topic.name, Reader(topic.type_name).read
+        name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
             try:
@@ -503,8 +503,8 @@ class BaseNode(LifecycleNode):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def tell(self, journal: Journal) -> None:
-        """Log the new lines of an event log (`Journal`), and publish diagnostics on change."""
+    def tell(self, journal: EventLog) -> None:
+        """Log the new lines of an event log (`EventLog`), and publish diagnostics on change."""
         if not journal.changed:
             return
         log = self.get_logger()

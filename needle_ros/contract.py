@@ -67,7 +67,7 @@ class Stamp(Enum):
     """
     Meaning of the stamp of a message, which decides whether its age matters.
 
-    Every node checks stamps by this rule: `needle_controller.safety.stream.Stream` checks samples,
+    `needle_controller.safety.input_monitor.InputMonitor` checks samples by this rule,
     `needle_ros.status.RequestLog` checks requests.
     """
 

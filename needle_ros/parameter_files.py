@@ -13,7 +13,7 @@ import yaml
 _MARK = 'ros__parameters'
 
 
-class Section(NamedTuple):
+class ParameterSection(NamedTuple):
     """
     Section of a parameter file.
 
@@ -42,17 +42,17 @@ class Section(NamedTuple):
         return re.fullmatch(pattern, node) is not None
 
 
-def sections(arguments: Sequence[str]) -> list[Section]:
+def sections(arguments: Sequence[str]) -> list[ParameterSection]:
     """Read the parameter files of a command line that rcl has already parsed."""
     files = [file for flag, file in pairwise(arguments) if flag == '--params-file']
     return [
-        Section(file, f'/{name}', frozenset(_flat(values)))
+        ParameterSection(file, f'/{name}', frozenset(_flat(values)))
         for file in files
         for name, values in _nodes(yaml.safe_load(Path(file).read_text(encoding='utf-8')))
     ]
 
 
-def strangers(found: Sequence[Section], node: str) -> list[str]:
+def strangers(found: Sequence[ParameterSection], node: str) -> list[str]:
     """Return a warning for each file without a section for a node."""
     lines = []
     for file in dict.fromkeys(section.file for section in found):
@@ -63,7 +63,7 @@ def strangers(found: Sequence[Section], node: str) -> list[str]:
     return lines
 
 
-def shared_names(found: Sequence[Section], node: str) -> frozenset[str]:
+def shared_names(found: Sequence[ParameterSection], node: str) -> frozenset[str]:
     """Return the parameters that wildcard sections (``/**``) set for a node."""
     shared = (one for one in found if '*' in one.nodes.rpartition('/')[2] and one.is_for(node))
     return frozenset(name for section in shared for name in section.names)

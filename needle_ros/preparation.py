@@ -8,7 +8,7 @@ from threading import Thread
 from typing import NamedTuple
 
 
-class Progress(NamedTuple):
+class PreparationProgress(NamedTuple):
     """Progress of a preparation: completed steps, total steps, and name of the next step."""
 
     done: int
@@ -19,13 +19,13 @@ class Progress(NamedTuple):
         return f'preparing {self.done + 1} of {self.total} ({self.step})'
 
 
-def imports(modules: Iterable[str]) -> Iterator[Progress]:
+def imports(modules: Iterable[str]) -> Iterator[PreparationProgress]:
     """Import modules, one per iteration, and yield the progress."""
     names = list(modules)
     for done, name in enumerate(names):
-        yield Progress(done, len(names), name)
+        yield PreparationProgress(done, len(names), name)
         import_module(name)
-    yield Progress(len(names), len(names), '')
+    yield PreparationProgress(len(names), len(names), '')
 
 
 class Preparation:
@@ -34,12 +34,12 @@ class Preparation:
 
     Parameters
     ----------
-    steps : iterable of Progress
+    steps : iterable of PreparationProgress
         Each iteration executes the next step.
 
     Attributes
     ----------
-    progress : Progress
+    progress : PreparationProgress
         The latest state.
     error : Exception or None
         Error of a step.
@@ -48,9 +48,9 @@ class Preparation:
 
     """
 
-    def __init__(self, steps: Iterable[Progress]) -> None:
+    def __init__(self, steps: Iterable[PreparationProgress]) -> None:
         self._steps = iter(steps)
-        self.progress = Progress(0, 1, '')
+        self.progress = PreparationProgress(0, 1, '')
         self.error: Exception | None = None
         self._thread: Thread | None = None
         self.is_complete = False

@@ -251,7 +251,7 @@ class Template:
         )
 
 
-class Reader:
+class MessageReader:
     """Parser of the messages of a topic, with the template of the previous message."""
 
     def __init__(self, type_name: str) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.steering import CASES, CONTROLLERS, insert, Outcome, turn, TURNING
+from benchmarks.steering import CASES, CONTROLLERS, insert, SteeringOutcome, turn, TURNING
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
@@ -31,7 +31,7 @@ def draw() -> Figure:
     return figure
 
 
-def show(axes: Axes, found: Sequence[Outcome], names: Sequence[str]) -> None:
+def show(axes: Axes, found: Sequence[SteeringOutcome], names: Sequence[str]) -> None:
     """Draw the part of the needles within each distance."""
     counted = [one for one in found if one.reachable and not one.refused]
     for name in names:

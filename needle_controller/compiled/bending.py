@@ -15,7 +15,7 @@ from needle_dynamics.compiled.cache import inlined
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals
 from needle_dynamics.compiled.normal_modes import modal_stiffness, normal_modes, NormalModes
 from needle_dynamics.compiled.oscillator import swing
-from needle_dynamics.compiled.step import Needle
+from needle_dynamics.compiled.step import CompiledNeedle
 from needle_dynamics.compiled.tissue import layer_at
 import numpy as np
 
@@ -50,7 +50,7 @@ class Frozen(NamedTuple):
 
 
 @inlined
-def freeze(needle: Needle, depth: float, growth: float, modes: NormalModes) -> Frozen:
+def freeze(needle: CompiledNeedle, depth: float, growth: float, modes: NormalModes) -> Frozen:
     """Return modes and tissue at an insertion depth [m]; ``modes`` is overwritten."""
     n = modes.squares.shape[0]
     grids, rows = np.empty((3, n, n)), np.empty((4, n))
@@ -134,7 +134,7 @@ def change_basis(
 
 
 @inlined
-def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -> None:
+def base_impulse(needle: CompiledNeedle, f: Frozen, velocity: float, rows: FloatArray) -> None:
     """
     Compute the impulse of force and moment at the base per change of c and b, shape (2, 2 n).
 
@@ -173,7 +173,7 @@ def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -
 
 
 @inlined
-def tip_response(needle: Needle, f: Frozen, rest: FloatArray, direct: FloatArray) -> None:
+def tip_response(needle: CompiledNeedle, f: Frozen, rest: FloatArray, direct: FloatArray) -> None:
     """
     Compute the response to a constant lateral force of 1 N at the tip.
 

@@ -23,13 +23,13 @@ from needle_dynamics.arrays import Array3, FloatArray, Matrix, Shaped, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.matrices import copy
 from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, NormalModes
-from needle_dynamics.compiled.step import Needle
+from needle_dynamics.compiled.step import CompiledNeedle
 from needle_dynamics.compiled.tissue import growth_at
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from needle_dynamics.compiled.held import Held
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Scalars of each sample: its time and length [s], mean insertion depth [m], stiffness factor of
 #: swelling, readings of the wrench [N, N m], and sum and number of the squared normalized
@@ -109,7 +109,7 @@ class Filter(NamedTuple):
 
     Attributes
     ----------
-    needle : Needle
+    needle : CompiledNeedle
         Nominal model of needle and tissue.
     noise : Noise
         Noise model.
@@ -132,7 +132,7 @@ class Filter(NamedTuple):
 
     """
 
-    needle: Needle
+    needle: CompiledNeedle
     noise: Noise
     low_pass: LowPass
     samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]
@@ -154,12 +154,12 @@ def _modes(f: Filter, slot: int) -> NormalModes:
 
 
 @inlined
-def _growth(needle: Needle, time: float) -> float:
+def _growth(needle: CompiledNeedle, time: float) -> float:
     return growth_at(needle.swelling, needle.swelling_time, max(time, 0.0))
 
 
 @kernel
-def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
+def begin(held: Boxed[Filter], time: float, span: float, depth: float) -> None:
     """
     Write the prior state at a time [s] and insertion depth [m] into the first slot.
 
@@ -372,7 +372,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
 
 @kernel
 def observe(
-    held: Held[Filter],
+    held: Boxed[Filter],
     count: int,
     old: int,
     new: int,
@@ -412,7 +412,7 @@ def observe(
 
 
 @kernel
-def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: float) -> None:
+def replay(held: Boxed[Filter], count: int, oldest: int, newest: int, since: float) -> None:
     """Recompute the slots later than ``since`` [s], the time of changed measurements."""
     f = held.value
     slots, slot = f.samples.shape[0], newest
@@ -426,7 +426,7 @@ def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: floa
 
 @kernel
 def estimate(  # noqa: C901
-    held: Held[Filter],
+    held: Boxed[Filter],
     slot: int,
     depth: float,
     span: float,

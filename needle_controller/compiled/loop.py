@@ -13,13 +13,13 @@ from needle_controller.compiled.laws import (
 from needle_dynamics.arrays import Matrix, Vector
 from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
-from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
+from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 import numpy as np
 
 
 @kernel
 def run_loop(  # noqa: C901
-    c: Needle,
+    c: CompiledNeedle,
     state: Vector,
     law: LawTuple,
     limit: float,
@@ -42,7 +42,7 @@ def run_loop(  # noqa: C901
 
     Parameters
     ----------
-    c : Needle
+    c : CompiledNeedle
         Needle.
     state : ndarray, shape (2 (2 + n),)
         Initial state; overwritten with the final state.

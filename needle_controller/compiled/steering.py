@@ -30,7 +30,7 @@ from needle_dynamics.compiled.matrices import backward, cholesky, forward
 import numpy as np
 
 if TYPE_CHECKING:
-    from needle_dynamics.compiled.held import Held
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Fraction of the later guide motion that the plan uses.
 _COUNTED: Final = 0.8
@@ -90,7 +90,7 @@ FROZEN: Final = 2
 FOREIGN: Final = 3
 
 
-class Responses(NamedTuple):
+class HypothesisResponses(NamedTuple):
     """
     Responses of the tip by hypothesis: the arrays of `SteeringModel` with these names, and sums.
 
@@ -123,7 +123,7 @@ class Steering(NamedTuple):
 
     Attributes
     ----------
-    responses : Responses
+    responses : HypothesisResponses
         Responses of the tip.
     limit : float
         Largest position of the guide along each axis [m].
@@ -153,7 +153,7 @@ class Steering(NamedTuple):
 
     """
 
-    responses: Responses
+    responses: HypothesisResponses
     limit: float
     load_limit: float
     ways: Vector
@@ -301,7 +301,7 @@ def _whole(w: FloatArray, tip: Tip) -> Whole:
 
 
 @kernel
-def expect(held: Held[Steering], at: int) -> Whole:
+def expect(held: Boxed[Steering], at: int) -> Whole:
     """Predict the tip at depth number ``at`` with guide and roll as last commanded."""
     c = held.value
     return _whole(weights(c.logs), _tip(c, at, _held(c)))
@@ -309,7 +309,7 @@ def expect(held: Held[Steering], at: int) -> Whole:
 
 @kernel
 def see(
-    held: Held[Steering], at: int, x: float, z: float, variance: float
+    held: Boxed[Steering], at: int, x: float, z: float, variance: float
 ) -> tuple[int, float, float]:
     """
     Update hypotheses and weights with a tip measurement (x, z) [m] at depth number ``at``.
@@ -418,7 +418,7 @@ def _reach(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
 
 
 @kernel
-def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+def reach(held: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """
     Return the reachable set of the tip by hypothesis, shape (h,) each.
 
@@ -429,7 +429,7 @@ def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]
 
 
 @kernel
-def chance(held: Held[Steering]) -> float:
+def chance(held: Boxed[Steering]) -> float:
     """Return the probability that the tip can reach the target within 1 mm."""
     c = held.value
     (middles, sizes, errors), w = _reach(c), weights(c.logs)
@@ -449,7 +449,7 @@ def chance(held: Held[Steering]) -> float:
 
 
 @kernel
-def choose(held: Held[Steering]) -> complex:
+def choose(held: Boxed[Steering]) -> complex:
     """
     Return the next position of the guide, x + i z [m], and turn the needle if worthwhile.
 

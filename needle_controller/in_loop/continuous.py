@@ -13,7 +13,7 @@ from typing import Final
 
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.continuous import acceleration, ContinuousLaw
-from needle_dynamics import FloatArray, InsertedLengthError, NeedleModel
+from needle_dynamics import FloatArray, InsertionDepthError, NeedleModel
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,7 +69,7 @@ def run_continuous(
     ------
     ShapeError, ParameterError
         If an argument is invalid.
-    InsertedLengthError
+    InsertionDepthError
         If the needle leaves its range.
     NeedleError
         If the solver fails, or law and friction chatter.
@@ -249,7 +249,7 @@ class _Pieces:
         )
         if what == 'leaves its range':
             depth = self.plant.parameters.length - end[0]
-            raise InsertedLengthError(
+            raise InsertionDepthError(
                 f'inserted length {depth:.6g} m left its range at {time:g} s'
             )
         if what == 'touches the hub':

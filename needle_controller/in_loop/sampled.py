@@ -12,7 +12,7 @@ import os
 from typing import Protocol
 
 from needle_controller.compiled.loop import run_loop
-from needle_controller.controller import Command, Measurement
+from needle_controller.controller import ControllerOutput, Measurement
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.setpoint import Reference
@@ -38,7 +38,7 @@ class Commander(Protocol):
     def delay(self) -> int:
         """Periods from a measurement to the effect of its command."""
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         """
         Return the command for a measurement.
 
@@ -51,7 +51,7 @@ class Commander(Protocol):
 
         Returns
         -------
-        Command
+        ControllerOutput
             Force and torque.
 
         """

@@ -32,7 +32,7 @@ from needle_controller.compiled.filter import (
 from needle_controller.laws.axis import require_complete
 from needle_controller.observer.consistency import Consistency
 from needle_controller.observer.settings import ObserverSettings
-from needle_dynamics import FloatArray, InsertedLengthError, NeedleModel, NeedleParameters
+from needle_dynamics import FloatArray, InsertionDepthError, NeedleModel, NeedleParameters
 from needle_dynamics.model import ROUNDING
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
@@ -123,9 +123,9 @@ class Observer:
             changes=np.zeros((slots, 2 * n, 2 * n)),
             exposures=np.zeros((2 * slots, 3)),
         )
-        from needle_dynamics.compiled.held import Held
+        from needle_dynamics.compiled.boxed import Boxed
 
-        self._held = Held(self._filter)
+        self._held = Boxed(self._filter)
         self._slots = slots
         self._modal, self._jacobian = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
         #: Tip deflection, its standard deviation, and load at the present depth, once computed.
@@ -184,7 +184,7 @@ class Observer:
         ParameterError
             If time, depth or speed is not finite, or the speed is implausible; the estimate does
             not change.
-        InsertedLengthError
+        InsertionDepthError
             If the depth is outside its range; the estimate does not change.
 
         """
@@ -198,7 +198,7 @@ class Observer:
         slack = ROUNDING * needle.length
         if not needle.minimum_depth <= depth <= needle.maximum_depth + slack:
             low = self.model.parameters.minimum_depth
-            raise InsertedLengthError(
+            raise InsertionDepthError(
                 f'inserted length {depth:.6g} m is outside [{low:g}, {needle.maximum_depth:g}] m '
                 '(minimum_depth to the hub); the estimate is held'
             )

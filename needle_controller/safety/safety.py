@@ -7,8 +7,8 @@ from typing import Final
 
 from needle_controller.controller import ControllerSettings
 from needle_controller.safety.guard import Guard
+from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.stream import Stream
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import BASE
 from needle_ros.timing import NANOSECONDS, RateCounter
@@ -52,7 +52,7 @@ class Safety:
         Number of stops so far.
     rivals : str or None
         Topics with duplicate publishers of commands or measurements, or None.
-    streams : dict of str to Stream
+    streams : dict of str to InputMonitor
         Inputs by topic.
     saturation : RateCounter
         Commands, with a mark for commands at their limit.
@@ -82,14 +82,14 @@ class Safety:
         self.streams = {
             stream.name: stream
             for stream in (
-                Stream('joint_states', settings.measurement_timeout, ahead=ahead),
-                Stream('ground_truth', settings.measurement_timeout, ahead=ahead),
-                Stream(
+                InputMonitor('joint_states', settings.measurement_timeout, ahead=ahead),
+                InputMonitor('ground_truth', settings.measurement_timeout, ahead=ahead),
+                InputMonitor(
                     'base_wrench', timeout, frames=(wrench_frame,),
                     jumps=(limits.lateral_jump, limits.moment_jump),
                     noise=noise.get('base_wrench', ()), ahead=ahead,
                 ),
-                Stream(
+                InputMonitor(
                     'tip_deflection', timeout, frames=('needle_entry',),
                     jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
                     ahead=ahead,

@@ -25,7 +25,7 @@ from __future__ import annotations
 from math import atan2, pi, remainder, sin, tau
 from typing import Final
 
-from needle_controller.steering.controller import Guidance
+from needle_controller.steering.controller import GuideSetpoint
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -67,13 +67,13 @@ class OpenLoop:
         self.guide = np.zeros(2)
         self.roll = 0.0
 
-    def next(self, tip: FloatArray | None) -> Guidance:
+    def next(self, tip: FloatArray | None) -> GuideSetpoint:
         """Process a tip measurement, x and z [m], or None; return guide and roll of the step."""
         if tip is not None and self.step < len(self.depths) - 1:
             self.guide = np.clip(self._choose(tip), -self.limit, self.limit)
         self.step += 1
         x, z = self.guide.tolist()
-        return Guidance(x, z, self.roll)
+        return GuideSetpoint(x, z, self.roll)
 
     def _choose(self, _tip: FloatArray) -> FloatArray:
         return self.guide

@@ -113,7 +113,7 @@ class TipEstimate:
     covariance: FloatArray
 
 
-class Guidance(NamedTuple):
+class GuideSetpoint(NamedTuple):
     """
     Guide setpoint for the next step: guide and roll move while the tip rests.
 
@@ -218,7 +218,7 @@ class SteeringController:
             raise ParameterError(f'roll must be finite, got {roll!r} rad')
         if position_limit == 0.0 and turns == 0:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
-        from needle_dynamics.compiled.held import Held
+        from needle_dynamics.compiled.boxed import Boxed
 
         count, size = len(model.lengths), len(model.prior)
         mean = np.zeros((count, size), dtype=np.complex128)
@@ -241,7 +241,7 @@ class SteeringController:
             last=np.full(2, nan),
             counts=np.array([0, turns, 0, 0, 0]),
         )
-        self._held = Held(self._now)
+        self._held = Boxed(self._now)
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
@@ -347,7 +347,7 @@ class SteeringController:
 
     # Steps.
 
-    def next(self, tip: Sequence[float] | FloatArray | None) -> Guidance:
+    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
         """
         Process a tip measurement, and return guide and roll for the next step.
 
@@ -358,7 +358,7 @@ class SteeringController:
 
         Returns
         -------
-        Guidance
+        GuideSetpoint
             Guide and roll; unchanged after the last measurement.
 
         Raises
@@ -419,13 +419,13 @@ class SteeringController:
             f'expected position, outside the model uncertainty (belief.*)'
         )
 
-    def plan(self) -> Guidance:
+    def plan(self) -> GuideSetpoint:
         """
         Return guide and roll for the next step, and advance to it.
 
         Returns
         -------
-        Guidance
+        GuideSetpoint
             As from `next`.
 
         """
@@ -434,7 +434,7 @@ class SteeringController:
             now.guide[k] = self._choose()
         now.counts[STEP] = k + 1
         there = complex(now.guide[min(k, last)])
-        return Guidance(there.real, there.imag, float(now.roll[0]))
+        return GuideSetpoint(there.real, there.imag, float(now.roll[0]))
 
     def _choose(self) -> complex:
         """Return the next position of the guide, x + i z [m]."""

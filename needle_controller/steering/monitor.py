@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from needle_controller.steering.motion import Move
+from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_ros.contract import JOINT_TRAJECTORY
 from needle_ros.status import Acknowledgement, REPEAT_AFTER, REPEATS, RequestStatus, Verdict
@@ -55,7 +55,7 @@ class MotionMonitor:
         self._overdue = 0
 
     def begin(
-        self, move: Move, at: FloatArray, *, again: bool = False, arrives: bool = False
+        self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False
     ) -> None:
         """
         Start to monitor a motion from positions ``at`` [m, rad], shape (joints,).
@@ -85,7 +85,7 @@ class MotionMonitor:
     def _room(self) -> FloatArray:
         return np.minimum(self._tolerances, _MOVED)
 
-    def stream(self, move: Move) -> None:
+    def stream(self, move: JointMotion) -> None:
         """Add a motion that is soon replaced by the next: only its answers are monitored."""
         self._streamed.append(move.stamp)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import ceil, sqrt
 from typing import Final, NamedTuple
 
-from needle_controller.steering.settings import OuterLoopSettings
+from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
 import numpy as np
 
@@ -23,7 +23,7 @@ _POINTS: Final = 20
 _INTERVAL: Final = 0.05
 
 
-class Move(NamedTuple):
+class JointMotion(NamedTuple):
     """
     Joint motion of needle and guide, for a robot or a controller.
 
@@ -47,7 +47,9 @@ class Move(NamedTuple):
     stamp: int = 0
 
 
-def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float) -> Move:
+def smooth(
+    joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float
+) -> JointMotion:
     """
     Return a minimum-jerk motion (fifth-order polynomial) from rest to rest of proportional joints.
 
@@ -60,10 +62,10 @@ def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration
     way = end - begin
     # The last point is exact.
     positions = np.vstack([begin + np.outer(gone[:-1], way), end])
-    return Move(joints, duration * part, positions, np.outer(rate, way))
+    return JointMotion(joints, duration * part, positions, np.outer(rate, way))
 
 
-def duration_of(way: FloatArray, settings: OuterLoopSettings) -> float:
+def duration_of(way: FloatArray, settings: ExecutiveSettings) -> float:
     """
     Return the shortest duration [s] of a smooth motion within speed and acceleration limits.
 

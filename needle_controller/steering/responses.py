@@ -23,8 +23,8 @@ from dataclasses import replace
 from math import ceil
 from typing import Final
 
-from needle_controller.compiled.steering import Responses
-from needle_controller.steering.belief import SteeringBelief
+from needle_controller.compiled.steering import HypothesisResponses
+from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.cut import Steered
 from needle_dynamics.compiled.superposition import insert_causes
@@ -75,7 +75,7 @@ class SteeringModel:
         Nominal constants of steering; path noise and bevel are taken from the belief.
     depths : array_like, shape (n + 1,)
         Depths of the tip measurements [m], increasing; the needle reaches the first one straight.
-    belief : SteeringBelief, optional
+    belief : SteeringPrior, optional
         Prior uncertainty.
     together : bool
         Whether the guide moves in proportion to the depth and reaches the position of a step at
@@ -89,7 +89,7 @@ class SteeringModel:
     ----------
     depths : ndarray, shape (n + 1,)
         The depths [m].
-    belief : SteeringBelief
+    belief : SteeringPrior
         As given.
     lengths, skins : ndarray, shape (h,)
         Bending length and skin stiffness of each hypothesis, relative to the nominal values.
@@ -110,7 +110,7 @@ class SteeringModel:
         Change of `guide` from one hypothesis to the next in bending length, and in skin.
     prior : ndarray, shape (7 + n, 7 + n)
         Prior covariance of the causes, and of the position between two hypotheses.
-    responses : Responses
+    responses : HypothesisResponses
         All responses, as arguments of compiled functions.
 
     Raises
@@ -125,7 +125,7 @@ class SteeringModel:
         needle: NeedleParameters,
         steering: SteeringParameters,
         depths: ArrayLike,
-        belief: SteeringBelief | None = None,
+        belief: SteeringPrior | None = None,
         *,
         together: bool = False,
         progress: Callable[[int, int], object] | None = None,
@@ -142,7 +142,7 @@ class SteeringModel:
                 f'depths must be in [0, {reach:g}] m, the length of the needle without its free '
                 f'length, got {at[0]:g} to {at[-1]:g} m'
             )
-        self.depths, self.belief = at, belief or SteeringBelief()
+        self.depths, self.belief = at, belief or SteeringPrior()
         self._together = together
         width = _BEYOND * self.belief.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
@@ -183,7 +183,7 @@ class SteeringModel:
         )
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
         self.prior[4:-2, 4:-2] = b.path_noise / (2.0 * b.path_noise_length) * np.exp(-apart)
-        self.responses = Responses(
+        self.responses = HypothesisResponses(
             self.guide, self.causes, self.bevel, self.elastic,
             self.guide_load, self.causes_load, self.bevel_load, self.between,
             _sums_from(self.guide[:, -1], self.steps + 1),

@@ -20,7 +20,7 @@ JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OuterLoopSettings:
+class ExecutiveSettings:
     """Steps, tip measurements and limits of a steered insertion."""
 
     step_length: float = constant(

@@ -18,7 +18,7 @@ DEEPEST: Final = 2
 _HALVINGS: Final = 60
 
 
-class Axis(NamedTuple):
+class AxisConstants(NamedTuple):
     """
     Constants along the insertion axis.
 
@@ -81,7 +81,7 @@ class Resistance(NamedTuple):
 
 
 @compiled
-def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Resistance:
+def resistance(a: AxisConstants, depth: float, touches: bool, punctured: BoolArray) -> Resistance:
     """Return the resistance at a depth [m]; ``touches``: the tip touches uncut tissue."""
     dry, viscous, cutting, elastic = a.coulomb, a.viscous, 0.0, 0.0
     for i in range(len(a.starts)):
@@ -101,7 +101,7 @@ def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Re
 
 
 @compiled
-def _events(a: Axis, state: FloatArray, punctured: BoolArray) -> tuple[float, float]:
+def _events(a: AxisConstants, state: FloatArray, punctured: BoolArray) -> tuple[float, float]:
     """Return the range of depths [m] around the tip without any change of the resistance."""
     depth = state[DEPTH]
     low, high = 0.0, a.reach
@@ -125,7 +125,7 @@ def _events(a: Axis, state: FloatArray, punctured: BoolArray) -> tuple[float, fl
 
 
 @inlined
-def _arrive(a: Axis, state: FloatArray, punctured: BoolArray) -> None:
+def _arrive(a: AxisConstants, state: FloatArray, punctured: BoolArray) -> None:
     """Update greatest depth, punctures and hub contact at the new depth."""
     depth = state[DEPTH]
     state[DEEPEST] = max(state[DEEPEST], depth)
@@ -138,7 +138,9 @@ def _arrive(a: Axis, state: FloatArray, punctured: BoolArray) -> None:
 
 
 @inlined
-def _glide(a: Axis, r: Resistance, speed: float, force: float, t: float) -> tuple[float, float]:
+def _glide(
+    a: AxisConstants, r: Resistance, speed: float, force: float, t: float
+) -> tuple[float, float]:
     """Return velocity [m/s] and displacement [m] under a constant resistance."""
     # Cutting as friction with the ratio of `slide`, plus a constant force.
     share = r.cutting / (1.0 + a.withdrawal)
@@ -148,7 +150,12 @@ def _glide(a: Axis, r: Resistance, speed: float, force: float, t: float) -> tupl
 
 @kernel
 def push(
-    a: Axis, state: Vector, punctured: BoolVector, force: float, duration: float, step: float
+    a: AxisConstants,
+    state: Vector,
+    punctured: BoolVector,
+    force: float,
+    duration: float,
+    step: float,
 ) -> float:
     """
     Advance under a constant force [N], positive into the tissue, for ``duration`` [s], in place.
@@ -199,7 +206,7 @@ def push(
 
 @kernel
 def carry_on(
-    a: Axis,
+    a: AxisConstants,
     state: Vector,
     punctured: BoolVector,
     speed: float,
@@ -248,7 +255,7 @@ def carry_on(
 
 
 @inlined
-def _held(a: Axis, r: Resistance, speed: float) -> float:
+def _held(a: AxisConstants, r: Resistance, speed: float) -> float:
     """Return friction and cutting force [N]; at rest the static friction of least force."""
     if speed > 0.0:
         return r.dry + r.cutting + r.viscous * speed

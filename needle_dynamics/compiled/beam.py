@@ -25,7 +25,7 @@ from needle_dynamics.arrays import Array3, FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled, inlined
 
 
-class Springs(NamedTuple):
+class SpringSupports(NamedTuple):
     """
     Equivalent spring of the needle up to each node; row i is node i.
 
@@ -178,7 +178,7 @@ def _loaded(
 
 
 @compiled
-def begin(s: Springs, ei: float, free: float, skin: float, entry: FloatArray) -> None:
+def begin(s: SpringSupports, ei: float, free: float, skin: float, entry: FloatArray) -> None:
     """
     Fill the first row: from the guide over the free length [m] to the entry point, and the skin.
 
@@ -201,7 +201,7 @@ def begin(s: Springs, ei: float, free: float, skin: float, entry: FloatArray) ->
 
 
 @inlined
-def carry(s: Springs, i: int, c: Crossing) -> None:
+def carry(s: SpringSupports, i: int, c: Crossing) -> None:
     """Fill row i + 1, at the end of the element from row i, without the load of the path."""
     j = i + 1
     s.compliance[j, 0], s.compliance[j, 1], s.compliance[j, 2] = c.c00, c.c01, c.c11
@@ -215,7 +215,7 @@ def carry(s: Springs, i: int, c: Crossing) -> None:
 
 
 @inlined
-def follow(s: Springs, i: int, plane: int, c: Crossing) -> None:
+def follow(s: SpringSupports, i: int, plane: int, c: Crossing) -> None:
     """Add the load of the path of an element to row i + 1, in plane 0 (x) or 1 (z)."""
     p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
     for k in range(2):
@@ -224,7 +224,7 @@ def follow(s: Springs, i: int, plane: int, c: Crossing) -> None:
 
 @compiled
 def shape(
-    s: Springs,
+    s: SpringSupports,
     last: int,
     tip: float,
     ei: float,
@@ -239,7 +239,7 @@ def shape(
 
     Parameters
     ----------
-    s : Springs
+    s : SpringSupports
         Rows.
     last : int
         Row of the node before the tip.

@@ -94,7 +94,7 @@ class _Compiled:
 
     def prepare(self) -> None:
         """Load or compile the function for the annotated types."""
-        from needle_dynamics.compiled.held import prepare_hold
+        from needle_dynamics.compiled.boxed import prepare_hold
         from needle_dynamics.compiled.signatures import argument_types
 
         found = argument_types(self.py_func)

@@ -14,13 +14,13 @@ from needle_dynamics.compiled.beam import (
     element,
     follow,
     shape,
-    Springs,
+    SpringSupports,
 )
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
 import numpy as np
 
 if TYPE_CHECKING:
-    from needle_dynamics.compiled.held import Held
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Indices of `Cut.pose`.
 DEPTH: Final = 0
@@ -101,7 +101,7 @@ class Cut(NamedTuple):
 
     Attributes
     ----------
-    springs : Springs
+    springs : SpringSupports
         Rows of the nodes; the row after the last node is the tip.
     guide : ndarray, shape (2, 2)
         By plane (x, z): position [m] and tilt of the guide.
@@ -118,7 +118,7 @@ class Cut(NamedTuple):
 
     """
 
-    springs: Springs
+    springs: SpringSupports
     guide: Matrix
     pose: Vector
     entry: Vector
@@ -127,14 +127,14 @@ class Cut(NamedTuple):
     counts: IntVector
 
 
-class Needle(NamedTuple):
+class CuttingNeedle(NamedTuple):
     """Constants and state of a needle that cuts its path."""
 
     constants: Steered
     state: Cut
 
 
-class Pose(NamedTuple):
+class GuidePose(NamedTuple):
     """
     Commanded pose of the needle.
 
@@ -158,7 +158,7 @@ class Pose(NamedTuple):
 
 
 @kernel
-def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
+def start(n: Steered, c: Cut, to: GuidePose, free: float) -> None:
     """Place the tip on the skin with a free length from the guide [m]; ignores ``to.depth``."""
     c.pose[DEPTH] = c.pose[DEEPEST] = 0.0
     c.pose[ROLL] = c.pose[TIP_ROLL] = to.roll
@@ -177,7 +177,7 @@ def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
 
 
 @inlined
-def move(n: Steered, c: Cut, to: Pose) -> None:
+def move(n: Steered, c: Cut, to: GuidePose) -> None:
     """
     Move the needle to a pose, in place; guide and roll change in proportion to the depth.
 
@@ -216,7 +216,7 @@ def move(n: Steered, c: Cut, to: Pose) -> None:
 def _set(
     n: Steered,
     c: Cut,
-    to: Pose,
+    to: GuidePose,
     x: float,
     tilt_x: float,
     z: float,
@@ -282,7 +282,7 @@ def _load(n: Steered, c: Cut, layer: int) -> None:
 
 
 @inlined
-def _path_end(s: Springs, i: int, plane: int, h: float) -> float:
+def _path_end(s: SpringSupports, i: int, plane: int, h: float) -> float:
     """Return the path of an element at a distance from its start [m]."""
     p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
     return float(p + h * (d + 0.5 * h * b))
@@ -371,7 +371,7 @@ def _keep(c: Cut) -> None:
 
 
 @compiled
-def node_before(s: Springs, last: int, depth: float) -> int:
+def node_before(s: SpringSupports, last: int, depth: float) -> int:
     """Return the row of the last node at or above a depth [m], by bisection."""
     low, high = 0, last
     while low < high:
@@ -384,7 +384,7 @@ def node_before(s: Springs, last: int, depth: float) -> int:
 
 
 @inlined
-def _over(n: Steered, s: Springs, i: int, h: float) -> Crossing:
+def _over(n: Steered, s: SpringSupports, i: int, h: float) -> Crossing:
     """Return the crossing of an element or of its first part of length h [m]."""
     return cross(
         element(n.ei, s.stiffness[i], h),
@@ -438,13 +438,13 @@ def _bend(n: Steered, c: Cut, found: FloatArray, felt: FloatArray) -> int:
 
 
 @kernel
-def bring(held: Held[Needle], to: Pose) -> None:
+def bring(held: Boxed[CuttingNeedle], to: GuidePose) -> None:
     """Apply `move` to a held needle."""
     move(held.value.constants, held.value.state, to)
 
 
 @kernel
-def bend(held: Held[Needle], found: Array3, felt: Matrix) -> int:
+def bend(held: Boxed[CuttingNeedle], found: Array3, felt: Matrix) -> int:
     """
     Compute the shape of a held needle and the load on the guide; return the node before the tip.
 
@@ -502,7 +502,7 @@ def insert(
     wander : ndarray, shape (runs or 1, cells, 2)
         As in `Steered`.
     poses : ndarray, shape (runs or 1, k, 6)
-        The fields of `Pose`; the first pose places the tip on the skin.
+        The fields of `GuidePose`; the first pose places the tip on the skin.
     runs : ndarray of int, shape (m,)
         Indices of the runs to compute.
     c : Cut
@@ -524,7 +524,7 @@ def insert(
         way = poses[run % len(poses)]
         for i in range(len(way)):
             p = way[i]
-            to = Pose(p[0], p[1], p[2], p[3], p[4], p[5])
+            to = GuidePose(p[0], p[1], p[2], p[3], p[4], p[5])
             if i == 0:
                 start(n, c, to, v[6])
             move(n, c, to)

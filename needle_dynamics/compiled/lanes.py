@@ -98,7 +98,7 @@ class Constants(NamedTuple):
     rotary_inertia: float
 
 
-class Course(NamedTuple):
+class BatchTrajectory(NamedTuple):
     """
     Inputs and steps of a batch.
 
@@ -343,7 +343,7 @@ def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
 def run(
     needles: Matrix,
     table: Matrix,
-    course: Course,
+    course: BatchTrajectory,
     runs: IntVector,
     states: Matrix,
     kept: Array3,
@@ -358,7 +358,7 @@ def run(
         `Constants` of each run, or of all runs.
     table : ndarray, shape (1 + 4 m, 26)
         First columns of the series of two modes of length 1.
-    course : Course
+    course : BatchTrajectory
         Inputs and steps.
     runs : ndarray of int
         Indices of the runs to compute.
@@ -412,7 +412,7 @@ def _next(
     i: int,
     which: int,
     at: IntArray,
-    course: Course,
+    course: BatchTrajectory,
     table: FloatArray,
     states: FloatArray,
     kept: FloatArray,

@@ -15,7 +15,7 @@ from typing import Final
 from needle_dynamics.arrays import Matrix, Vector
 from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals
-from needle_dynamics.compiled.step import advance, Inputs, Needle
+from needle_dynamics.compiled.step import advance, CompiledNeedle, Inputs
 import numpy as np
 
 #: Step at the largest vibration, as a fraction of the slowest mode's period over 2 pi.
@@ -30,7 +30,7 @@ _MOST: Final = 1e12
 
 @kernel
 def run_refined(
-    c: Needle,
+    c: CompiledNeedle,
     state: Vector,
     forces: Vector,
     interval: float,

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
 from needle_dynamics.arrays import Shaped
-from needle_dynamics.compiled.held import Held, held_type
+from needle_dynamics.compiled.boxed import Boxed, held_type
 import numba
 from numba.core import types
 
@@ -30,9 +30,9 @@ def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
     Return Numba's types of the arguments of a function; TypeError if an annotation has none.
 
     Annotations are numbers, arrays of `needle_dynamics.arrays` with a known number of dimensions,
-    tuples, named tuples of these, and `Held` named tuples.
+    tuples, named tuples of these, and `Boxed` named tuples.
     """
-    hints = get_type_hints(function, localns={'Held': Held}, include_extras=True)
+    hints = get_type_hints(function, localns={'Held': Boxed}, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     try:
         return tuple(numba_type(hints[name]) for name in names)
@@ -52,7 +52,7 @@ def numba_type(hint: Any) -> Any:
         if isinstance(shaped, Shaped):
             kind = numba.from_dtype(shaped.dtype)
             return types.Array(kind, shaped.dimensions, 'C', readonly=not shaped.writable)
-    if origin is Held:
+    if origin is Boxed:
         return held_type(numba_type(arguments[0]))
     if origin is tuple and Ellipsis not in arguments:
         return _tuple_type([numba_type(one) for one in arguments])

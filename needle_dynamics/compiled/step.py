@@ -25,7 +25,7 @@ import numpy as np
 GRADED_FROM: Final = 0.1
 
 
-class Needle(NamedTuple):
+class CompiledNeedle(NamedTuple):
     """
     Constants of a needle in tissue, from `needle_dynamics.model.NeedleModel.compiled`; SI units.
 
@@ -63,13 +63,13 @@ class Needle(NamedTuple):
 
 
 @compiled
-def adapted(c: Needle, coulomb: float, viscous: float, layers: Layers) -> Needle:
+def adapted(c: CompiledNeedle, coulomb: float, viscous: float, layers: Layers) -> CompiledNeedle:
     """Return the needle with other friction coefficients [N], [N s/m] and other tissue layers."""
     f = c.friction
     friction = FrictionConstants(
         f.law, coulomb, viscous, f.withdrawal, f.breakaway, f.stribeck_speed, f.smoothing_speed
     )
-    return Needle(
+    return CompiledNeedle(
         c.length, c.linear_density, c.bending_stiffness, c.tissue_damping, c.moving_mass,
         c.carriage_mass, c.rotary_inertia, c.minimum_depth, c.maximum_depth, c.hub_stop,
         c.as_printed, c.swelling, c.swelling_time, friction, c.modes, layers,
@@ -151,7 +151,7 @@ class _Border(NamedTuple):
 
 @inlined
 def _rates(
-    c: Needle, at: ModeIntegrals, z: FloatArray, factor: FloatArray, rates: FloatArray
+    c: CompiledNeedle, at: ModeIntegrals, z: FloatArray, factor: FloatArray, rates: FloatArray
 ) -> None:
     """Compute the rates of the modes from ``z``: momenta, or rates if `as_printed`."""
     n = z.shape[0]
@@ -167,7 +167,7 @@ def _rates(
 
 @inlined
 def _border(
-    c: Needle,
+    c: CompiledNeedle,
     at: ModeIntegrals,
     z: FloatArray,
     factor: FloatArray,
@@ -186,7 +186,7 @@ def _border(
 
 @compiled
 def _hub_contact(
-    c: Needle, u: float, drive: float, gain: float, moved: bool, room: float, h: float
+    c: CompiledNeedle, u: float, drive: float, gain: float, moved: bool, room: float, h: float
 ) -> tuple[float, float]:
     """Return the time of the hub contact within a step [s], -1 at rest, and the velocity [m/s]."""
     if room <= 0.0:
@@ -210,7 +210,7 @@ def _hub_contact(
 
 @compiled
 def _resistance(
-    c: Needle, u: float, new_u: float, travel: float, impulse: float, h: float
+    c: CompiledNeedle, u: float, new_u: float, travel: float, impulse: float, h: float
 ) -> tuple[float, float]:
     """Return the friction loss of a moved needle [J] and the impulse that it requires [N s]."""
     f, mean = c.friction, 0.5 * (u + new_u)
@@ -229,7 +229,7 @@ def _resistance(
 
 @inlined
 def _write_felt(
-    c: Needle, inputs: Inputs, before: _Border, now: _Border, span: float, felt: FloatArray
+    c: CompiledNeedle, inputs: Inputs, before: _Border, now: _Border, span: float, felt: FloatArray
 ) -> None:
     """Write the mean load on the base in a part of the duration, by balance of momentum."""
     gained = now.motion.velocity - before.motion.velocity
@@ -246,7 +246,7 @@ def _write_felt(
 
 @inlined
 def _steps(  # noqa: C901
-    c: Needle,
+    c: CompiledNeedle,
     at: ModeIntegrals,
     work: FloatArray,
     modal: FloatArray,
@@ -356,7 +356,7 @@ def _steps(  # noqa: C901
 
 @kernel
 def advance(
-    c: Needle,
+    c: CompiledNeedle,
     state: Vector,
     time: float,
     inputs: Inputs,
@@ -439,7 +439,7 @@ def advance(
 
 @kernel
 def run(
-    c: Needle,
+    c: CompiledNeedle,
     state: Vector,
     forces: Vector,
     torques: Vector,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from needle_dynamics.arrays import Matrix, Vector
-from needle_dynamics.compiled.beam import begin, cross, element, Springs
+from needle_dynamics.compiled.beam import begin, cross, element, SpringSupports
 from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.cut import SHIFT
 import numpy as np
@@ -50,7 +50,7 @@ def insert_causes(
 
     """
     count = len(tilts)
-    s = Springs(
+    s = SpringSupports(
         np.empty(1), np.empty(1), np.empty((1, 3)),
         np.empty((1, 2, 2)), np.empty((1, 2, 2)), np.empty((1, 2, 3)),
     )  # fmt: skip

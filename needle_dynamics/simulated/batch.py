@@ -12,7 +12,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
-from needle_dynamics.compiled.step import Needle, run
+from needle_dynamics.compiled.step import CompiledNeedle, run
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
@@ -171,7 +171,7 @@ def simulate_batch(
         raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     _check(each, starts)
-    course = lanes.Course(pushes, turns, count, float(interval), step, graded)
+    course = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
     kept, completed = _take(
         each, np.array(np.broadcast_to(starts, (runs, starts.shape[1]))), course, keep=keep,
         workers=min(workers or os.cpu_count() or 1, runs), progress=progress or (lambda: None),
@@ -183,7 +183,7 @@ def simulate_batch(
 def _take(
     each: Sequence[NeedleParameters],
     states: FloatArray,
-    course: lanes.Course,
+    course: lanes.BatchTrajectory,
     *,
     keep: bool,
     workers: int,
@@ -195,7 +195,7 @@ def _take(
     completed = np.zeros(runs)
 
     @cache
-    def needle(k: int) -> Needle:
+    def needle(k: int) -> CompiledNeedle:
         return NeedleModel(each[k]).compiled
 
     def alone(some: IntArray) -> None:

@@ -9,7 +9,7 @@ from needle_ros.contract import BASE
 from needle_ros.timing import apart, NANOSECONDS
 
 
-class Command(NamedTuple):
+class AppliedForces(NamedTuple):
     """
     Force command.
 
@@ -47,9 +47,9 @@ class Commands:
 
     Attributes
     ----------
-    held : Command
+    held : AppliedForces
         Command that acts until the next sample.
-    newest : Command
+    newest : AppliedForces
         Command that acts from the next sample on, unless it exceeds the timeout by then.
     refused : int
         Number of invalid commands.
@@ -85,7 +85,7 @@ class Commands:
 
     def begin(self) -> None:
         """Discard all commands and their senders, as at an activation."""
-        self.held = self.newest = Command()
+        self.held = self.newest = AppliedForces()
         self.rivals = self._number = 0
         self._quiet = 0
         #: Stamps of the samples to which a command may respond, and whether commands do.
@@ -97,7 +97,7 @@ class Commands:
 
     def forget(self) -> None:
         """Reset the force to zero; commands older than the newest are still discarded."""
-        self.held = self.newest = Command(self.newest.stamp)
+        self.held = self.newest = AppliedForces(self.newest.stamp)
 
     def offer(
         self, stamp: int, frame: str, force: float, torque: float, now: int
@@ -133,7 +133,7 @@ class Commands:
             self.refused += 1
         # While several nodes publish commands no force acts, and their commands must expire.
         acts = not complaint and self.may_move(now)
-        self.newest = Command(stamp, force, torque) if acts else Command(stamp)
+        self.newest = AppliedForces(stamp, force, torque) if acts else AppliedForces(stamp)
         return True, complaint
 
     def _complaint(self, frame: str, force: float, torque: float) -> str:
@@ -152,7 +152,7 @@ class Commands:
     def refuse(self) -> None:
         """Count an invalid command and set the force to zero."""
         self.refused += 1
-        self.newest = Command(self.newest.stamp)
+        self.newest = AppliedForces(self.newest.stamp)
 
     def may_move(self, now: int) -> bool:
         """Return whether commands may act at a time [ns], with a single sender."""
@@ -162,7 +162,7 @@ class Commands:
         """Ignore commands for the timeout; a short-lived node may have sent some."""
         self._quiet = now + round(self._timeout)
         self._answers = False
-        self.newest = Command(self.newest.stamp)
+        self.newest = AppliedForces(self.newest.stamp)
 
     def count_commanders(self, number: int) -> bool:
         """
@@ -177,7 +177,7 @@ class Commands:
         if rivals == self.rivals:
             return False
         self.rivals = rivals
-        self.newest = Command(self.newest.stamp)
+        self.newest = AppliedForces(self.newest.stamp)
         return True
 
     def hold(self, stamp: int, distance: float = 0.0) -> None:
@@ -194,7 +194,7 @@ class Commands:
         self._energy = self._left * self._energy + max(0.0, before * distance)
         self.exhausted = self._energy > (0.5 if self.exhausted else 1.0) * self._most_energy
         if self.exhausted or stamp - newest.stamp > self._timeout:
-            self.held = Command(newest.stamp)
+            self.held = AppliedForces(newest.stamp)
             return
         growth = self._growth
         force = min(max(newest.force, min(before, 0.0) - growth), max(before, 0.0) + growth)

@@ -40,7 +40,7 @@ class FaultParameters:
         check_constants(self)
 
 
-class Fault:
+class SensorFault:
     """
     A fault of one measurement stream, with ``rate`` measurements per second [Hz].
 
@@ -116,13 +116,13 @@ def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], f
 
 
 #: Functions that apply a fault to an affected measurement, by kind.
-FAULTS: Final[Mapping[str, Callable[[Fault, Reading, Sequence[int]], list[Reading]]]] = {
-    'drop': Fault._drop,
-    'delay': Fault._delay,
-    'duplicate': Fault._duplicate,
-    'reorder': Fault._reorder,
-    'freeze': Fault._freeze,
-    'bias': Fault._bias,
-    'nan': Fault._nan,
-    'saturate': Fault._saturate,
+FAULTS: Final[Mapping[str, Callable[[SensorFault, Reading, Sequence[int]], list[Reading]]]] = {
+    'drop': SensorFault._drop,
+    'delay': SensorFault._delay,
+    'duplicate': SensorFault._duplicate,
+    'reorder': SensorFault._reorder,
+    'freeze': SensorFault._freeze,
+    'bias': SensorFault._bias,
+    'nan': SensorFault._nan,
+    'saturate': SensorFault._saturate,
 }

@@ -27,7 +27,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.step import advance, Inputs, Sums
-from needle_dynamics.errors import InsertedLengthError, ToleranceError
+from needle_dynamics.errors import InsertionDepthError, ToleranceError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError
@@ -208,7 +208,7 @@ class Integrator:
         ------
         ParameterError
             If the duration is not positive, or an input is not finite.
-        InsertedLengthError
+        InsertionDepthError
             If the insertion depth left its range; the state is the last valid one.
         ToleranceError
             If the tolerance cannot be met.
@@ -269,7 +269,7 @@ class Integrator:
         way = force
         try:
             seen = self.advance(duration, force)
-        except InsertedLengthError:
+        except InsertionDepthError:
             # At the speed limit the depth may stay within its range.
             too_fast = True
         else:
@@ -325,11 +325,11 @@ class Integrator:
         start, clock = self._state.copy(), self.time
         longest = min(duration, self.step / self._refinement)
 
-        def attempt(longest: float) -> Sums | InsertedLengthError:
+        def attempt(longest: float) -> Sums | InsertionDepthError:
             self._state[:], self.time = start, clock
             try:
                 return self._take(duration, inputs, longest, felt)
-            except InsertedLengthError as error:
+            except InsertionDepthError as error:
                 return error
 
         outcome = attempt(longest)
@@ -344,7 +344,7 @@ class Integrator:
             change = self._distance(coarse, self._state) / 3.0
             if change <= tolerance and isinstance(outcome, Sums) == isinstance(before, Sums):
                 break
-        if isinstance(outcome, InsertedLengthError):
+        if isinstance(outcome, InsertionDepthError):
             raise outcome
         # The next interval starts with the second last step, or a longer one if the error permits:
         # twice the step has four times the error.
@@ -374,7 +374,7 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
     """
     Return the exception for a motion with ``left`` seconds remaining (NaN: not finite).
 
-    It is an `InsertedLengthError` if the needle would leave its range; ``state`` is the last valid
+    It is an `InsertionDepthError` if the needle would leave its range; ``state`` is the last valid
     state.
     """
     if isnan(left):
@@ -386,7 +386,7 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
         if depth - p.minimum_depth < far - depth
         else f'the largest insertion depth, {far:g} m'
     )
-    return InsertedLengthError(f'insertion depth {depth:.6g} m reached {limit}')
+    return InsertionDepthError(f'insertion depth {depth:.6g} m reached {limit}')
 
 
 def checked_step(step: float) -> float:

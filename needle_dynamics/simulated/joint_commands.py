@@ -19,7 +19,7 @@ _EFFORT: Final = 'effort'
 _KINDS: Final = (_POSITION, _VELOCITY, _EFFORT)
 
 
-class Motion(NamedTuple):
+class JointSetpoints(NamedTuple):
     """Target positions [m or rad] by joint, with the time to reach them [s]."""
 
     goals: dict[str, float]
@@ -34,7 +34,7 @@ class Asked(NamedTuple):
     ----------
     force, torque : float
         Axial force [N] and torque [N m]; NaN if an effort that was a number is now NaN.
-    motions : list of Motion
+    motions : list of JointSetpoints
         Joint motions, only where the message has new values.
     stamp : int
         Stamp of the message [ns].
@@ -45,7 +45,7 @@ class Asked(NamedTuple):
 
     force: float
     torque: float
-    motions: list[Motion]
+    motions: list[JointSetpoints]
     stamp: int
     given: dict[tuple[str, str], float]
 
@@ -104,7 +104,10 @@ class JointCommands:
             # A zero velocity is sent once.
             if kind == _VELOCITY and (_POSITION, joint) not in new and (value or before):
                 lasting[joint] = at.get(joint, 0.0) + value * self._longest
-        motions = [Motion(goals, self._passed(stamp)), Motion(lasting, self._longest)]
+        motions = [
+            JointSetpoints(goals, self._passed(stamp)),
+            JointSetpoints(lasting, self._longest),
+        ]
         return Asked(
             force=new.get((_EFFORT, INSERTION), 0.0),
             torque=new.get((_EFFORT, ROTATION), 0.0),

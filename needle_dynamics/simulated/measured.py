@@ -15,7 +15,7 @@ import numpy as np
 Measurement: TypeAlias = tuple[str, int, list[float]]
 
 
-class Outline(NamedTuple):
+class MeasuredShape(NamedTuple):
     """
     Needle shape for display, in the frame of the entry point.
 
@@ -86,5 +86,5 @@ class SimulatedPlant(Protocol):
     def take(self, force: float, torque: float) -> list[Measurement]:
         """Advance by one interval under a force [N] and torque [N m]; `joint_states` is last."""
 
-    def outline(self) -> Outline | None:
+    def outline(self) -> MeasuredShape | None:
         """Return the needle shape for display; None without a needle."""

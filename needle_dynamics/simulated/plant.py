@@ -13,7 +13,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.integrator import Integrator, Interval
-from needle_dynamics.simulated.measured import Measurement, Outline
+from needle_dynamics.simulated.measured import MeasuredShape, Measurement
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.contract import (
     BASE_WRENCH,
@@ -51,7 +51,7 @@ def _friction_gained(friction: Friction, before: float, after: float) -> float:
     return friction.force(after, 0.0) - friction.force(0.5 * (before + after), 0.0)
 
 
-class Sample(NamedTuple):
+class PlantSample(NamedTuple):
     """
     Measurements at the end of one sample interval.
 
@@ -242,13 +242,13 @@ class Plant:
         measured.append((JOINT_STATES.name, 0, joints))
         return measured
 
-    def outline(self) -> Outline:
+    def outline(self) -> MeasuredShape:
         """
         Return the outline of the needle for display.
 
         Returns
         -------
-        Outline
+        MeasuredShape
             From the base through the entry point to the tip.
 
         """
@@ -256,14 +256,14 @@ class Plant:
         along = model.shape(self.integrator.state, _POINTS)
         slopes = np.zeros((_POINTS, 2))
         slopes[:, 1] = np.gradient(along[:, 1], along[:, 0])
-        return Outline(
+        return MeasuredShape(
             base=np.array([0.0, self.depth - model.parameters.length, 0.0]),
             points=np.insert(along, 0, 0.0, axis=1),
             slopes=slopes,
             path=np.empty((0, 3)),
         )
 
-    def advance(self, force: float = 0.0, torque: float = 0.0) -> Sample:
+    def advance(self, force: float = 0.0, torque: float = 0.0) -> PlantSample:
         """
         Advance by one sample interval.
 
@@ -276,7 +276,7 @@ class Plant:
 
         Returns
         -------
-        Sample
+        PlantSample
             Measurements at the end of the interval.
 
         Raises
@@ -312,7 +312,7 @@ class Plant:
             wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
             start[1] -= 2.0 * late
         depth, speed = needle.depth, needle.velocity
-        return Sample(
+        return PlantSample(
             state=needle.state,
             depth=depth,
             speed=speed,

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
-from needle_dynamics.simulated.commands import Command, Commands
+from needle_dynamics.simulated.commands import AppliedForces, Commands
 from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
 from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
@@ -164,7 +164,7 @@ class PlantRun:
 
     # Samples.
 
-    def take(self, stamp: int, command: Command | None = None) -> list[Measurement]:
+    def take(self, stamp: int, command: AppliedForces | None = None) -> list[Measurement]:
         """
         Take a sample with a stamp [ns] and return its measurements, `joint_states` last.
 

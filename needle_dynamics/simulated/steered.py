@@ -10,7 +10,7 @@ from typing import Any, Final
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.measured import Measurement, Outline
+from needle_dynamics.simulated.measured import MeasuredShape, Measurement
 from needle_dynamics.simulated.plant import AT_REST
 from needle_dynamics.simulated.tip_sensor import TipSensor
 from needle_dynamics.steering.insertion import Insertion
@@ -267,7 +267,7 @@ class SteeredPlant:
         measured.append((JOINT_STATES.name, 0, joints))
         return measured
 
-    def outline(self) -> Outline:
+    def outline(self) -> MeasuredShape:
         """Return needle (base, guide, tip) and path for display."""
         needle = self.insertion.needle
         shape, path = needle.shape, needle.path
@@ -275,7 +275,7 @@ class SteeredPlant:
         # Behind the guide the needle is straight, with the slope at the guide.
         rest = max(0.0, needle.needle.length - needle.depth - needle.steering.free_length)
         slope = np.array([shape.slopes[0, 0], 1.0, shape.slopes[0, 1]])
-        return Outline(
+        return MeasuredShape(
             base=points[0] - rest * slope,
             points=points,
             slopes=shape.slopes,

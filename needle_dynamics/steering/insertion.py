@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from math import copysign, inf, isfinite
 
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_dynamics.compiled.axis import Axis, carry_on, DEPTH, push, SPEED
-from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, SPEED
+from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import by_layer, SteeringParameters
@@ -18,7 +18,7 @@ import numpy as np
 DEFAULT_AXIS_STEP = 1e-4
 
 
-def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
+def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConstants:
     """Return the constants along the insertion axis."""
     if needle.friction_law != 'coulomb':
         raise ParameterError(
@@ -35,7 +35,7 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
     }
     membranes = np.array(steering.membrane_depths)
     order = np.argsort(membranes)
-    return Axis(
+    return AxisConstants(
         mass=needle.moving_mass,
         coulomb=needle.coulomb_friction,
         viscous=needle.viscous_friction,
@@ -77,7 +77,7 @@ class Insertion:
     ----------
     needle : SteeredNeedle
         Lateral model of the needle.
-    axis : Axis
+    axis : AxisConstants
         Constants along the axis.
     time : float
         Time [s], initially 0.
@@ -189,7 +189,7 @@ class Insertion:
         ------
         ParameterError
             If a value is not valid.
-        InsertedLengthError
+        InsertionDepthError
             If the needle left the tissue.
 
         """
@@ -242,7 +242,7 @@ class Insertion:
         ------
         ParameterError
             If a value is not valid.
-        InsertedLengthError
+        InsertionDepthError
             If the needle left the tissue or the hub reached the guide.
 
         """
@@ -297,7 +297,7 @@ class Insertion:
                 if depth > 0.5 * self.axis.reach
                 else 'the skin'
             )
-            raise InsertedLengthError(f'the needle reached {limit}')
+            raise InsertionDepthError(f'the needle reached {limit}')
 
     @property
     def wrench(self) -> FloatArray:

@@ -7,18 +7,18 @@ from math import ceil, exp, isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.beam import Springs
+from needle_dynamics.compiled.beam import SpringSupports
 from needle_dynamics.compiled.cut import (
     bend,
     bring,
     Cut,
+    CuttingNeedle,
     DEEPEST,
     DEPTH,
     FREE,
+    GuidePose,
     LAST,
-    Needle,
     place,
-    Pose,
     remember,
     respond,
     ROLL,
@@ -138,7 +138,7 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
 def empty_cut(length: float, element: float, layers: int) -> Cut:
     """Allocate the state of a needle (lengths in m); ``start`` initializes it."""
     rows = _SPARE * (ceil(length / element) + layers) + 3
-    springs = Springs(
+    springs = SpringSupports(
         np.zeros(rows),
         np.zeros(rows),
         np.zeros((rows, 3)),
@@ -211,22 +211,22 @@ class SteeredNeedle:
         roll: float = 0.0,
         seed: int = 0,
     ) -> None:
-        from needle_dynamics.compiled.held import Held
+        from needle_dynamics.compiled.boxed import Boxed
 
         self.needle = needle
         self.steering = steering or SteeringParameters()
         self._constants = steered(needle, self.steering, wandering(needle, self.steering, seed))
         self._cut = empty_cut(needle.length, self._constants.element, len(self._constants.starts))
-        self._held = Held(Needle(self._constants, self._cut))
+        self._held = Boxed(CuttingNeedle(self._constants, self._cut))
         self._shift = np.zeros(3)
         self._guide, self._tilt = _pair('guide', guide), _pair('tilt', tilt)
         self._roll = _finite('roll', roll)
         start(self._constants, self._cut, self._pose(0.0), self.steering.free_length)
 
-    def _pose(self, depth: float) -> Pose:
+    def _pose(self, depth: float) -> GuidePose:
         """Return the pose in the frame of the tissue."""
         (x, z), (tilt_x, tilt_z) = self._guide, self._tilt
-        return Pose(
+        return GuidePose(
             depth - self._shift[1],
             x - self._shift[0],
             tilt_x,

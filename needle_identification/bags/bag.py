@@ -9,19 +9,19 @@ from pathlib import Path
 import sqlite3
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.batch import Batch, Tally
+from needle_identification.bags.batch import MessageBatch, Tally
 from needle_identification.bags.files import files_of, form_of
 from needle_identification.bags.limits import Budget
 from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
 from needle_identification.bags.sqlite_file import sqlite_batches
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 
 #: Size of the buffer for sorting messages by receive time [bytes].
 _WINDOW: Final = 2**22
 
 
-def _ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+def _ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     # Lazy import: large, and needed for ROS 1 only.
     from needle_identification.bags.ros1_file import ros1_batches
 
@@ -40,7 +40,7 @@ class Recorded(NamedTuple):
     ----------
     received : int
         Receive time [ns].
-    topic : Topic
+    topic : BagTopic
         Topic of the message.
     data : bytes
         Serialized message (CDR).
@@ -48,7 +48,7 @@ class Recorded(NamedTuple):
     """
 
     received: int
-    topic: Topic
+    topic: BagTopic
     data: bytes
 
 
@@ -93,13 +93,13 @@ class Bag:
             self._files, self._missing = files_of(self.path)
         except OSError as error:
             raise RecordingError(f'cannot read {path}: {error.strerror or error}') from error
-        self.counts: dict[Topic, int] = {}
+        self.counts: dict[BagTopic, int] = {}
         self.losses = list(self._missing)
 
     def __repr__(self) -> str:
         return f'<Bag {self.path}>'
 
-    def topics(self) -> tuple[Topic, ...]:
+    def topics(self) -> tuple[BagTopic, ...]:
         """
         List the topics that have messages.
 
@@ -114,7 +114,7 @@ class Bag:
             If the bag has no messages.
 
         """
-        found: set[Topic] = set()
+        found: set[BagTopic] = set()
         for file in self._files:
             indexed = indexed_topics(file) if file.suffix == '.mcap' else None
             if indexed is None:
@@ -125,7 +125,7 @@ class Bag:
             raise _empty(self)
         return tuple(sorted(found, key=lambda topic: (topic.name, topic.type_name)))
 
-    def count(self) -> Mapping[Topic, int]:
+    def count(self) -> Mapping[BagTopic, int]:
         """
         Read the whole bag and count its messages.
 
@@ -139,7 +139,7 @@ class Bag:
             pass
         return self.counts
 
-    def batches(self, wanted: Callable[[Topic], bool]) -> Iterator[Batch]:
+    def batches(self, wanted: Callable[[BagTopic], bool]) -> Iterator[MessageBatch]:
         """
         Iterate over the bag in batches of messages, from its start.
 
@@ -150,14 +150,14 @@ class Bag:
 
         Yields
         ------
-        Batch
+        MessageBatch
             Messages of one topic.
 
         """
         for _, batch in self._pieces(wanted):
             yield batch
 
-    def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Recorded]:
+    def messages(self, wanted: Callable[[BagTopic], bool]) -> Iterator[Recorded]:
         """
         Iterate over the messages in the order of receive time.
 
@@ -174,7 +174,7 @@ class Bag:
             A message.
 
         """
-        waiting: list[tuple[int, int, Topic, bytes]] = []
+        waiting: list[tuple[int, int, BagTopic, bytes]] = []
         size = order = 0
         piece: tuple[Path, int] | None = None
         for current, batch in self._pieces(wanted):
@@ -193,7 +193,9 @@ class Bag:
             received, _, topic, data = heappop(waiting)
             yield Recorded(received, topic, data)
 
-    def _pieces(self, wanted: Callable[[Topic], bool]) -> Iterator[tuple[tuple[Path, int], Batch]]:
+    def _pieces(
+        self, wanted: Callable[[BagTopic], bool]
+    ) -> Iterator[tuple[tuple[Path, int], MessageBatch]]:
         """Yield each batch with its file and its piece of the file."""
         self.counts.clear()
         self.losses[:] = self._missing

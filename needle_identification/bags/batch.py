@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from needle_identification.bags.compression import DAMAGED, decompress
 from needle_identification.bags.limits import Budget
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,13 +23,13 @@ LATEST: Final = 2**62
 _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
-class Batch(NamedTuple):
+class MessageBatch(NamedTuple):
     """
     Messages of one topic, in the order of the file.
 
     Attributes
     ----------
-    topic : Topic
+    topic : BagTopic
         Topic of the messages.
     received : ndarray of int64, shape (m,)
         Receive times [ns].
@@ -38,14 +38,16 @@ class Batch(NamedTuple):
 
     """
 
-    topic: Topic
+    topic: BagTopic
     received: NDArray[np.int64]
     data: NDArray[np.uint8]
     begin: NDArray[np.int64]
     end: NDArray[np.int64]
 
     @classmethod
-    def joined(cls, topic: Topic, received: NDArray[np.int64], messages: Sequence[bytes]) -> Batch:
+    def joined(
+        cls, topic: BagTopic, received: NDArray[np.int64], messages: Sequence[bytes]
+    ) -> MessageBatch:
         """Build a batch from separate messages and their receive times [ns], shape (m,)."""
         lengths = np.array([len(message) for message in messages], dtype=np.int64)
         end = np.cumsum(lengths)
@@ -53,7 +55,9 @@ class Batch(NamedTuple):
         return cls(topic, received, data, end - lengths, end)
 
     @classmethod
-    def of_times(cls, topic: Topic, times: Sequence[Any], messages: Sequence[Any]) -> Batch:
+    def of_times(
+        cls, topic: BagTopic, times: Sequence[Any], messages: Sequence[Any]
+    ) -> MessageBatch:
         """
         Build a batch from unchecked values of a file.
 
@@ -71,7 +75,7 @@ class Batch(NamedTuple):
         for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
             yield int(received), self.data[begin:end].tobytes()
 
-    def decompressed(self, budget: Budget) -> Batch:
+    def decompressed(self, budget: Budget) -> MessageBatch:
         """
         Decompress messages that were compressed one by one; a damaged message becomes empty.
 
@@ -85,7 +89,7 @@ class Batch(NamedTuple):
             with suppress(*DAMAGED):
                 parts[k] = decompress(compression, data, budget.largest_message)
             budget.spend(len(parts[k]))
-        return Batch.joined(self.topic, self.received, parts)
+        return MessageBatch.joined(self.topic, self.received, parts)
 
 
 def grouped(rows: Iterable[tuple[Any, Any, Any]]) -> dict[Any, list[tuple[Any, Any]]]:
@@ -118,8 +122,8 @@ class Tally:
 
     """
 
-    counts: dict[Topic, int]
-    wanted: Callable[[Topic], bool]
+    counts: dict[BagTopic, int]
+    wanted: Callable[[BagTopic], bool]
     faults: list[str]
     budget: Budget
     count: int = 0
@@ -130,7 +134,7 @@ class Tally:
         of = '' if self.written is None else f' of {self.written}'
         return f'{self.count}{of} messages'
 
-    def enter(self, topic: Topic | None, number: int) -> bool:
+    def enter(self, topic: BagTopic | None, number: int) -> bool:
         """Count messages of a topic (None: unknown, a fault); return whether it is selected."""
         if topic is None:
             self.faults.append(f'is damaged: {number} messages of an unknown topic')

@@ -19,7 +19,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
-from needle_identification.bags.batch import Batch, LARGEST_BATCH, LATEST, Tally
+from needle_identification.bags.batch import LARGEST_BATCH, LATEST, MessageBatch, Tally
 from needle_identification.bags.compression import (
     BLOCK,
     DAMAGED,
@@ -27,7 +27,7 @@ from needle_identification.bags.compression import (
     open_file,
     read_up_to,
 )
-from needle_identification.bags.topics import make_topic, Topic
+from needle_identification.bags.topics import BagTopic, make_topic
 from needle_identification.errors import RecordingError
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -58,7 +58,7 @@ class _Channels:
     """Topics of a file by channel, and the message counts of the statistics record."""
 
     def __init__(self) -> None:
-        self.topics: dict[int, Topic] = {}
+        self.topics: dict[int, BagTopic] = {}
         self.counts: dict[int, int] = {}
         self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
 
@@ -83,7 +83,7 @@ class _Channels:
             self.counts = Statistics.read(stream).channel_message_counts
 
 
-def indexed_topics(file: Path) -> set[Topic] | None:
+def indexed_topics(file: Path) -> set[BagTopic] | None:
     """Return the topics with messages by the index of a file; None without a valid index."""
     channels = _Channels()
     try:
@@ -108,7 +108,7 @@ def indexed_topics(file: Path) -> set[Topic] | None:
         return None
 
 
-def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """
     Read an MCAP file, compressed or not; yield the messages of the selected topics.
 
@@ -195,7 +195,7 @@ def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int
         yield table[:-1] + head, table[1:]
 
 
-def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batch]:
+def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[MessageBatch]:
     """Yield the messages among records."""
     data = np.frombuffer(content, dtype=np.uint8)
     for begin, end in _records(content):
@@ -217,6 +217,6 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batc
             rows = np.flatnonzero(ids == id_)
             if tally.enter(topic, len(rows)) and topic is not None:
                 starts = first[rows] + _MESSAGE_HEAD
-                yield Batch(topic, received[rows], data, starts, after[rows]).decompressed(
+                yield MessageBatch(topic, received[rows], data, starts, after[rows]).decompressed(
                     tally.budget
                 )

@@ -9,7 +9,7 @@ import re
 from typing import Any
 
 from needle_identification.bags.compression import DAMAGED
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
@@ -128,13 +128,13 @@ def encode(message: Any) -> bytes:
     return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
 
 
-def deserialize(topic: Topic, data: bytes) -> Any:
+def deserialize(topic: BagTopic, data: bytes) -> Any:
     """
     Deserialize a message of a topic.
 
     Parameters
     ----------
-    topic : Topic
+    topic : BagTopic
         Topic of a bag; a type outside ROS 2 Jazzy is defined in the bag.
     data : bytes
         Serialized message (CDR).

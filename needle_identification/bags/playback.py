@@ -44,7 +44,7 @@ class PlaybackSettings:
             )
 
 
-class Playback:
+class BagPlayback:
     """
     Iterates over the messages of a bag in the order of reception, in recorded time.
 

@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from needle_identification.bags.batch import Batch, grouped, LARGEST_BATCH, Tally
+from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
 from needle_identification.bags.compression import DAMAGED, decompress
 from needle_identification.bags.limits import Budget
 from needle_identification.bags.topics import make_topic
@@ -30,7 +30,7 @@ _BOUNDED: Final[dict[Any, Callable[[bytes, int], bytes]]] = {
 }
 
 
-def ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+def ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """Read a ``.bag`` file; yield its messages, converted to ROS 2."""
     try:
         with Reader(file) as reader:
@@ -42,7 +42,7 @@ def ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
         tally.faults.append(f'is damaged: {error}')
 
 
-def _batches(reader: Reader, tally: Tally) -> Iterator[Batch]:
+def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
     old, new = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
     known = {name for name in old.fielddefs if name in new.fielddefs}
     topics = {
@@ -68,7 +68,7 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[Batch]:
             )
             converters[kind] = convert
             parts = [_converted(convert, data) for _, data in group]
-            yield Batch.of_times(topic, [when for when, _ in group], parts)
+            yield MessageBatch.of_times(topic, [when for when, _ in group], parts)
 
 
 def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:

@@ -11,10 +11,10 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 from urllib.parse import quote
 
-from needle_identification.bags.batch import Batch, grouped, LARGEST_BATCH, Tally
+from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
 from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
 from needle_identification.bags.limits import factor
-from needle_identification.bags.topics import make_topic, Topic
+from needle_identification.bags.topics import BagTopic, make_topic
 from needle_identification.errors import RecordingError
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
@@ -29,7 +29,7 @@ _STEPS_PER_BYTE: Final = 20
 _STEPS_PER_CALL: Final = 10**5
 
 
-def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """
     Read a ``.db3`` file, compressed or not; yield the messages of the selected topics.
 
@@ -74,7 +74,7 @@ def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
             )
 
 
-def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
+def _topics(database: sqlite3.Connection) -> dict[int, BagTopic]:
     """Return the topics by their key in the database."""
     definitions: dict[Any, tuple[Any, Any]] = {}
     with suppress(sqlite3.Error):
@@ -100,7 +100,7 @@ def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
     return topics
 
 
-def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
+def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[MessageBatch]:
     """Yield the messages of a database up to its first damaged part."""
     topics = _topics(database)
     wanted = ', '.join(str(key) for key, topic in topics.items() if tally.wanted(topic))
@@ -123,7 +123,7 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
         for key, group in grouped(some).items():
             if tally.enter(topics.get(key), len(group)):
                 times, parts = zip(*group, strict=True)
-                yield Batch.of_times(topics[key], times, parts).decompressed(tally.budget)
+                yield MessageBatch.of_times(topics[key], times, parts).decompressed(tally.budget)
     if fault is not None:
         raise fault
 

@@ -89,7 +89,7 @@ def _nanoseconds(time: Mapping[str, int] | None) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Topic:
+class BagTopic:
     """
     A topic in a bag.
 
@@ -151,7 +151,7 @@ def make_topic(
     encoding: str = '',
     definition: str = '',
     profiles: str = '',
-) -> Topic:
+) -> BagTopic:
     """
     Build a topic from the names and definitions in a file.
 
@@ -161,4 +161,4 @@ def make_topic(
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'
     # Escaped names keep error messages of damaged files on one line.
-    return Topic(shown(name), shown(full), encoding, definition, profiles)
+    return BagTopic(shown(name), shown(full), encoding, definition, profiles)

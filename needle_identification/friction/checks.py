@@ -8,7 +8,7 @@ from typing import Final
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
-from needle_identification.friction.comparison import Comparison
+from needle_identification.friction.comparison import CandidateFit
 from needle_identification.friction.design import Design
 from needle_identification.friction.terms import columns_of
 import numpy as np
@@ -142,7 +142,7 @@ def _of_memory(design: Design, fit: Regression) -> Iterator[str]:
     yield f'the noise of the force {how}: the errors grow by {growth:.2g} against white noise'
 
 
-def missing_term(chosen: Sequence[str], comparisons: Sequence[Comparison]) -> str:
+def missing_term(chosen: Sequence[str], comparisons: Sequence[CandidateFit]) -> str:
     """Return a warning that names the best missing term, or an empty string."""
     missing = [c for c in comparisons if c.supported and len(c.terms) > len(chosen)]
     if not missing:

@@ -33,7 +33,7 @@ _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class CandidateFit:
     """
     Comparison of an alternative set of terms with the chosen set.
 
@@ -65,7 +65,7 @@ class Comparison:
     words: str
 
 
-def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comparison, ...]:
+def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
     """
     Fit each unused term in addition, and leave out each chosen term.
 
@@ -121,7 +121,7 @@ def _added(
     candidates: Sequence[tuple[str, ...]],
     samples: float,
     level: float,
-) -> list[Comparison]:
+) -> list[CandidateFit]:
     """Fit additional terms; a supported term must also improve the prediction."""
     tried = [_tried(design, screening, more) for more in candidates]
     p_values = _holm([trial.p_value for trial in tried])
@@ -159,12 +159,12 @@ def _judged(
     p_value: float,
     samples: float,
     level: float,
-) -> Comparison:
+) -> CandidateFit:
     settings = design.signals.settings
     terms, name = (*settings.terms, *more), ' and '.join(more)
     if not trial.determined:
         words = f'the data do not distinguish the term {name} from the others'
-        return Comparison(terms=terms, words=words)
+        return CandidateFit(terms=terms, words=words)
     columns = columns_of(more, settings)
     difference = samples * log(trial.misfit / misfit) + len(columns) * log(samples)
     firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
@@ -183,7 +183,7 @@ def _judged(
     words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
     if not better:
         words += ', which does not predict better'
-    return Comparison(
+    return CandidateFit(
         terms=terms,
         difference=difference,
         p_value=p_value,
@@ -237,13 +237,13 @@ def _independent_samples(design: Design, fit: Regression) -> float:
 
 def _removed(
     terms: tuple[str, ...], term: str, fit: Regression, which: list[int], difference: float
-) -> Comparison:
+) -> CandidateFit:
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
-        return Comparison(terms=terms, words=words)
+        return CandidateFit(terms=terms, words=words)
     p_value = fit.wald(which)[1]
     supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
-    return Comparison(
+    return CandidateFit(
         terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
     )

@@ -17,7 +17,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import independent_span, regress, Regression
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
-from needle_identification.friction.terms import columns_of, Motion, regressors
+from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
@@ -91,7 +91,7 @@ class Design:
     def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
         """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
-        motion = Motion(
+        motion = NeedleMotion(
             self.speed - later * self.acceleration,
             self.acceleration,
             signals.time - signals.time[0],

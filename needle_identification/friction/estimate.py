@@ -8,7 +8,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.estimation.estimate import Named, ParameterEstimate
 from needle_identification.estimation.formatting import measured
 from needle_identification.estimation.residual_tests import ResidualTest
-from needle_identification.friction.comparison import Comparison
+from needle_identification.friction.comparison import CandidateFit
 from needle_identification.friction.punctures import Puncture
 
 
@@ -76,7 +76,7 @@ class FrictionEstimate(Named[ParameterEstimate]):
         Condition number of the regressors, each scaled to unit norm.
     tests : tuple of ResidualTest
         Tests of the residuals.
-    comparison : tuple of Comparison
+    comparison : tuple of CandidateFit
         Comparisons with alternative sets of terms.
     warnings : tuple of str
         Warnings about the validity of the estimate.
@@ -97,7 +97,7 @@ class FrictionEstimate(Named[ParameterEstimate]):
     determination: float
     condition: float
     tests: tuple[ResidualTest, ...]
-    comparison: tuple[Comparison, ...]
+    comparison: tuple[CandidateFit, ...]
     warnings: tuple[str, ...]
     fit: Fit
 

@@ -15,7 +15,7 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
-from needle_identification.friction.terms import Motion, regressors
+from needle_identification.friction.terms import NeedleMotion, regressors
 import numpy as np
 from scipy.special import ndtri
 
@@ -93,7 +93,7 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     moving = np.abs(speed) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
-    motion = Motion(
+    motion = NeedleMotion(
         speed[moving],
         acceleration[moving],
         time[moving] - time[0],

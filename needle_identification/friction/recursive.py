@@ -20,7 +20,7 @@ from needle_identification.estimation.regression import determinable, Regression
 from needle_identification.friction.filtering import CORRELATION_LENGTH, filter_taps, GAP
 from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.settings import AUTO, FrictionSettings
-from needle_identification.friction.terms import columns_of, Motion, regressors
+from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 from needle_ros.errors import ParameterError
 import numpy as np
 
@@ -158,7 +158,7 @@ class RecursiveFriction:
 
     def _learn(self, speed: float, acceleration: float, force: float) -> None:
         none = np.zeros(1)
-        motion = Motion(np.array([speed]), np.array([acceleration]), none, none, none > 0.0)
+        motion = NeedleMotion(np.array([speed]), np.array([acceleration]), none, none, none > 0.0)
         row = regressors(motion, self._settings.terms, self._settings)[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)

@@ -14,7 +14,7 @@ from needle_identification.estimation.estimate import (
     Statistic,
     statistic,
 )
-from needle_identification.friction.comparison import Comparison, SIGNIFICANCE
+from needle_identification.friction.comparison import CandidateFit, SIGNIFICANCE
 from needle_identification.friction.estimate import FrictionEstimate
 from scipy.special import chdtrc
 
@@ -79,7 +79,7 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
 
 def _together(estimates: Sequence[FrictionEstimate]) -> Iterator[str]:
     """Warn of a term that the recordings support only together, by Fisher's test."""
-    tried: dict[str, list[Comparison]] = {}
+    tried: dict[str, list[CandidateFit]] = {}
     for estimate in estimates:
         for one in estimate.comparison:
             if len(one.terms) == len(estimate.terms) + 1:

@@ -27,7 +27,7 @@ from needle_identification.friction.settings import FrictionSettings
 import numpy as np
 
 
-class Motion(NamedTuple):
+class NeedleMotion(NamedTuple):
     """
     Motion of the needle, shape (n,) each.
 
@@ -52,32 +52,32 @@ class Motion(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class Regressor:
     """Regressor ``of`` the motion and the settings, shape (n,), and its coefficient."""
 
     name: str
     symbol: str
     unit: str
-    of: Callable[[Motion, FrictionSettings], FloatArray]
+    of: Callable[[NeedleMotion, FrictionSettings], FloatArray]
 
 
-_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
-    'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
-    'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
-    'offset': (Column('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
+_COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
+    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
+    'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
+    'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
     # Drift of sensor or tissue since the start of the recording.
-    'drift': (Column('force_drift', 'c', 'N/s', lambda x, _: x.time),),
-    'inertia': (Column('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
+    'drift': (Regressor('force_drift', 'c', 'N/s', lambda x, _: x.time),),
+    'inertia': (Regressor('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
     # Additional Coulomb and viscous friction on withdrawal.
     'direction': (
-        Column(
+        Regressor(
             'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.speed), 0)
         ),
-        Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
+        Regressor('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
     ),
     # Excess of the breakaway friction over mu_s.
     'stribeck': (
-        Column(
+        Regressor(
             'stribeck_friction',
             'mu_b - mu_s',
             'N',
@@ -85,10 +85,10 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
         ),
     ),
     'length': (
-        Column('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.speed) * x.depth),
+        Regressor('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.speed) * x.depth),
     ),
     'cutting': (
-        Column(
+        Regressor(
             'cutting_force', 'f_c', 'N',
             lambda x, _: np.where(x.fresh & (x.speed > 0.0), 1.0, 0.0),
         ),
@@ -96,21 +96,25 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
 }  # fmt: skip
 
 
-def _layers(boundaries: Sequence[float]) -> list[Column]:
+def _layers(boundaries: Sequence[float]) -> list[Regressor]:
     """Return a column per layer; the last layer is unbounded."""
     ends = [*boundaries[1:], inf]
     return [
-        Column(f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low))
+        Regressor(
+            f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low)
+        )
         for k, (low, end) in enumerate(zip(boundaries, ends, strict=True))
     ]
 
 
-def _in_layer(begin: float, thickness: float, motion: Motion, _: FrictionSettings) -> FloatArray:
+def _in_layer(
+    begin: float, thickness: float, motion: NeedleMotion, _: FrictionSettings
+) -> FloatArray:
     inside = np.clip(motion.depth - begin, 0.0, thickness)
     return np.asarray(np.sign(motion.speed) * inside)
 
 
-def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]:
+def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:
     """Return the columns of terms, in order."""
     return [
         column
@@ -119,6 +123,8 @@ def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]
     ]
 
 
-def regressors(motion: Motion, terms: Sequence[str], settings: FrictionSettings) -> FloatArray:
+def regressors(
+    motion: NeedleMotion, terms: Sequence[str], settings: FrictionSettings
+) -> FloatArray:
     """Return the regressors of terms, shape (n, k), with the columns of `columns_of`."""
     return np.column_stack([c.of(motion, settings) for c in columns_of(terms, settings)])

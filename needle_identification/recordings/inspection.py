@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import (
@@ -21,7 +21,7 @@ from needle_identification.recordings.samples import (
     each_joint,
     Gathering,
     Samples,
-    Source,
+    SignalSource,
     source_of,
 )
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
@@ -50,7 +50,7 @@ _MAX_JOINTS: Final = 64
 _TRIED: Final = 20_000
 
 
-class Column(NamedTuple):
+class ColumnSummary(NamedTuple):
     """
     One component of a topic, or one column of a table.
 
@@ -83,7 +83,7 @@ class Content:
         Messages per second, from the median step; nan if not inspected.
     gaps : int
         Number of pauses of more than ten steps.
-    columns : tuple of Column
+    columns : tuple of ColumnSummary
         Components with their ranges; none if the type is not supported.
 
     """
@@ -93,7 +93,7 @@ class Content:
     count: int
     rate: float = float('nan')
     gaps: int = 0
-    columns: tuple[Column, ...] = ()
+    columns: tuple[ColumnSummary, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,11 +176,11 @@ def _table(path: Path) -> Inspection:
     )  # fmt: skip
 
 
-def _column(name: str, values: FloatArray) -> Column:
+def _column(name: str, values: FloatArray) -> ColumnSummary:
     finite = values[np.isfinite(values)]
     if not len(finite):
-        return Column(name, float('nan'), float('nan'))
-    return Column(name, float(finite.min()), float(finite.max()))
+        return ColumnSummary(name, float('nan'), float('nan'))
+    return ColumnSummary(name, float(finite.min()), float(finite.max()))
 
 
 # Bags.
@@ -189,7 +189,7 @@ def _column(name: str, values: FloatArray) -> Column:
 class _Signal(NamedTuple):
     """A component of a topic over time: stamps [ns], values in SI units."""
 
-    topic: Topic
+    topic: BagTopic
     axis: str
     stamps: IntArray
     values: FloatArray
@@ -238,7 +238,7 @@ def _presses(path: Path) -> bool:
     return False
 
 
-def _joints(bag: Bag, topics: Sequence[Topic]) -> Mapping[Topic, list[str]]:
+def _joints(bag: Bag, topics: Sequence[BagTopic]) -> Mapping[BagTopic, list[str]]:
     """Return the joint names of each JointState topic, from its first messages."""
     states = [topic for topic in topics if topic.type_name == wire.JOINT_STATE]
     return {
@@ -247,7 +247,7 @@ def _joints(bag: Bag, topics: Sequence[Topic]) -> Mapping[Topic, list[str]]:
     }
 
 
-def _source(topic: Topic, axes: Sequence[str]) -> Source:
+def _source(topic: BagTopic, axes: Sequence[str]) -> SignalSource:
     return (
         each_joint(axes)
         if topic.type_name == wire.JOINT_STATE
@@ -255,7 +255,7 @@ def _source(topic: Topic, axes: Sequence[str]) -> Source:
     )
 
 
-def _content(topic: Topic, count: int, axes: Sequence[str], samples: Samples) -> Content:
+def _content(topic: BagTopic, count: int, axes: Sequence[str], samples: Samples) -> Content:
     steps = np.diff(samples.stamps)
     return Content(
         name=topic.name,
@@ -267,7 +267,7 @@ def _content(topic: Topic, count: int, axes: Sequence[str], samples: Samples) ->
     )
 
 
-def _signals(topic: Topic, axes: Sequence[str], samples: Samples) -> Iterator[_Signal]:
+def _signals(topic: BagTopic, axes: Sequence[str], samples: Samples) -> Iterator[_Signal]:
     for k, axis in enumerate(axes):
         values = samples.values[:, k]
         if np.isfinite(values).all() and np.ptp(values) > 0.0:

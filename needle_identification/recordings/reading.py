@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from needle_identification.bags.bag import Bag
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
@@ -24,7 +24,7 @@ from needle_identification.recordings.samples import (
     AXES,
     Gathering,
     position_and_speed,
-    Source,
+    SignalSource,
     source_of,
 )
 from needle_identification.recordings.tables import is_table, read_friction_table, TABLES
@@ -229,7 +229,7 @@ def signed_axis(text: str, what: str) -> tuple[float, str]:
     return sign, axis
 
 
-def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, float]:
+def _motion_source(bag: Bag, topic: BagTopic, axis: str | None) -> tuple[SignalSource, float]:
     """Return the source of a motion along an axis or of a joint, and its sign."""
     if topic.type_name == wire.JOINT_STATE:
         sign, joint = signed(axis or '')
@@ -238,7 +238,7 @@ def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, fl
     return source_of(topic.type_name, [name]), sign
 
 
-def _only_joint(bag: Bag, topic: Topic) -> str | None:
+def _only_joint(bag: Bag, topic: BagTopic) -> str | None:
     """Return the joint named alone by more than 80 % of the first messages, else None."""
     names = Counter(first_names(bag, topic))
     if not names:
@@ -247,9 +247,9 @@ def _only_joint(bag: Bag, topic: Topic) -> str | None:
     return usual[0] if len(usual) == 1 and count > 0.8 * names.total() else None
 
 
-def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
+def first_names(bag: Bag, topic: BagTopic) -> list[tuple[str, ...]]:
     """Return the joint names of each readable message among the first of a JointState topic."""
-    reader = wire.Reader(wire.JOINT_STATE)
+    reader = wire.MessageReader(wire.JOINT_STATE)
     found: list[tuple[str, ...]] = []
     # Only the first batch is read.
     for batch in islice(bag.batches(lambda other: other == topic), 1):
@@ -259,7 +259,9 @@ def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
     return found
 
 
-def chosen_topic(bag: Bag, topics: Sequence[Topic], wanted: Wanted, name: str | None) -> Topic:
+def chosen_topic(
+    bag: Bag, topics: Sequence[BagTopic], wanted: Wanted, name: str | None
+) -> BagTopic:
     """
     Return the topic with a name, or the only suitable topic by type and usual name.
 
@@ -289,8 +291,8 @@ def chosen_topic(bag: Bag, topics: Sequence[Topic], wanted: Wanted, name: str | 
 
 
 def read_samples(
-    bag: Bag, sources: Mapping[Topic, Source], time: str
-) -> tuple[Mapping[Topic, Gathering], str]:
+    bag: Bag, sources: Mapping[BagTopic, SignalSource], time: str
+) -> tuple[Mapping[BagTopic, Gathering], str]:
     """
     Gather the samples of topics from a bag, with stamps from `time`, one of `TIMES`.
 
@@ -313,5 +315,5 @@ def read_samples(
     return gathered, configuration
 
 
-def _is_configuration(topic: Topic) -> bool:
+def _is_configuration(topic: BagTopic) -> bool:
     return topic.type_name == 'std_msgs/msg/String' and topic.name.endswith('plant/configuration')

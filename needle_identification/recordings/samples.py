@@ -8,8 +8,8 @@ from typing import Final, NamedTuple, NoReturn
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.bags.bag import Bag
-from needle_identification.bags.batch import Batch
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.batch import MessageBatch
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated
 from needle_identification.recordings.series import FINEST, Series
@@ -37,7 +37,7 @@ _STRAY: Final = 0.1
 _LATENCIES: Final = (64, 2**16)
 
 
-class Source(ABC):
+class SignalSource(ABC):
     """
     Selection of numbers from the messages of a topic.
 
@@ -71,7 +71,7 @@ class Source(ABC):
         return []
 
 
-class _Vector(Source):
+class _Vector(SignalSource):
     """Components of the first vector of a message."""
 
     def __init__(self, *axes: str) -> None:
@@ -83,7 +83,7 @@ class _Vector(Source):
         return [begin + offset for offset in self._offsets]
 
 
-class _Odometry(Source):
+class _Odometry(SignalSource):
     """Position, velocity and its validity; the pose is in the frame, the twist in the body."""
 
     columns, width = 10, 3
@@ -103,7 +103,7 @@ class _Odometry(Source):
         return _position_and_speed(numbers[:, self._axis], velocity[:, self._axis])
 
 
-class _Joint(Source):
+class _Joint(SignalSource):
     """Position, velocity and its validity of a joint; default: the joint of the plant."""
 
     columns, width = 2, 3
@@ -141,7 +141,7 @@ class _Joint(Source):
         return ''
 
 
-class _PlaneJoints(Source):
+class _PlaneJoints(SignalSource):
     """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
 
     columns = width = 3
@@ -179,7 +179,7 @@ class _PlaneJoints(Source):
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
 
 
-class _EachJoint(Source):
+class _EachJoint(SignalSource):
     """Positions of joints by name; nan where missing in a message."""
 
     def __init__(self, *joints: str) -> None:
@@ -194,7 +194,7 @@ class _EachJoint(Source):
         ]
 
 
-def each_joint(joints: Sequence[str]) -> Source:
+def each_joint(joints: Sequence[str]) -> SignalSource:
     """Return a source of the positions of joints."""
     return _EachJoint(*joints)
 
@@ -214,7 +214,7 @@ def _position_and_speed(position: FloatArray, speed: FloatArray) -> FloatArray:
     return np.column_stack([position, np.where(known, speed, 0.0), known])
 
 
-def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> Source:
+def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> SignalSource:
     """
     Return the source for messages of a type.
 
@@ -256,7 +256,7 @@ class Samples(NamedTuple):
 class Gathering:
     """Gathers the samples of one topic, stamped by message headers or by receive times."""
 
-    def __init__(self, topic: Topic, source: Source, *, by_header: bool) -> None:
+    def __init__(self, topic: BagTopic, source: SignalSource, *, by_header: bool) -> None:
         self._topic = topic
         self._source = source
         self._by_header = by_header
@@ -265,7 +265,7 @@ class Gathering:
         self._unstamped = self._invalid = self._unusable = self._unwanted = self._messages = 0
         self._fault = ''
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: MessageBatch) -> None:
         decoded = wire.decode(
             batch.data,
             batch.begin,

@@ -26,7 +26,7 @@ TERMS: Final = {
 _ELEMENT: Final = 1.5e-3
 
 
-class Responses(NamedTuple):
+class TipResponses(NamedTuple):
     """
     Tip motion at the samples by cause.
 
@@ -48,7 +48,7 @@ class Responses(NamedTuple):
 
 def responses(
     recording: SteeringRecording, free: float, length: float, skin: float, order: str
-) -> Responses:
+) -> TipResponses:
     """
     Simulate a recorded insertion for each cause.
 
@@ -90,10 +90,10 @@ def responses(
     )
     if order == 'guide first':
         tips = tips[:, ::2]
-    return Responses(guide=tips[0], tilt=tips[1, :, 1], bevel=tips[2])
+    return TipResponses(guide=tips[0], tilt=tips[1, :, 1], bevel=tips[2])
 
 
-def drift(term: str, recording: SteeringRecording, r: Responses) -> FloatArray:
+def drift(term: str, recording: SteeringRecording, r: TipResponses) -> FloatArray:
     """Return tip motion in x, then z, per unit of the constants of a term, shape (2 n, k)."""
     zero, depth = np.zeros(len(r.tilt)), recording.depth
     (guide_x, guide_z), (bevel_x, bevel_z) = r.guide.T, r.bevel.T

@@ -13,9 +13,9 @@ from needle_dynamics.linearization import SLIDING
 from needle_insertion.commands.common import (
     add_needle,
     check_folder,
-    Command,
     constants,
     make_folder,
+    Subcommand,
 )
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
@@ -108,4 +108,4 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
     return report.write_map(options.output, found)
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

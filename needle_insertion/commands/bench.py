@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 
 _ROOT = Path(__file__).parents[2]
 
@@ -25,4 +25,4 @@ def _run(options: argparse.Namespace) -> int:
     return int(import_module('benchmarks.run').run(options))
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: `Command`, model constants from words, output folders."""
+"""Shared parts of the commands: `Subcommand`, model constants from words, output folders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from needle_ros.errors import ParameterError
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """
     Subcommand of `needle`: the constant ``COMMAND`` of its module.
 

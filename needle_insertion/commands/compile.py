@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 
 
 def _add_arguments(_parser: argparse.ArgumentParser) -> None:
@@ -25,4 +25,4 @@ def _run(_options: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

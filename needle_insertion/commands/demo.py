@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import check_folder, Command
+from needle_insertion.commands.common import check_folder, Subcommand
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 
 
@@ -35,4 +35,4 @@ def _run(options: argparse.Namespace) -> int:
     return demo.run(options.output, options.bags, lockstep=not options.realtime)
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

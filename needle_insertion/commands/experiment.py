@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import check_folder, Command
+from needle_insertion.commands.common import check_folder, Subcommand
 from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
 from needle_ros.errors import ParameterError
 
@@ -63,4 +63,4 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

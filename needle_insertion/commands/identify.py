@@ -26,7 +26,7 @@ from needle_identification import (
 )
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles, ROLES
-from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
+from needle_insertion.commands.common import check_file, check_folder, make_folder, Subcommand
 from needle_insertion.commands.identify_steering import add_steering
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
@@ -316,4 +316,4 @@ def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
     return True
 
 
-COMMAND = Command(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))
+COMMAND = Subcommand(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))

@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 
 from needle_identification import inspect_recording, Inspection
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, shown
@@ -75,4 +75,4 @@ def _text(found: Inspection) -> str:
     return '\n'.join(lines)
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import check_folder, Command, make_folder
+from needle_insertion.commands.common import check_folder, make_folder, Subcommand
 from needle_insertion.report.text import table
 
 #: Results to choose from.
@@ -82,4 +82,4 @@ def _run(options: argparse.Namespace) -> int:
     return 0 if passed else 1
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from needle_insertion.commands.common import check_folder, Command
+from needle_insertion.commands.common import check_folder, Subcommand
 from needle_ros.errors import ParameterError
 
 
@@ -115,4 +115,4 @@ def _parameter(word: str) -> tuple[str, str, Any]:
         raise ParameterError(f'-p {word}: {text!r} is not a value in YAML') from error
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

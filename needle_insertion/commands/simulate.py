@@ -12,7 +12,7 @@ from typing import Final
 
 from needle_dynamics import DEFAULT_PRESET, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
-from needle_insertion.commands.common import add_needle, check_file, Command, constants
+from needle_insertion.commands.common import add_needle, check_file, constants, Subcommand
 from needle_insertion.commands.simulate_steering import add_steering, run_steering
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
@@ -169,4 +169,4 @@ def _pace(ratio: float) -> str:
     return f'{float(f"{times:.2g}"):g} times {word} than'
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

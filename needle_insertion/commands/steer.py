@@ -13,13 +13,13 @@ from typing import Any, Final, NamedTuple
 
 from needle_controller import (
     OutOfReachError,
-    SteeringBelief,
     SteeringController,
     SteeringModel,
+    SteeringPrior,
 )
-from needle_controller.steering.controller import Guidance
+from needle_controller.steering.controller import GuideSetpoint
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
-from needle_controller.steering.trial import drawn, insert, Truth
+from needle_controller.steering.simulation import drawn, GroundTruth, insert
 from needle_dynamics import (
     FloatArray,
     NeedleParameters,
@@ -28,7 +28,7 @@ from needle_dynamics import (
     STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_insertion.commands.common import check_file, Command, constants
+from needle_insertion.commands.common import check_file, constants, Subcommand
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach
@@ -84,7 +84,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar='NAME=VALUE',
         help='prior uncertainty of the model, one of '
-        f'{", ".join(asdict(SteeringBelief()))}, SI units; repeatable',
+        f'{", ".join(asdict(SteeringPrior()))}, SI units; repeatable',
     )
     parser.add_argument(
         '--step',
@@ -140,7 +140,7 @@ class _Task(NamedTuple):
     target: FloatArray
     needle: NeedleParameters
     steering: SteeringParameters
-    belief: SteeringBelief
+    belief: SteeringPrior
     depths: FloatArray
 
 
@@ -161,19 +161,19 @@ def _task(options: argparse.Namespace) -> _Task:
     for name in constants(options.set):
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
-    given = {**asdict(SteeringBelief()), **constants(options.belief)}
+    given = {**asdict(SteeringPrior()), **constants(options.belief)}
     steps = max(1, round(target[1] / options.step))
     return _Task(
         target,
         *made(options.needle, options.set),
-        from_values(SteeringBelief, given),
+        from_values(SteeringPrior, given),
         np.linspace(0.0, target[1], steps + 1),
     )
 
 
 def _truth(
-    needle: NeedleParameters, steering: SteeringParameters, belief: SteeringBelief, seed: int
-) -> Truth:
+    needle: NeedleParameters, steering: SteeringParameters, belief: SteeringPrior, seed: int
+) -> GroundTruth:
     """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
     nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
     found = drawn(needle, steering, replace(belief, **nearer), np.random.default_rng(seed), seed)
@@ -201,7 +201,7 @@ def _run(options: argparse.Namespace) -> int:
     def look(tip: FloatArray) -> FloatArray:
         return np.asarray(tip + belief.noise * noise.standard_normal(2))
 
-    def follow(tip: FloatArray | None) -> Guidance:
+    def follow(tip: FloatArray | None) -> GuideSetpoint:
         depth, to = depths[controller.step], controller.next(tip)
         if controller.warning and not warnings and depth < target[1]:
             warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {controller.warning}')
@@ -265,4 +265,4 @@ def _text(found: Mapping[str, Any]) -> str:
     return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
 
 
-COMMAND = Command(_add_arguments, _run, signed=('--target',))
+COMMAND = Subcommand(_add_arguments, _run, signed=('--target',))

@@ -12,7 +12,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import check_folder, Command
+from needle_insertion.commands.common import check_folder, Subcommand
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.process_pool import processes
 
@@ -108,4 +108,4 @@ def _executor(
         yield partial(engine.dask, client), count
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -97,4 +97,4 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
     yield f'{len(results)} runs: {total}'
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -10,7 +10,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import Subcommand
 from needle_ros.errors import ParameterError, shown
 
 if TYPE_CHECKING:
@@ -61,10 +61,10 @@ def _run(options: argparse.Namespace) -> int:
 
 async def _recorded(options: argparse.Namespace) -> None:
     from needle_insertion.watch.live import RecordedReader
-    from needle_insertion.watch.recorded import Recording
+    from needle_insertion.watch.recorded import ShownRecording
     from needle_insertion.watch.server import Server
 
-    recording = Recording(options.bag)
+    recording = ShownRecording(options.bag)
     for loss in recording.losses:
         sys.stderr.write(shown(f'warning: {loss}') + '\n')
     await _serve(Server(lambda: RecordedReader(recording), options.host, options.port))
@@ -105,4 +105,4 @@ async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> No
         await server.end()
 
 
-COMMAND = Command(_add_arguments, _run)
+COMMAND = Subcommand(_add_arguments, _run)

@@ -10,7 +10,7 @@ from typing import Final
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from matplotlib.figure import Figure
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.experiment.bending import read_needles
@@ -18,12 +18,12 @@ from needle_insertion.experiment.insertion import RATE, SETTLING, target_message
 from needle_insertion.experiment.node_process import GraphError
 from needle_insertion.experiment.progress import Show
 from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import Sample, SimulatedRun
+from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
-from needle_insertion.watch.recorded import Recording
+from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
@@ -106,7 +106,7 @@ def record_aimed(
         waiting = True
         end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
 
-        def act(sample: Sample) -> bool:
+        def act(sample: RunSample) -> bool:
             nonlocal waiting, end
             if waiting and sample.time >= WARM_UP:
                 waiting = False
@@ -224,7 +224,7 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
 
 def animate_aiming(bag: Path) -> Animation:
     """Return an animation of the steered needle with some 80 frames."""
-    recording = Recording(bag)
+    recording = ShownRecording(bag)
     times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
     frames = [recording.view(time).frame(time) for time in times]
     return Animation(

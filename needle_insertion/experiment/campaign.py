@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from needle_dynamics.simulated.force_sensor import HIGHEST_RATE
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
-from needle_insertion.experiment.protocol import indenter_name, Protocol
+from needle_insertion.experiment.protocol import ExperimentProtocol, indenter_name
 from needle_insertion.paper.tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import ParameterError
 
@@ -21,7 +21,7 @@ _MOST_REPEATS: Final = 1000
 class Campaign:
     """Repeats of one experiment."""
 
-    protocol: Protocol
+    protocol: ExperimentProtocol
     repeats: int = EXPERIMENTS
     #: Seed of the true values; the sensor noise of run k, from 0, has the seed plus k.
     seed: int = 2014

@@ -31,24 +31,24 @@ from needle_insertion.experiment.bending import bending_checks, draw_bending, re
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.insertion import (
     draw_insertions,
-    Insertion,
     insertion_checks,
     RATE,
     read_insertion,
     record_insertion,
+    RecordedInsertion,
     SPEED,
     START_DEFLECTION,
     START_DEPTH,
     TARGET_DEPTH,
 )
-from needle_insertion.experiment.progress import Progress
+from needle_insertion.experiment.progress import ProgressLine
 from needle_insertion.experiment.protocol import PROTOCOLS
 from needle_insertion.experiment.record import rig
 from needle_insertion.experiment.truth import (
     compare_friction,
     compare_stiffness,
-    Comparison,
     Coverage,
+    TruthComparison,
 )
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_figures import (
@@ -93,29 +93,29 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
     shipped = {name: _shipped(bags, name) for name in PROTOCOLS}
     _clear(output)
     insertions, bent = [], output / 'bending'
-    with Progress('insertion, bent needle') as show:
+    with ProgressLine('insertion, bent needle') as show:
         record_bending(bent, output / 'logs' / 'bending', show, lockstep=lockstep)
     for law in ('adaptive', 'pid'):
-        with Progress(f'insertion, {law}') as show:
+        with ProgressLine(f'insertion, {law}') as show:
             record_insertion(law, output / law, output / 'logs' / law, show, lockstep=lockstep)
         insertions.append(read_insertion(law, output / law))
     aimed, alone = output / 'steered', output / 'guide_at_rest'
     for folder, steered in ((alone, False), (aimed, True)):
-        with Progress(f'insertion, {folder.name.replace("_", " ")}') as show:
+        with ProgressLine(f'insertion, {folder.name.replace("_", " ")}') as show:
             logs = output / 'logs' / folder.name
             record_aimed(folder, logs, show, steered=steered, lockstep=lockstep)
     for name, protocol in PROTOCOLS.items():
         # The noise is the same in each demo, and so is the verdict.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
         (parameters,) = campaign.runs.values()
-        with Progress(f'{name} experiment') as show, rig(output, protocol) as running:
+        with ProgressLine(f'{name} experiment') as show, rig(output, protocol) as running:
             running.record(output / name, parameters, EXPERIMENT_SPEED, partial(show, 'recording'))
 
     friction: list[FrictionEstimate] = []
     stiffness: list[StiffnessEstimate] = []
-    compared: dict[str, list[list[Comparison]]] = {'friction': [], 'stiffness': []}
+    compared: dict[str, list[list[TruthComparison]]] = {'friction': [], 'stiffness': []}
     total = sum(map(len, shipped.values())) + 2
-    with Progress('identification') as show:
+    with ProgressLine('identification') as show:
         for bag in (*shipped['friction'], output / 'friction'):
             show('friction', len(friction) / total)
             recording = read_friction_recording(bag)
@@ -132,7 +132,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
         output / 'result.yaml', summarize(friction[:-1]), summarize_stiffness(stiffness[:-1])
     )
 
-    with Progress('report') as show:
+    with ProgressLine('report') as show:
         show('checking the bent needle')
         checks = bending_checks(bent)
         show('checking the steered needle')
@@ -190,7 +190,7 @@ def _clear(output: Path) -> None:
 def _pictures(
     bent: Path,
     aimed: tuple[Path, Path],
-    insertions: Sequence[Insertion],
+    insertions: Sequence[RecordedInsertion],
     friction: FrictionEstimate,
     stiffness: StiffnessEstimate,
 ) -> list[Picture]:
@@ -237,21 +237,21 @@ def _pictures(
     ]
 
 
-def _known(bag: Path, comparisons: list[Comparison]) -> list[Comparison]:
+def _known(bag: Path, comparisons: list[TruthComparison]) -> list[TruthComparison]:
     """Require that the true values are available."""
     if any(one.truth is None for one in comparisons):
         raise DemoError(f'{bag} does not hold the configuration of its plant')
     return comparisons
 
 
-def _by_symbol(comparisons: Sequence[Comparison]) -> Mapping[str, list[Comparison]]:
-    groups: dict[str, list[Comparison]] = {}
+def _by_symbol(comparisons: Sequence[TruthComparison]) -> Mapping[str, list[TruthComparison]]:
+    groups: dict[str, list[TruthComparison]] = {}
     for one in comparisons:
         groups.setdefault(one.estimate.symbol, []).append(one)
     return groups
 
 
-def _shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Check]:
+def _shipped_checks(source: str, bags: Sequence[Sequence[TruthComparison]]) -> list[Check]:
     """Check the number of 95 % intervals that contain the true value of their own bag."""
     checks = []
     for symbol, group in _by_symbol([one for bag in bags for one in bag]).items():
@@ -267,7 +267,7 @@ def _shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[C
     return checks
 
 
-def _fresh_checks(comparisons: Sequence[Comparison]) -> list[Check]:
+def _fresh_checks(comparisons: Sequence[TruthComparison]) -> list[Check]:
     """Check the error in half-widths of the 95 % interval, at the force of the largest error."""
     checks = []
     for symbol, group in _by_symbol(comparisons).items():
@@ -284,12 +284,12 @@ def _fresh_checks(comparisons: Sequence[Comparison]) -> list[Check]:
     return checks
 
 
-def _half_width(one: Comparison) -> float:
+def _half_width(one: TruthComparison) -> float:
     low, high = one.estimate.interval
     return (high - low) / 2.0
 
 
-def _distance(one: Comparison) -> float:
+def _distance(one: TruthComparison) -> float:
     """Return the error of an estimate in half-widths of its 95 % interval."""
     if not one.estimate.determined or one.truth is None:
         return float('inf')

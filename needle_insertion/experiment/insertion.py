@@ -13,7 +13,7 @@ from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.experiment.progress import Show
 from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import Sample, SimulatedRun
+from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
 from needle_insertion.report.text import Check
 from needle_ros.contract import ENTRY
 from needle_ros.timing import NANOSECONDS, seconds
@@ -38,7 +38,7 @@ SETTLING: Final = 1.6
 
 
 @dataclass(frozen=True, eq=False)
-class Insertion:
+class RecordedInsertion:
     """Curves of a recorded insertion, shape (2, n): times since the target [s], and values."""
 
     law: str
@@ -76,7 +76,7 @@ def record_insertion(
         move = run.publisher(JointTrajectory, 'joint_trajectory')
         waiting = True
 
-        def act(sample: Sample) -> bool:
+        def act(sample: RunSample) -> bool:
             nonlocal waiting
             if waiting and sample.time >= WARM_UP:
                 waiting = False
@@ -105,7 +105,7 @@ def target_message(stamp: int, point: tuple[float, float, float]) -> PointStampe
     return message
 
 
-def read_insertion(law: str, bag: Path) -> Insertion:
+def read_insertion(law: str, bag: Path) -> RecordedInsertion:
     """Read a recording of `record_insertion`."""
 
     def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
@@ -125,10 +125,10 @@ def read_insertion(law: str, bag: Path) -> Insertion:
     target = series('target', lambda m: m.point.y)[0, 0]
     for curve in curves.values():
         curve[0] -= target
-    return Insertion(law=law, completeness=completeness, **curves)
+    return RecordedInsertion(law=law, completeness=completeness, **curves)
 
 
-def insertion_checks(run: Insertion) -> list[Check]:
+def insertion_checks(run: RecordedInsertion) -> list[Check]:
     """Check final depth, overshoot, tracking error and number of messages of an insertion."""
     law = run.law.replace('_', ' ')
     end, over = run.depth[1, -1] - TARGET_DEPTH, run.depth[1].max() - TARGET_DEPTH
@@ -154,7 +154,7 @@ def insertion_checks(run: Insertion) -> list[Check]:
     ]
 
 
-def draw_insertions(runs: Sequence[Insertion]) -> Figure:
+def draw_insertions(runs: Sequence[RecordedInsertion]) -> Figure:
     """Draw depth, tracking error, force and tip deflection for two control laws."""
     figure = Figure(figsize=(9.0, 9.0), layout='constrained')
     axes = figure.subplots(4, 1)

@@ -23,7 +23,7 @@ class Show(Protocol):
         """Show an activity in a few words, and the completed fraction."""
 
 
-class Progress:
+class ProgressLine:
     """
     Write the activity of a job with the elapsed time, also while its thread is busy.
 
@@ -39,7 +39,7 @@ class Progress:
         self._end = Event()
         self._thread = Thread(target=self._update, daemon=True)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressLine:
         self('starting')
         self._thread.start()
         return self

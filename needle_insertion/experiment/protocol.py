@@ -40,7 +40,7 @@ SPEED: Final = 10.0
 FASTEST: Final = 100.0
 
 
-class Point(NamedTuple):
+class TrajectoryPoint(NamedTuple):
     """Point of the commanded trajectory: motion if it has positions, else force."""
 
     time: float
@@ -49,7 +49,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Protocol:
+class ExperimentProtocol:
     """One experiment on the simulated robot."""
 
     #: First part of the names of its bags.
@@ -57,7 +57,7 @@ class Protocol:
     #: Commanded joints.
     joints: tuple[str, ...]
     #: Trajectory: times [s], insertion depths [m], forces [N].
-    points: tuple[Point, ...]
+    points: tuple[TrajectoryPoint, ...]
     #: Topic of the motion, sampled as often as ``/base_wrench``.
     motion: str
     #: Parameters of the plant, with its mode.
@@ -79,7 +79,7 @@ class Protocol:
         return *self.sampled, '/joint_trajectory', '/plant/configuration'
 
 
-def _friction_points() -> tuple[Point, ...]:
+def _friction_points() -> tuple[TrajectoryPoint, ...]:
     """
     Return the protocol of section 3.2.2.2, with the tip past the tissue.
 
@@ -87,9 +87,12 @@ def _friction_points() -> tuple[Point, ...]:
     back, and makes one stroke in and one out at each of `SPEEDS`, with rests. Strokes begin and
     end with an acceleration within the limits of the base.
     """
-    points = [Point(REST_TIME, effort=(0.0,)), Point(REST_TIME + PUSH_TIME, effort=(PUSH,))]
+    points = [
+        TrajectoryPoint(REST_TIME, effort=(0.0,)),
+        TrajectoryPoint(REST_TIME + PUSH_TIME, effort=(PUSH,)),
+    ]
     for time in (RETURN_TIME, REST_TIME):
-        points.append(Point(points[-1].time + time, positions=(START_DEPTH,)))
+        points.append(TrajectoryPoint(points[-1].time + time, positions=(START_DEPTH,)))
     easing = [EASE_TIME * k / _EASE_STEPS for k in range(1, _EASE_STEPS + 1)]
     times = [*easing, *(STROKE_TIME - time for time in reversed(easing)), STROKE_TIME]
     for speed in SPEEDS:
@@ -97,8 +100,10 @@ def _friction_points() -> tuple[Point, ...]:
         for begin, direction in ((START_DEPTH, 1.0), (end, -1.0)):
             start = points[-1].time
             depths = [begin + direction * _travel(time, speed) for time in times]
-            points += [Point(start + t, (at,)) for t, at in zip(times, depths, strict=True)]
-            points.append(Point(start + STROKE_TIME + REST_TIME, (depths[-1],)))
+            points += [
+                TrajectoryPoint(start + t, (at,)) for t, at in zip(times, depths, strict=True)
+            ]
+            points.append(TrajectoryPoint(start + STROKE_TIME + REST_TIME, (depths[-1],)))
     return tuple(points)
 
 
@@ -109,13 +114,13 @@ def _travel(time: float, speed: float) -> float:
     return speed * (steady + (begun**2 + EASE_TIME**2 - left**2) / (2.0 * EASE_TIME))
 
 
-def _stiffness_points() -> tuple[Point, ...]:
+def _stiffness_points() -> tuple[TrajectoryPoint, ...]:
     """
     Return the protocol of section 3.2.2.3: at each force level one press in each direction.
 
     A press is a force in the plane (x, z) that rises, is held, falls to zero and stays there.
     """
-    points = [Point(RELEASED_TIME, effort=(0.0, 0.0))]
+    points = [TrajectoryPoint(RELEASED_TIME, effort=(0.0, 0.0))]
     for level in FORCE_LEVELS:
         for k in range(DIRECTIONS):
             angle = 2.0 * pi * k / DIRECTIONS
@@ -126,20 +131,20 @@ def _stiffness_points() -> tuple[Point, ...]:
                 (RAMP_TIME, (0.0, 0.0)),
                 (RELEASED_TIME, (0.0, 0.0)),
             ):
-                points.append(Point(points[-1].time + time, effort=effort))
+                points.append(TrajectoryPoint(points[-1].time + time, effort=effort))
     return tuple(points)
 
 
 #: Experiments by name.
-PROTOCOLS: Final[Mapping[str, Protocol]] = {
-    'friction': Protocol(
+PROTOCOLS: Final[Mapping[str, ExperimentProtocol]] = {
+    'friction': ExperimentProtocol(
         name='friction',
         joints=('insertion',),
         points=_friction_points(),
         motion='/joint_states',
         plant={'mode': 'robot', 'depth': START_DEPTH},
     ),
-    'stiffness': Protocol(
+    'stiffness': ExperimentProtocol(
         name='stiffness',
         joints=('x', 'z'),
         points=_stiffness_points(),

@@ -13,7 +13,7 @@ from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import JobError, ParameterError
 from needle_identification import message_counts, read_topic, RecordingError
 from needle_insertion.experiment.campaign import Campaign
-from needle_insertion.experiment.protocol import Protocol, SPEED
+from needle_insertion.experiment.protocol import ExperimentProtocol, SPEED
 from needle_insertion.experiment.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document
@@ -62,7 +62,7 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
 
 
 @contextmanager
-def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
+def rig(folder: Path, protocol: ExperimentProtocol) -> Iterator[Rig]:
     """Start a plant and a recorder for runs of a protocol; drafts are in a hidden folder."""
     drafts = folder / f'.{protocol.name}.unfinished'
     # Left by an earlier call that was killed.
@@ -82,7 +82,7 @@ class Rig:
     `draft` is the folder of the first bag during recording; the name of bag k ends in ``_k``.
     """
 
-    def __init__(self, graph: Graph, draft: Path, protocol: Protocol) -> None:
+    def __init__(self, graph: Graph, draft: Path, protocol: ExperimentProtocol) -> None:
         self._graph, self._draft, self._protocol = graph, draft, protocol
         self._recordings = 0
         topics = list(protocol.topics)
@@ -187,7 +187,7 @@ def _move(draft: Path, bag: Path) -> None:
     draft.rename(bag)
 
 
-def _trajectory(protocol: Protocol) -> JointTrajectory:
+def _trajectory(protocol: ExperimentProtocol) -> JointTrajectory:
     points = [
         JointTrajectoryPoint(
             positions=point.positions,
@@ -199,7 +199,7 @@ def _trajectory(protocol: Protocol) -> JointTrajectory:
     return JointTrajectory(joint_names=protocol.joints, points=points)
 
 
-def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
+def _lost(bag: Path, protocol: ExperimentProtocol, rate: float) -> str:
     """Return a description of the missing samples of a recorded run, '' if it is complete."""
     counts = message_counts(bag)
     for topic in protocol.topics:
@@ -216,7 +216,7 @@ def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
     return ''
 
 
-def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -> bool:
+def _is_finished(bag: Path, protocol: ExperimentProtocol, parameters: Mapping[str, Any]) -> bool:
     """Return whether a run is recorded; raise `ParameterError` if its name is taken."""
     if not bag.exists():
         return False

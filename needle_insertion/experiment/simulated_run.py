@@ -14,7 +14,7 @@ from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, profile, SENSOR
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reader
+from needle_ros.wire import MessageReader
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -34,7 +34,7 @@ _STALL: Final = 60.0
 _CHECK: Final = 0.05
 
 
-class Sample(NamedTuple):
+class RunSample(NamedTuple):
     """A sample of the plant."""
 
     #: [ns].
@@ -53,12 +53,12 @@ class Witness:
     the call that returned False, until `release`. `stamp` is the stamp of the newest sample [ns].
     """
 
-    def __init__(self, node: Node, act: Callable[[Sample], bool], *, lockstep: bool) -> None:
+    def __init__(self, node: Node, act: Callable[[RunSample], bool], *, lockstep: bool) -> None:
         self._node, self._act = node, act
         self._first = self.stamp = 0
         self.ended = False
         topic = contract.JOINT_STATES
-        self._read = Reader(topic.type_name).read
+        self._read = MessageReader(topic.type_name).read
         self._processed: Publisher | None = None
         if lockstep:
             kind = contract.PROCESSED
@@ -88,7 +88,7 @@ class Witness:
         if stamp != self.stamp:
             self._first, self.stamp = self._first or stamp, stamp
             time = (stamp - self._first) / NANOSECONDS
-            self.ended = not self._act(Sample(stamp, time, reading.values[0][0]))
+            self.ended = not self._act(RunSample(stamp, time, reading.values[0][0]))
         if self._processed is not None and not self.ended:
             message = Header(frame_id=self._node.get_fully_qualified_name())
             message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
@@ -125,7 +125,7 @@ class SimulatedRun:
         self,
         bag: Path,
         nodes: Mapping[str, Mapping[str, object]],
-        act: Callable[[Sample], bool],
+        act: Callable[[RunSample], bool],
     ) -> None:
         """Record the nodes, the plant last, until `act`, called at each sample, returns False."""
         graph, node = self._graph, self.node

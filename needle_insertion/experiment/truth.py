@@ -24,7 +24,7 @@ IMPROBABLE: Final = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class TruthComparison:
     """An estimate and its true value."""
 
     estimate: ParameterEstimate
@@ -48,7 +48,7 @@ class Coverage:
     known: int = 0
 
     @classmethod
-    def of(cls, comparisons: Iterable[Comparison]) -> Coverage:
+    def of(cls, comparisons: Iterable[TruthComparison]) -> Coverage:
         """Count the intervals of comparisons."""
         known = [one.holds for one in comparisons if one.truth is not None]
         return cls(sum(known), len(known))
@@ -65,20 +65,21 @@ class Coverage:
         return self.held >= self.least
 
 
-def compare_friction(recording: Recording, estimate: FrictionEstimate) -> list[Comparison]:
+def compare_friction(recording: Recording, estimate: FrictionEstimate) -> list[TruthComparison]:
     """Compare the friction estimate with the recorded plant, in the order of Table 1."""
     truth = recording.truth or {}
     return [
-        Comparison(estimate=estimate[name], truth=truth.get(f'model.{name}')) for name in TABLE_1
+        TruthComparison(estimate=estimate[name], truth=truth.get(f'model.{name}'))
+        for name in TABLE_1
     ]
 
 
 def compare_stiffness(
     recording: IndentationRecording, estimate: StiffnessEstimate
-) -> list[Comparison]:
+) -> list[TruthComparison]:
     """Compare the stiffness estimate with the recorded indenter, by entry of Table 2 and level."""
     return [
-        Comparison(
+        TruthComparison(
             estimate=level[entry],
             truth=_stiffness(recording.truth, entry, level.force),
             force=level.force,

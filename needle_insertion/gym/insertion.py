@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
-from needle_dynamics.compiled.held import Held
+from needle_dynamics.compiled.boxed import Boxed
 from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -43,7 +43,7 @@ class _Needles:
             np.array([self._start] * number),
             np.zeros(number),
         )
-        self._held = Held(self._needles)
+        self._held = Boxed(self._needles)
 
     def begin(self, k: int, rng: np.random.Generator) -> None:
         """Sample a new needle and target for episode k."""

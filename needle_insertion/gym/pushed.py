@@ -7,12 +7,12 @@ from typing import Any, Final, NamedTuple, TYPE_CHECKING
 from needle_dynamics.arrays import Array3, Array4, BoolVector, FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.integrals import tip_deflections
-from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
+from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 from needle_dynamics.compiled.tissue import Layers
 import numpy as np
 
 if TYPE_CHECKING:
-    from needle_dynamics.compiled.held import Held
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Period of an action [s], longest step of the integrator [s], and largest force [N].
 PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
@@ -46,7 +46,7 @@ class Pushed(NamedTuple):
 
     Attributes
     ----------
-    common : Needle
+    common : CompiledNeedle
         Constants that are the same for all.
     friction : ndarray, shape (n, 2)
         Coulomb friction [N] and viscous friction [N s/m].
@@ -60,7 +60,7 @@ class Pushed(NamedTuple):
         Target depths [m].
     """
 
-    common: Needle
+    common: CompiledNeedle
     friction: Matrix
     layers: Tissues
     times: Vector
@@ -69,7 +69,7 @@ class Pushed(NamedTuple):
 
 
 @kernel
-def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
+def push(held: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
     Push the needles of the mask `which` for a period; overwrite their times and states.
 
@@ -102,7 +102,7 @@ def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatA
 
 
 @kernel
-def observe(held: Held[Pushed]) -> Any:
+def observe(held: Boxed[Pushed]) -> Any:
     """Return depth error, velocity, depth and tip deflection, shape (n, 4), in `UNITS`."""
     c, _, _, _, states, targets = held.value
     tips, u = tip_deflections(c.modes, states), states.shape[1] // 2

@@ -6,15 +6,15 @@ from typing import Any, ClassVar, Final
 
 import gymnasium
 from gymnasium import spaces
-from needle_controller import SteeringBelief
-from needle_controller.steering.trial import drawn, Truth
+from needle_controller import SteeringPrior
+from needle_controller.steering.simulation import drawn, GroundTruth
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
 from needle_insertion.gym.pushed import BOUND
 from needle_ros.errors import ParameterError
 import numpy as np
 
 #: Default distribution of the unknown disturbances of a needle.
-BELIEF: Final = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1)
+BELIEF: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
 
 #: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63
@@ -40,7 +40,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         Largest displacement of the guide along x and z [m].
     aside : float
         Largest distance of the target from the axis, along x and z [m].
-    belief : SteeringBelief
+    belief : SteeringPrior
         Distribution of the needles.
     """
 
@@ -54,7 +54,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         step: float = 5e-3,
         guide_limit: float = 6e-3,
         aside: float = 4e-3,
-        belief: SteeringBelief = BELIEF,
+        belief: SteeringPrior = BELIEF,
     ) -> None:
         if needle not in STEERING_PRESETS:
             raise ParameterError(
@@ -73,7 +73,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._limit, self._aside, self._belief = guide_limit, aside, belief
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
-        self._truth: Truth | None = None
+        self._truth: GroundTruth | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,7 +103,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         miss = float(np.hypot(*(truth.tip(self._one) - self._target)))
         return seen, -1e3 * miss, True, False, {'miss': miss}
 
-    def _observe(self, truth: Truth, one: SteeredNeedle) -> FloatArray:
+    def _observe(self, truth: GroundTruth, one: SteeredNeedle) -> FloatArray:
         seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)
         depth = one.depth / self._depths[-1]
         lengths = np.concatenate([seen, self._target, one.guide]) / self._limit

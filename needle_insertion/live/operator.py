@@ -53,7 +53,7 @@ class State(NamedTuple):
         return RequestStatus.from_values(self.values)
 
 
-class Outcome(NamedTuple):
+class RequestOutcome(NamedTuple):
     """Result of a request: whether it was executed, and the answers of the nodes."""
 
     success: bool
@@ -146,7 +146,7 @@ class Operator:
 
     def ask(self, word: str) -> Future:
         """
-        Call the services of a key of `REQUESTS`; the result of the future is an `Outcome`.
+        Call the services of a key of `REQUESTS`; the result of the future is an `RequestOutcome`.
 
         The future is done at once if no node offers the service.
         """
@@ -156,7 +156,7 @@ class Operator:
             if (client := self._clients[request.node, request.service]).service_is_ready()
         ]
         if not ready:
-            return _done(Outcome(False, f'no node offers {_names(REQUESTS[word])}'))
+            return _done(RequestOutcome(False, f'no node offers {_names(REQUESTS[word])}'))
         return _gathered(
             {
                 f'{request.node}/{request.service}': self._calls.call(
@@ -167,24 +167,24 @@ class Operator:
                 )
                 for request, client in ready
             },
-            lambda answer: Outcome(answer.success, printable(answer.message)),
+            lambda answer: RequestOutcome(answer.success, printable(answer.message)),
         )
 
     def set(self, node: str, name: str, value: Any) -> Future:
         """
-        Set a parameter of a node; the result of the future is an `Outcome`.
+        Set a parameter of a node; the result of the future is an `RequestOutcome`.
 
         The future is done at once if there is no such node.
         """
         client = self._client(SetParameters, node, 'set_parameters')
         # A new client has not discovered the service yet.
         if not client.wait_for_service(timeout_sec=_DISCOVERY):
-            return _done(Outcome(False, f'no node {node}'))
+            return _done(RequestOutcome(False, f'no node {node}'))
         parameter = Parameter(name, value=value).to_parameter_msg()
 
-        def read(answer: SetParameters.Response) -> Outcome:
+        def read(answer: SetParameters.Response) -> RequestOutcome:
             (result,) = answer.results
-            return Outcome(result.successful, printable(result.reason))
+            return RequestOutcome(result.successful, printable(result.reason))
 
         request = SetParameters.Request(parameters=[parameter])
         service = f'{node}/set_parameters'
@@ -195,29 +195,29 @@ def _names(requests: tuple[Request, ...]) -> str:
     return ' or '.join(f'{request.node}/{request.service}' for request in requests)
 
 
-def _done(outcome: Outcome) -> Future:
+def _done(outcome: RequestOutcome) -> Future:
     future = Future()
     future.set_result(outcome)
     return future
 
 
-def _gathered(answers: Mapping[str, Future], read: Callable[[Any], Outcome]) -> Future:
+def _gathered(answers: Mapping[str, Future], read: Callable[[Any], RequestOutcome]) -> Future:
     """Return one outcome of all calls, when the last has an answer or has failed."""
     gathered = Future()
 
-    def outcome(service: str) -> Outcome:
+    def outcome(service: str) -> RequestOutcome:
         response, node = answers[service].result(), service.partition('/')[0]
         if response is None:
-            return Outcome(False, no_answer(service))
+            return RequestOutcome(False, no_answer(service))
         found = read(response)
-        return Outcome(found.success, f'{node}: {found.message or "done"}')
+        return RequestOutcome(found.success, f'{node}: {found.message or "done"}')
 
     def on_answer(_: Future) -> None:
         if gathered.done() or not all(answer.done() for answer in answers.values()):
             return
         outcomes = [outcome(service) for service in answers]
         lines = '; '.join(one.message for one in outcomes)
-        gathered.set_result(Outcome(all(one.success for one in outcomes), lines))
+        gathered.set_result(RequestOutcome(all(one.success for one in outcomes), lines))
 
     for answer in answers.values():
         answer.add_done_callback(on_answer)

@@ -9,7 +9,7 @@ from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reader, Reading
+from needle_ros.wire import MessageReader, Reading
 from rclpy.node import Node
 
 #: Tolerance of the position [m] and the velocity [m/s] of a reference at rest at its target.
@@ -35,7 +35,7 @@ class Readings:
         #: Kept alive for its subscriptions.
         self._node = node
         self._newest: dict[str, bytes] = {}
-        self._readers = {topic.name: Reader(topic.type_name) for topic in _TOPICS}
+        self._readers = {topic.name: MessageReader(topic.type_name) for topic in _TOPICS}
         self._come = {
             topic.name: waiting(node, topic, topic.qos._replace(depth=1)) for topic in _TOPICS
         }

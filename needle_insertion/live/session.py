@@ -13,7 +13,7 @@ from typing import Any, Final
 from needle_insertion.experiment.insertion import WARM_UP
 from needle_insertion.experiment.node_process import GraphError, NodeProcess
 from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.experiment.simulated_run import IN_LOCKSTEP, Sample, Witness
+from needle_insertion.experiment.simulated_run import IN_LOCKSTEP, RunSample, Witness
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
@@ -108,7 +108,7 @@ def run(session: Session) -> int:
     return 0
 
 
-def _warms_up(sample: Sample) -> bool:
+def _warms_up(sample: RunSample) -> bool:
     """Return whether time continues: until all sensors have reported."""
     return sample.time < WARM_UP
 

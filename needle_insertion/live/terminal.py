@@ -11,9 +11,9 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from needle_controller import LAWS
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering.executive import Phase
 from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.live.operator import Operator, Outcome, State
+from needle_insertion.live.operator import Operator, RequestOutcome, State
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.requests import CONTROLLER, STEERING
 from needle_insertion.live.screen import Screen
@@ -269,7 +269,7 @@ class Terminal:
     def _answered(self, future: Future, what: str) -> None:
         # A call without an answer is done, too.
         self._spin_until(future.done, f'the answer to {what}', inf)
-        outcome: Outcome = future.result()
+        outcome: RequestOutcome = future.result()
         if not outcome.success:
             raise JobError(f'{what}: {outcome.message}')
         self._say(outcome.message)

@@ -6,7 +6,7 @@ from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.report import controllability as report
-from needle_insertion.report.content import Grid, Picture, Section
+from needle_insertion.report.content import Grid, Picture, ReportSection
 
 #: Operating points: insertion depths [m], tip deflections [m], velocity [m/s].
 DEPTHS: Final = (0.02, 0.1, 0.2)
@@ -14,7 +14,7 @@ DEFLECTIONS: Final = (0.0, 5e-4)
 SPEED: Final = 5e-3
 
 
-def section() -> Section:
+def section() -> ReportSection:
     """Return the section of the results page: table of operating points, and map."""
     parameters = NeedleParameters.preset('paper_si')
     model = NeedleModel(parameters)
@@ -23,7 +23,7 @@ def section() -> Section:
     )
     first, last = straight[0].result, bent[0].result
     figure = report.draw_map(report.map_needle(parameters, SPEED))
-    return Section(
+    return ReportSection(
         title='Controllability and observability',
         paragraphs=(
             (

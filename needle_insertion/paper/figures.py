@@ -17,12 +17,12 @@ from needle_insertion.paper.runs import (
     hub_time,
     LAWS,
     open_loop,
-    Outcome,
     PID_KP,
     READINGS,
+    RunOutcome,
     SHOWN,
 )
-from needle_insertion.report.content import Grid, Picture, Section
+from needle_insertion.report.content import Grid, Picture, ReportSection
 import numpy as np
 
 LAW_COLORS: Final[Mapping[str, str]] = {'inverse_dynamics': '#c25a00', 'pid': '#1f5fa8'}
@@ -45,7 +45,7 @@ _HEADS: Final = (
 )
 
 
-def _cells(found: Outcome) -> tuple[str, ...]:
+def _cells(found: RunOutcome) -> tuple[str, ...]:
     return (
         f'{1e3 * found.peak:.4g}',
         f'{found.peak_time:.4g}',
@@ -81,7 +81,7 @@ class PaperFigure:
     """
 
     picture: Picture
-    outcomes: Mapping[tuple[str, ...], Outcome]
+    outcomes: Mapping[tuple[str, ...], RunOutcome]
 
     def table(self, title: str = '') -> Grid:
         """Return the metrics as a table with a row per run; default title is the figure."""
@@ -115,8 +115,8 @@ def _draw_band(axes: Axes, time: FloatArray, values: FloatArray, color: str) -> 
     )
 
 
-def _open_outcomes() -> dict[tuple[str, ...], Outcome]:
-    return {case: Outcome.of(open_loop(*case)) for case in CASES}
+def _open_outcomes() -> dict[tuple[str, ...], RunOutcome]:
+    return {case: RunOutcome.of(open_loop(*case)) for case in CASES}
 
 
 def _figure_4() -> PaperFigure:
@@ -169,9 +169,9 @@ def _figure_5() -> PaperFigure:
     return PaperFigure(picture=Picture('figure_5', caption, figure), outcomes=_open_outcomes())
 
 
-def _closed_outcomes(law: str) -> dict[tuple[str, ...], Outcome]:
+def _closed_outcomes(law: str) -> dict[tuple[str, ...], RunOutcome]:
     return {
-        (*case, 'hub' if hub_stop else 'no hub'): Outcome.of(
+        (*case, 'hub' if hub_stop else 'no hub'): RunOutcome.of(
             closed_loop(law, *case, hub_stop=hub_stop)
         )
         # PID stops before the hub.
@@ -292,7 +292,7 @@ def _comparison() -> Grid:
                 'f_y alone': base_alone(law, reading),
             }
             rows += [
-                (f'{LAWS[law]}, {_label((reading,))}, {how}', *_cells(Outcome.of(run)))
+                (f'{LAWS[law]}, {_label((reading,))}, {how}', *_cells(RunOutcome.of(run)))
                 for how, run in runs.items()
             ]
     return Grid(
@@ -302,12 +302,14 @@ def _comparison() -> Grid:
     )
 
 
-def section() -> Section:
+def section() -> ReportSection:
     """Return the section of the results page: figures 4 to 8, and a comparison of the laws."""
     figures = [draw() for draw in FIGURES.values()]
-    pid = Outcome.of(closed_loop('pid', 'paper_mm', 'complete', hub_stop=True))
-    inverse, proportional = (1e3 * Outcome.of(base_alone(law, 'paper_mm')).final for law in LAWS)
-    return Section(
+    pid = RunOutcome.of(closed_loop('pid', 'paper_mm', 'complete', hub_stop=True))
+    inverse, proportional = (
+        1e3 * RunOutcome.of(base_alone(law, 'paper_mm')).final for law in LAWS
+    )
+    return ReportSection(
         title='Figures 4 to 8',
         paragraphs=(
             (

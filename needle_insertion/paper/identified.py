@@ -25,7 +25,7 @@ from needle_insertion.experiment.truth import (
     LEVEL,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.report.content import Grid, Section
+from needle_insertion.report.content import Grid, ReportSection
 from needle_ros.errors import NeedleError
 from scipy.special import chdtri
 from tqdm import tqdm
@@ -57,7 +57,7 @@ class ReproduceError(NeedleError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
+class PublishedValue:
     """
     Published quantity and its statistics over the recordings.
 
@@ -142,7 +142,7 @@ class IdentifiedTable:
 
     name: str
     bags: tuple[Path, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[PublishedValue, ...]
 
     @property
     def title(self) -> str:
@@ -188,9 +188,9 @@ class IdentifiedTable:
         }
 
     @property
-    def section(self) -> Section:
+    def section(self) -> ReportSection:
         """Section of the results page."""
-        return Section(
+        return ReportSection(
             title=self.title,
             paragraphs=(
                 _UNITS[self.name],
@@ -212,7 +212,7 @@ class IdentifiedTable:
         )
 
 
-def _table_1(bags: Sequence[Path]) -> list[Line]:
+def _table_1(bags: Sequence[Path]) -> list[PublishedValue]:
     """Return mu_s and mu_v over repeated experiments."""
     recordings = [read_friction_recording(bag) for bag in _shown(bags, 'reading')]
     estimates = [identify_friction(recording) for recording in _shown(recordings, 'fits')]
@@ -222,11 +222,11 @@ def _table_1(bags: Sequence[Path]) -> list[Line]:
     for k, (name, paper) in enumerate(TABLE_1.items()):
         truth, found = Coverage.of(one[k] for one in compared), summary[name]
         quantity = f'{found.symbol} [{found.unit}]'
-        lines.append(Line(quantity=quantity, paper=paper, found=found, truth=truth))
+        lines.append(PublishedValue(quantity=quantity, paper=paper, found=found, truth=truth))
     return lines
 
 
-def _table_2(bags: Sequence[Path]) -> list[Line]:
+def _table_2(bags: Sequence[Path]) -> list[PublishedValue]:
     """Return the entries of the stiffness matrix by level over several places, and k_a."""
     recordings = [read_indentation_recording(bag) for bag in _shown(bags, 'reading')]
     estimates = [identify_stiffness(recording) for recording in _shown(recordings, 'fits')]
@@ -242,7 +242,7 @@ def _table_2(bags: Sequence[Path]) -> list[Line]:
     for k, force in enumerate(FORCE_LEVELS):
         for i, (entry, (means, deviations)) in enumerate(TABLE_2.items()):
             lines.append(
-                Line(
+                PublishedValue(
                     quantity=f'{entry} at {force:g} N [N/m]',
                     paper=(means[k], deviations[k]),
                     found=summary.levels[k][entry],
@@ -252,12 +252,14 @@ def _table_2(bags: Sequence[Path]) -> list[Line]:
     tissue, (means, deviations) = summary.tissue_stiffness, TABLE_2['k_zz']
     quantity = f'{tissue.symbol} at {FORCE_LEVELS[-1]:g} N [{tissue.unit}]'
     # The paper equates k_a and k_zz, which implies a contact length of 1 m.
-    lines.append(Line(quantity=quantity, paper=(means[-1], deviations[-1]), found=tissue))
+    lines.append(
+        PublishedValue(quantity=quantity, paper=(means[-1], deviations[-1]), found=tissue)
+    )
     return lines
 
 
 #: Tables by name: experiment, and function that identifies the table from bags.
-TABLES: Final[Mapping[str, tuple[str, Callable[[Sequence[Path]], list[Line]]]]] = {
+TABLES: Final[Mapping[str, tuple[str, Callable[[Sequence[Path]], list[PublishedValue]]]]] = {
     'table-1': ('friction', _table_1),
     'table-2': ('stiffness', _table_2),
 }

@@ -30,7 +30,7 @@ from needle_controller import (
 from needle_dynamics import DEFAULT_PRESET, FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS
 from needle_insertion.paper.runs import LAWS
-from needle_insertion.report.content import Grid, Picture, Section
+from needle_insertion.report.content import Grid, Picture, ReportSection
 import numpy as np
 
 #: Largest relative deviation of the uniform distributions, and the sampled constants.
@@ -198,7 +198,7 @@ def _figure(found: Mismatch) -> Figure:
     return figure
 
 
-def section(found: Mismatch) -> Section:
+def section(found: Mismatch) -> ReportSection:
     """Return the section of the results page."""
     final = {name: 1e6 * np.median(np.abs(b.final)) for name, b in found.batches.items()}
     rms = {name: 1e6 * np.median(b.rms) for name, b in found.batches.items()}
@@ -208,7 +208,7 @@ def section(found: Mismatch) -> Section:
         'against the error in mu_s. The integral of each law continues until the '
         'error is within its tolerance.'
     )
-    return Section(
+    return ReportSection(
         title='Mismatch between needle and model',
         paragraphs=(
             (

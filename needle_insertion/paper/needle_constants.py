@@ -6,13 +6,13 @@ from math import pi
 from typing import Final
 
 from needle_dynamics import NeedleParameters
-from needle_insertion.report.content import Grid, Section
+from needle_insertion.report.content import Grid, ReportSection
 
 #: Diameter of an 18 gauge needle [m].
 DIAMETER: Final = 1.27e-3
 
 
-def section() -> Section:
+def section() -> ReportSection:
     """Return Table 3 for the results page."""
     p = NeedleParameters()
     rows = (
@@ -23,7 +23,7 @@ def section() -> Section:
         ('I_y [m^4]', p.area_moment, pi / 64.0 * DIAMETER**4),
         ('I_x [m^4] in the paper, [kg m^2] here', p.rotary_inertia, pi / 32.0 * DIAMETER**4),
     )
-    return Section(
+    return ReportSection(
         title='Table 3',
         paragraphs=(
             (

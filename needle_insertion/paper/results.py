@@ -20,7 +20,7 @@ from needle_insertion.paper.identified import (
     VERDICTS,
 )
 from needle_insertion.paper.tables import TABLE_1, TABLE_2
-from needle_insertion.report.content import Section
+from needle_insertion.report.content import ReportSection
 from needle_insertion.report.page import write_page
 from needle_insertion.report.text import filled, table
 from tqdm import tqdm
@@ -43,7 +43,7 @@ class Result:
 
     Attributes
     ----------
-    section : Section
+    section : ReportSection
         Section of the page.
     text : str
         Text for the terminal.
@@ -56,7 +56,7 @@ class Result:
 
     """
 
-    section: Section
+    section: ReportSection
     text: str
     verdicts: tuple[tuple[str, str, str], ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)
@@ -120,7 +120,7 @@ def _of_claims(judged: list[claims.Claim]) -> Result:
     )
 
 
-def _of_section(section: Section, **more: object) -> Result:
+def _of_section(section: ReportSection, **more: object) -> Result:
     grids = (f'{one.caption}\n\n{table(one.rows, one.heads)}' for one in section.tables)
     captions = [one.caption for one in section.pictures]
     return Result(
@@ -138,7 +138,7 @@ def _of_section(section: Section, **more: object) -> Result:
 
 def _of_figure(name: str) -> Result:
     found = figures.FIGURES[name]()
-    section = Section(
+    section = ReportSection(
         title=name.replace('-', ' ').capitalize(),
         paragraphs=(),
         tables=(found.table(),),

@@ -59,7 +59,7 @@ SHOWN: Final = 40.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class RunOutcome:
     """
     Metrics of a run.
 
@@ -87,7 +87,7 @@ class Outcome:
 
     @classmethod
     @cache
-    def of(cls, run: LoopRun) -> Outcome:
+    def of(cls, run: LoopRun) -> RunOutcome:
         """Compute the metrics of a run."""
         tip = run.tip_deflection
         k = int(np.abs(tip).argmax())

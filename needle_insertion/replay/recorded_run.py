@@ -16,12 +16,12 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics import FloatArray, NeedleError
 from needle_dynamics.simulated.assembly import SETTINGS
 from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRun, TRAJECTORY
-from needle_identification import Bag, deserialize, RecordingError, Topic
+from needle_identification import Bag, BagTopic, deserialize, RecordingError
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
-from needle_ros.wire import Reader, TYPES
+from needle_ros.wire import MessageReader, TYPES
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,9 +45,9 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
     """Read the runs of all plants in a bag; raise `RecordingError` without a plant."""
     bag, invalid = Bag(path), Counter[str]()
     messages: dict[str, _Messages] = defaultdict(list)
-    readers: dict[str, Reader] = {}
+    readers: dict[str, MessageReader] = {}
 
-    def wanted(topic: Topic) -> bool:
+    def wanted(topic: BagTopic) -> bool:
         kind = topic.name.rpartition('/')[2]
         return _TYPES.get(kind) == topic.type_name and (
             kind in _OTHERS or topic.type_name in TYPES
@@ -57,7 +57,7 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
         name, kind = topic.name, topic.type_name
         try:
             if kind in TYPES:
-                message = readers.setdefault(name, Reader(kind)).read(data)
+                message = readers.setdefault(name, MessageReader(kind)).read(data)
             else:
                 message = deserialize(topic, data)
             messages[name].append((received, message))

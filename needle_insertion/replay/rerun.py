@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_dynamics import FloatArray, NeedleError
-from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.run import (
     CONFIGURED,
     Event,
@@ -47,7 +47,7 @@ _WORDS: Final = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Comparison:
+class TopicComparison:
     """
     Comparison of a recorded topic with the recomputed topic.
 
@@ -91,7 +91,7 @@ class Rerun:
     recorded : RecordedRun
         Recorded run.
     topics : dict
-        `Comparison` of each topic.
+        `TopicComparison` of each topic.
     first : dict or None
         First difference beyond the tolerance.
     reason : str
@@ -162,7 +162,7 @@ class Rerun:
             'notes': self.notes,
         }
 
-    def _commands(self) -> dict[int, Command]:
+    def _commands(self) -> dict[int, AppliedForces]:
         """Return the active commands by sample number, if recorded."""
         for name, rows in self.recorded.rows.items():
             topic = self.recorded.topics[name]
@@ -170,7 +170,9 @@ class Rerun:
             if topic.name == GROUND_TRUTH.name and efforts:
                 told = zip(rows.numbers.tolist(), rows.values[:, efforts].tolist(), strict=True)
                 # Insertion reduces d.
-                return {n: Command(0, -d, torque) for n, (d, torque, *_) in told if not isnan(d)}
+                return {
+                    n: AppliedForces(0, -d, torque) for n, (d, torque, *_) in told if not isnan(d)
+                }
         return {}
 
     def _compute(self) -> dict[str, FloatArray]:
@@ -213,7 +215,7 @@ class Rerun:
         plant.perform(event)
         return plant
 
-    def _compare(self, name: str, computed: FloatArray, tolerance: float) -> Comparison:
+    def _compare(self, name: str, computed: FloatArray, tolerance: float) -> TopicComparison:
         """Compare the recorded messages of a topic with the computed values."""
         rows, quantities = self.recorded.rows[name], self.recorded.topics[name].quantities
         found = computed[rows.numbers]
@@ -239,7 +241,7 @@ class Rerun:
                 'recorded': float(rows.values[at]),
                 'computed': None if np.isnan(found[at]) else float(found[at]),
             }
-        return Comparison(
+        return TopicComparison(
             compared=len(part),
             differing=len(differing),
             largest=largest,

@@ -74,7 +74,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Section:
+class ReportSection:
     """Heading with paragraphs of plain text, tables and pictures."""
 
     title: str

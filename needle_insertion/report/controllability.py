@@ -33,7 +33,7 @@ SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
 #: Largest tip deflection of the map if none is given [m].
 LARGEST_DEFLECTION: Final = 2e-3
 
-#: Column heads of `Point.row`.
+#: Column heads of `OperatingPoint.row`.
 POINT_HEADS: Final = (
     'depth, tip, speed',
     *('controllable', 'not controllable', 'margin', 'weakest'),
@@ -55,7 +55,7 @@ _PANELS: Final = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Point:
+class OperatingPoint:
     """
     Analysis at an operating point.
 
@@ -133,7 +133,7 @@ def analyze_points(
     speeds: Sequence[float],
     force: float = 0.0,
     sliding: str | None = None,
-) -> list[Point]:
+) -> list[OperatingPoint]:
     """
     Analyze every combination of depth [m], deflection [m] and velocity [m/s].
 
@@ -146,7 +146,7 @@ def analyze_points(
         state = operating_point(model, depth, deflection, speed)
         system = linearize(model, state, force, sliding=sliding)
         points.append(
-            Point(
+            OperatingPoint(
                 depth=depth,
                 deflection=deflection,
                 speed=speed,

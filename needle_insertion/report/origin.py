@@ -16,7 +16,7 @@ _PIECE: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
+class RecordingSource:
     """
     Recording of a result.
 
@@ -55,7 +55,7 @@ class Origin:
         Options of the reader; None for automatic selection by type.
     result : Path or None
         Written parameter file, if any.
-    sources : sequence of Source
+    sources : sequence of RecordingSource
         Recordings.
     failures : sequence of (str, str)
         Unusable recordings with reason.
@@ -67,7 +67,7 @@ class Origin:
     settings: Any
     reading: Mapping[str, Any]
     result: Path | None
-    sources: Sequence[Source] = ()
+    sources: Sequence[RecordingSource] = ()
     failures: Sequence[tuple[str, str]] = ()
     copies: Sequence[tuple[str, str]] = ()
 
@@ -159,7 +159,7 @@ def identify_all(
             failures.append((str(bag), str(error)))
             continue
         sources.append(
-            Source(
+            RecordingSource(
                 name=recording.name,
                 losses=recording.losses,
                 clock_offset=recording.clock_offset,

@@ -21,7 +21,7 @@ from typing import Final
 from needle_insertion.slicer.frames import Frame, Frames
 from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.errors import MessageError
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 
 #: Time between attempts to listen or to connect [s].
 _RETRY: Final = 1.0
@@ -41,7 +41,7 @@ _SYSTEM_BUFFER: Final = 1 << 16
 _MOST_STRANGERS: Final = 8
 
 
-class Link:
+class Connection:
     """
     Connection to a peer, which is restored whenever it is lost.
 
@@ -51,7 +51,7 @@ class Link:
         Role and address.
     wanted : callable
         Returns whether a message of a type and a device name is wanted.
-    journal : Journal
+    journal : EventLog
         Event log.
     steady : callable
         Returns the time of a monotonic clock [s].
@@ -71,7 +71,7 @@ class Link:
         self,
         settings: LinkSettings,
         wanted: Callable[[str, str], bool],
-        journal: Journal,
+        journal: EventLog,
         steady: Callable[[], float] = monotonic,
     ) -> None:
         self.peer = self.complaint = ''

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_insertion.slicer.frames import Frame, HEADER
-from needle_insertion.slicer.needle import Pose, Shape
+from needle_insertion.slicer.needle import EntryPose, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
@@ -119,13 +119,13 @@ class Interpreter:
 
     def tip(self, shape: Shape) -> bytes:
         """Return the pose of the tip as a TRANSFORM message, with y along the needle."""
-        return self._pose(TIP, Pose(shape.stamp, shape.points[-1], shape.turn))
+        return self._pose(TIP, EntryPose(shape.stamp, shape.points[-1], shape.turn))
 
-    def tip_expected(self, pose: Pose) -> bytes:
+    def tip_expected(self, pose: EntryPose) -> bytes:
         """Return the predicted pose of the tip as a TRANSFORM message."""
         return self._pose(TIP_EXPECTED, pose)
 
-    def _pose(self, device: str, pose: Pose) -> bytes:
+    def _pose(self, device: str, pose: EntryPose) -> bytes:
         matrix = self._registration.pose_to_image(pose.position, pose.turn)
         message = TransformMessage(matrix, timestamp=_seconds(pose.stamp), device_name=device)
         return bytes(message.pack())

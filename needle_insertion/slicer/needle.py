@@ -47,7 +47,7 @@ class Shape(NamedTuple):
     source: str
 
 
-class Pose(NamedTuple):
+class EntryPose(NamedTuple):
     """
     Pose in ``needle_entry``.
 
@@ -73,13 +73,13 @@ class NeedleView:
 
     Attributes
     ----------
-    expected : Pose or None
+    expected : EntryPose or None
         Last prediction of the tip.
 
     """
 
     def __init__(self) -> None:
-        self.expected: Pose | None = None
+        self.expected: EntryPose | None = None
         self._shape: tuple[float, Shape] | None = None
         self._tip: tuple[float, int, FloatArray] | None = None
         self._guide: tuple[float, FloatArray] | None = None
@@ -105,7 +105,7 @@ class NeedleView:
 
     def take_expected(self, stamp: int, position: ArrayLike, turn: ArrayLike) -> None:
         """Store a prediction of the tip pose; `MessageError` if it is invalid."""
-        self.expected = Pose(stamp, _places(position), _turn(turn))
+        self.expected = EntryPose(stamp, _places(position), _turn(turn))
 
     def shape(self, now: float) -> Shape | None:
         """

@@ -10,14 +10,14 @@ from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
-from needle_insertion.slicer.link import Link
+from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
 from needle_insertion.slicer.settings import LinkSettings, TargetSettings
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.publishers_node import request_stamp
 from needle_ros.run_node import run
 from needle_ros.status import PendingRequest, RequestStatus
@@ -74,8 +74,8 @@ class SlicerNode(BaseNode):
         self.declare_settings('', LinkSettings())
         self.declare_settings('', TargetSettings())
         self.declare_settings('registration.', Registration())
-        self._link: Link | None = None
-        self._journal, self._view = Journal(), NeedleView()
+        self._link: Connection | None = None
+        self._journal, self._view = EventLog(), NeedleView()
         self._interpreter: Interpreter | None = None
         self._greeted = ''
         self._shapes = self._targets = 0
@@ -111,7 +111,7 @@ class SlicerNode(BaseNode):
 
         registration = self.settings('registration.', Registration)
         self._interpreter = Interpreter(registration, self.settings('', TargetSettings).reach)
-        self._link = Link(self.settings('', LinkSettings), is_wanted, self._journal)
+        self._link = Connection(self.settings('', LinkSettings), is_wanted, self._journal)
 
     def cleanup(self) -> None:
         """Discard the connection."""
@@ -280,7 +280,7 @@ class SlicerNode(BaseNode):
         turn.x, turn.y, turn.z, turn.w = shape.turn.tolist()
         self._tip_pose.publish(message)
 
-    def _tell_shape(self, link: Link, interpreter: Interpreter, shape: Shape) -> None:
+    def _tell_shape(self, link: Connection, interpreter: Interpreter, shape: Shape) -> None:
         if not link.peer:
             return
         points, header = interpreter.shape(shape, self._shapes)
@@ -289,7 +289,7 @@ class SlicerNode(BaseNode):
             self._rate.add(self._steady_ns())
         link.send(interpreter.tip(shape))
 
-    def _tell_state(self, link: Link, interpreter: Interpreter, now: float) -> None:
+    def _tell_state(self, link: Connection, interpreter: Interpreter, now: float) -> None:
         self._said = {
             name: said for name, said in self._said.items() if now - said[0] < _FORGOTTEN
         }

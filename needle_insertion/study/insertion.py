@@ -31,8 +31,8 @@ from needle_dynamics import (
     PRESETS,
     simulate_batch,
 )
-from needle_insertion.study.protocol import Figure, Quantity, Seen
 from needle_insertion.study.reading import check_names, mapping, one_of
+from needle_insertion.study.scenario import MeasuredRun, Metric, Variable
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
@@ -60,17 +60,17 @@ _AT_ONCE: Final = 16
 #: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
 
-FIGURES: Final[Mapping[str, Figure]] = {
-    'error': Figure('m', 'distance of the needle from the target depth at the end'),
-    'hit': Figure('', 'the needle ends within the tolerance of the target depth'),
-    'overshoot': Figure('m', 'largest overshoot of the target depth'),
-    'following': Figure('m', 'root mean square of the tracking error'),
-    'force': Figure('N', 'largest force'),
-    'deflection': Figure('m', 'largest tip deflection'),
-    'rest': Figure('s', 'time until the needle remains at rest'),
-    'reversals': Figure('1', 'reversals of the velocity after the end of the reference'),
-    'stopped': Figure('', 'the guard stopped the needle'),
-    'left': Figure('', 'the needle left its range of depths'),
+FIGURES: Final[Mapping[str, Metric]] = {
+    'error': Metric('m', 'distance of the needle from the target depth at the end'),
+    'hit': Metric('', 'the needle ends within the tolerance of the target depth'),
+    'overshoot': Metric('m', 'largest overshoot of the target depth'),
+    'following': Metric('m', 'root mean square of the tracking error'),
+    'force': Metric('N', 'largest force'),
+    'deflection': Metric('m', 'largest tip deflection'),
+    'rest': Metric('s', 'time until the needle remains at rest'),
+    'reversals': Metric('1', 'reversals of the velocity after the end of the reference'),
+    'stopped': Metric('', 'the guard stopped the needle'),
+    'left': Metric('', 'the needle left its range of depths'),
 }
 
 
@@ -203,26 +203,26 @@ class InsertionProtocol:
                 f'{samples:.3g}: see rate, wait, speed and push'
             )
         deepest, most = p.length, NeedleModel(p).modes.reach * p.length
-        self.quantities: Mapping[str, Quantity] = {
-            'target': Quantity(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
-            'depth': Quantity(
+        self.quantities: Mapping[str, Variable] = {
+            'target': Variable(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
+            'depth': Variable(
                 max(0.1 * p.length, p.minimum_depth), 'm', 'insertion depth at the start',
                 p.minimum_depth, deepest,
             ),
-            'tip': Quantity(0.0, 'm', 'tip deflection at the start', -most, most),
-            'coulomb_friction': Quantity(1.0, '1', 'mu_s over its nominal value', 0.0, 1e3),
-            'viscous_friction': Quantity(1.0, '1', 'mu_v over its nominal value', 0.0, 1e3),
-            'carriage_mass': Quantity(
+            'tip': Variable(0.0, 'm', 'tip deflection at the start', -most, most),
+            'coulomb_friction': Variable(1.0, '1', 'mu_s over its nominal value', 0.0, 1e3),
+            'viscous_friction': Variable(1.0, '1', 'mu_v over its nominal value', 0.0, 1e3),
+            'carriage_mass': Variable(
                 p.carriage_mass, 'kg', 'mass moved along with the needle', 0.0, 1e3
             ),
-            'tissue_stiffness': Quantity(1.0, '1', 'k_a over its nominal value', 0.0, 1e3),
-            'tissue_damping': Quantity(1.0, '1', 'c_a over its nominal value', 0.0, 1e3),
-            'depth_noise': Quantity(0.0, 'm', 'standard deviation of a measured depth', 0.0),
-            'speed_noise': Quantity(0.0, 'm/s', 'standard deviation of a measured velocity', 0.0),
-            'force_noise': Quantity(
+            'tissue_stiffness': Variable(1.0, '1', 'k_a over its nominal value', 0.0, 1e3),
+            'tissue_damping': Variable(1.0, '1', 'c_a over its nominal value', 0.0, 1e3),
+            'depth_noise': Variable(0.0, 'm', 'standard deviation of a measured depth', 0.0),
+            'speed_noise': Variable(0.0, 'm/s', 'standard deviation of a measured velocity', 0.0),
+            'force_noise': Variable(
                 0.0, 'N', 'standard deviation of the additional force on the needle', 0.0
             ),
-            'late': Quantity(
+            'late': Variable(
                 0.0, 'periods', 'delay that is not in the model of the law, to whole periods',
                 0.0, 100.0,
             ),
@@ -280,10 +280,12 @@ class InsertionProtocol:
         ]
         return {name: np.array([one[name] for one in found]) for name in FIGURES}
 
-    def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
         """Yield joints, tip and commands at each sample up to a stop, and the target."""
         ((row, course),) = self._courses([self._row(drawn)], [rng])
-        yield Seen(contract.TARGET, 0, (0.0, row['target'], 0.0))
+        yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
         m = course.model.coordinates
         depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
         # The effort acted up to the sample.
@@ -291,12 +293,12 @@ class InsertionProtocol:
         for k, (state, tip) in enumerate(zip(course.states, course.tip, strict=True)):
             stamp = round(k * self._period * NANOSECONDS)
             joints = (depths[k], state[1], speeds[k], state[m + 1], acted[k], 0.0)
-            yield Seen(contract.JOINT_STATES, stamp, [float(value) for value in joints])
+            yield MeasuredRun(contract.JOINT_STATES, stamp, [float(value) for value in joints])
             at = (0.0, float(course.depth[k]), float(tip))
-            yield Seen(contract.TIP_DEFLECTION, stamp, at)
+            yield MeasuredRun(contract.TIP_DEFLECTION, stamp, at)
             if k < len(course.commands):
                 force = (0.0, float(course.commands[k]), 0.0)
-                yield Seen(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
+                yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
 
     def _row(self, drawn: Mapping[str, float]) -> dict[str, float]:
         return {name: drawn.get(name, one.default) for name, one in self.quantities.items()}

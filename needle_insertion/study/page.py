@@ -9,10 +9,10 @@ from typing import Final
 
 from matplotlib.figure import Figure as Drawing
 from needle_dynamics import FloatArray
-from needle_insertion.report.content import Grid, Picture, Section
+from needle_insertion.report.content import Grid, Picture, ReportSection
 from needle_insertion.report.page import write_page
 from needle_insertion.study.engine import Results
-from needle_insertion.study.protocol import Figure
+from needle_insertion.study.scenario import Metric
 from needle_insertion.study.study import Study
 from needle_insertion.study.summary import (
     batches,
@@ -76,7 +76,7 @@ def write(results: Results, path: Path) -> None:
     units[main] = figures[main].unit
     limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
     sections = [
-        Section(
+        ReportSection(
             title='Probabilities',
             paragraphs=('95 % intervals by the method of Wilson.', _MISSING),
             tables=(
@@ -92,7 +92,7 @@ def write(results: Results, path: Path) -> None:
             ),
             pictures=(),
         ),
-        Section(
+        ReportSection(
             title='Quantiles',
             paragraphs=('With distribution-free 95 % intervals.', _MISSING, *limited),
             tables=(
@@ -107,7 +107,7 @@ def write(results: Results, path: Path) -> None:
     ]  # fmt: skip
     if drawn:
         sections.append(
-            Section(
+            ReportSection(
                 title='Sensitivity',
                 paragraphs=(
                     f'Fraction of the variance of {main} explained by each variable alone.',
@@ -131,7 +131,7 @@ def write(results: Results, path: Path) -> None:
             )
         )  # fmt: skip
     sections.append(
-        Section(
+        ReportSection(
             title='Worst samples',
             paragraphs=('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
             tables=(
@@ -204,7 +204,7 @@ def _share(part: float) -> str:
     return f'{part:.1%}' if isfinite(part) else 'too few samples'
 
 
-def _distribution(name: str, figure: Figure, values: FloatArray) -> Picture:
+def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
     drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
     axes = drawing.subplots()
     seen = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
@@ -228,7 +228,7 @@ def _dashed() -> str:
 
 
 def _map(
-    name: str, figure: Figure, values: FloatArray, over: dict[str, FloatArray], study: Study
+    name: str, figure: Metric, values: FloatArray, over: dict[str, FloatArray], study: Study
 ) -> tuple[Picture, ...]:
     """Draw the median of a metric over two variables, if both vary."""
     if len(over) < 2:

@@ -10,13 +10,13 @@ from typing import Any, Final
 
 from needle_controller import (
     OutOfReachError,
-    SteeringBelief,
     SteeringController,
     SteeringModel,
+    SteeringPrior,
 )
 from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
-from needle_controller.steering.controller import Guidance, SteeringFaultError
-from needle_controller.steering.trial import insert, Truth
+from needle_controller.steering.controller import GuideSetpoint, SteeringFaultError
+from needle_controller.steering.simulation import GroundTruth, insert
 from needle_dynamics import (
     FloatArray,
     insert_batch,
@@ -26,8 +26,8 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import with_lengths
-from needle_insertion.study.protocol import Figure, Quantity, Seen
 from needle_insertion.study.reading import check_names, mapping, one_of
+from needle_insertion.study.scenario import MeasuredRun, Metric, Variable
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
@@ -66,20 +66,20 @@ _TOGETHER: Final = 256
 #: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'belief', 'controller')
 
-FIGURES: Final[Mapping[str, Figure]] = {
-    'miss': Figure('m', 'distance of the tip from the target at the end'),
-    'hit': Figure('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
-    'tip_x': Figure('m', 'final tip position, in the frame of the sensor'),
-    'tip_z': Figure('m', 'final tip position, in the frame of the sensor'),
-    'way': Figure('m', 'distance traveled by the guide'),
-    'turns': Figure('1', 'number of needle rotations'),
-    'load': Figure('N', 'largest lateral force on the guide after its motions'),
-    'refused': Figure('', 'the target was rejected as outside the reachable set'),
-    'stopped': Figure('', 'the controller stopped before the target depth'),
-    'warned': Figure('', 'a warning before the target depth: target outside the reachable set'),
-    'said_x': Figure('m', 'expected final tip position of the controller'),
-    'said_z': Figure('m', 'expected final tip position of the controller'),
-    'held': Figure('', 'the tip is in the 95 % ellipse of the controller'),
+FIGURES: Final[Mapping[str, Metric]] = {
+    'miss': Metric('m', 'distance of the tip from the target at the end'),
+    'hit': Metric('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
+    'tip_x': Metric('m', 'final tip position, in the frame of the sensor'),
+    'tip_z': Metric('m', 'final tip position, in the frame of the sensor'),
+    'way': Metric('m', 'distance traveled by the guide'),
+    'turns': Metric('1', 'number of needle rotations'),
+    'load': Metric('N', 'largest lateral force on the guide after its motions'),
+    'refused': Metric('', 'the target was rejected as outside the reachable set'),
+    'stopped': Metric('', 'the controller stopped before the target depth'),
+    'warned': Metric('', 'a warning before the target depth: target outside the reachable set'),
+    'said_x': Metric('m', 'expected final tip position of the controller'),
+    'said_z': Metric('m', 'expected final tip position of the controller'),
+    'held': Metric('', 'the tip is in the 95 % ellipse of the controller'),
 }
 
 
@@ -129,7 +129,7 @@ class SteeringProtocol:
         self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
         self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
         belief = mapping('settings: belief', settings.get('belief'))
-        self._belief = from_values(SteeringBelief, belief, 'settings.belief.')
+        self._belief = from_values(SteeringPrior, belief, 'settings.belief.')
         reach = self._needle.length - self._steering.free_length
         if numbers.depth > reach:
             raise ParameterError(
@@ -150,24 +150,24 @@ class SteeringProtocol:
         self._depths = np.linspace(0.0, numbers.depth, steps + 1)
         bevel = max(self._steering.bevel_load)
         noise = self._belief.path_noise
-        self.quantities: Mapping[str, Quantity] = {
-            'target_x': Quantity(0.0, 'm', 'lateral position of the target'),
-            'target_z': Quantity(0.0, 'm', 'lateral position of the target'),
-            'bending_length': Quantity(1.0, '1', 'bending length over its nominal value', 0.1, 10),
-            'skin': Quantity(
+        self.quantities: Mapping[str, Variable] = {
+            'target_x': Variable(0.0, 'm', 'lateral position of the target'),
+            'target_z': Variable(0.0, 'm', 'lateral position of the target'),
+            'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
+            'skin': Variable(
                 1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
             ),
-            'tilt_x': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
-            'tilt_z': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
-            'bevel_x': Quantity(0.0, 'N', 'load of the bevel', -1e3, 1e3),
-            'bevel_z': Quantity(bevel, 'N', 'load of the bevel', -1e3, 1e3),
-            'frame_x': Quantity(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
-            'frame_z': Quantity(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
-            'path_noise': Quantity(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
-            'look_noise': Quantity(
+            'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'bevel_x': Variable(0.0, 'N', 'load of the bevel', -1e3, 1e3),
+            'bevel_z': Variable(bevel, 'N', 'load of the bevel', -1e3, 1e3),
+            'frame_x': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
+            'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
+            'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
+            'look_noise': Variable(
                 self._belief.noise, 'm', 'standard deviation of a tip measurement', 0.0
             ),
-            'lost': Quantity(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
+            'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
         }
 
     @cached_property
@@ -217,7 +217,7 @@ class SteeringProtocol:
             for name, value in self._steered(truth, row, rng).items():
                 found[name][k] = value
 
-    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> Truth:
+    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
         needle, steering = with_lengths(
             self._needle, self._steering, row['bending_length'], row['skin']
         )
@@ -228,7 +228,7 @@ class SteeringProtocol:
             path_noise=row['path_noise'],
             path_noise_length=self._belief.path_noise_length,
         )
-        return Truth(
+        return GroundTruth(
             needle=needle,
             steering=steering,
             tilt=(row['tilt_x'], row['tilt_z']),
@@ -237,7 +237,7 @@ class SteeringProtocol:
             seed=int(rng.integers(_SEEDS)),
         )
 
-    def _open(self, truths: Sequence[Truth], found: Mapping[str, FloatArray]) -> None:
+    def _open(self, truths: Sequence[GroundTruth], found: Mapping[str, FloatArray]) -> None:
         """Simulate all insertions with a guide at rest in one batch."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
@@ -256,25 +256,31 @@ class SteeringProtocol:
         for name in ('way', 'turns'):
             found[name][:] = 0.0
 
-    def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
         tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
-        still, seen = [0.0] * len(_JOINTS.joints), list[Seen]()
+        still, seen = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
         def watch(one: SteeredNeedle) -> None:
             stamp = round(one.depth / _SPEED * NANOSECONDS)
-            seen.append(Seen(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still)))
+            seen.append(
+                MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
+            )
             x, z = (one.tip[[0, 2]] + np.array(frame) * one.depth).tolist()
-            seen.append(Seen(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
+            seen.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
 
         self._steered(self._truth(row, rng), row, rng, watch)
-        yield Seen(contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z']))
+        yield MeasuredRun(
+            contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z'])
+        )
         yield from seen
 
     def _steered(
         self,
-        truth: Truth,
+        truth: GroundTruth,
         row: Mapping[str, float],
         rng: np.random.Generator,
         watch: Callable[[SteeredNeedle], object] | None = None,
@@ -290,7 +296,7 @@ class SteeringProtocol:
             noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
             return None if lost else np.asarray(tip + row['look_noise'] * noise)
 
-        def follow(tip: FloatArray | None) -> Guidance:
+        def follow(tip: FloatArray | None) -> GuideSetpoint:
             to = controller.next(tip)
             if isinstance(controller, SteeringController) and controller.step < len(self._depths):
                 said.append(controller.warning)

@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from needle_dynamics import FloatArray
 from needle_insertion.study.distribution import Distribution, distribution
-from needle_insertion.study.protocol import Protocol, PROTOCOLS
 from needle_insertion.study.reading import check_names, mapping, one_of
+from needle_insertion.study.scenario import PROTOCOLS, Scenario
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -42,7 +42,7 @@ _BELOW: Final = 1.0 - 2.0**-53
 class Study:
     """A study, as read from a file."""
 
-    protocol: Protocol
+    protocol: Scenario
     samples: int
     seed: int
     #: One of `DESIGNS`.

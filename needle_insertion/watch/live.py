@@ -9,7 +9,7 @@ import json
 from time import monotonic
 from typing import Any, Final
 
-from needle_insertion.watch.recorded import Playback, Recording
+from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.view import RATE, row, SPAN, View
 from needle_ros.errors import ParameterError
 
@@ -107,16 +107,16 @@ class RecordedReader:
 
     Parameters
     ----------
-    recording : Recording
+    recording : ShownRecording
         Recording.
     losses : sequence of str
         Descriptions of unreadable parts.
 
     """
 
-    def __init__(self, recording: Recording, losses: Sequence[str] = ()) -> None:
+    def __init__(self, recording: ShownRecording, losses: Sequence[str] = ()) -> None:
         self._recording = recording
-        self._playback = Playback(recording.duration)
+        self._playback = PagePlayback(recording.duration)
         self._setting = {
             'control': False,
             'recording': {
@@ -156,6 +156,6 @@ class RecordedReader:
         return _json(content)
 
     def take(self, message: dict[str, Any]) -> None:
-        """Process a playback message; see `Playback.take`."""
+        """Process a playback message; see `PagePlayback.take`."""
         self._jumped |= self._playback.take(message)
         self._asked.set()

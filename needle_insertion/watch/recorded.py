@@ -13,13 +13,13 @@ from needle_dynamics import FloatArray
 from needle_identification import Bag, RecordingError
 from needle_identification.bags.bag import Recorded
 from needle_identification.bags.messages import deserialize
-from needle_identification.bags.topics import Topic
+from needle_identification.bags.topics import BagTopic
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import RATE, row, SPAN, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import read_line, read_string, Reader, Reading
+from needle_ros.wire import MessageReader, read_line, read_string, Reading
 
 #: Topics shown on the page; each also in a namespace.
 STREAMS: Final = (
@@ -69,7 +69,7 @@ class _Kept(Generic[_Item]):
         return (self._times[k], self._items[k]) if k >= 0 else None
 
 
-class Recording:
+class ShownRecording:
     """
     Content of a bag for the page, by time from its start.
 
@@ -104,7 +104,7 @@ class Recording:
         self._nodes: dict[str, _Kept[Any]] = {}
         self._period = period
         self._invalid = 0
-        self._readers = {topic.name: Reader(topic.type_name) for topic in STREAMS}
+        self._readers = {topic.name: MessageReader(topic.type_name) for topic in STREAMS}
 
         bag = Bag(path)
         there = bag.topics()
@@ -188,7 +188,7 @@ class Recording:
         return rows
 
 
-class Playback:
+class PagePlayback:
     """
     Playback of a recording for one reader.
 
@@ -253,9 +253,9 @@ class Playback:
         return self._at != now
 
 
-def _chosen(there: tuple[Topic, ...]) -> dict[Topic, str]:
+def _chosen(there: tuple[BagTopic, ...]) -> dict[BagTopic, str]:
     """Return the topics to read, by contract name or, for configurations, by node name."""
-    chosen: dict[Topic, str] = {}
+    chosen: dict[BagTopic, str] = {}
     for topic in sorted(there, key=lambda one: len(one.name), reverse=True):
         space, _, last = topic.name.rpartition('/')
         for known in (*STREAMS, *_OTHERS):

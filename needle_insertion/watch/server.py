@@ -69,7 +69,7 @@ _HEADERS: Final = {
 }
 
 
-class Reader(Protocol):
+class FrameReader(Protocol):
     """Interface of the source of frames for one reader of the page."""
 
     async def next(self) -> str:
@@ -122,7 +122,7 @@ class Server:
 
     def __init__(
         self,
-        readers: Callable[[], Reader],
+        readers: Callable[[], FrameReader],
         host: str = '127.0.0.1',
         port: int = PORT,
         control: Control | None = None,
@@ -302,7 +302,7 @@ class _Connection:
     skips frames, receives no outdated frames, and nothing accumulates.
     """
 
-    def __init__(self, socket: web.WebSocketResponse, reader: Reader) -> None:
+    def __init__(self, socket: web.WebSocketResponse, reader: FrameReader) -> None:
         self.reader = reader
         self.asking: set[asyncio.Task[None]] = set()
         self._socket = socket

@@ -21,7 +21,7 @@ from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError
 from needle_ros.network import domain_of, stay_local
-from needle_ros.wire import read_line, read_string, Reader
+from needle_ros.wire import MessageReader, read_line, read_string
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
@@ -67,7 +67,7 @@ class WatchNode(Node):
         self._view = view
         self._takers: list[tuple[Callable[[], Iterator[Any]], Callable[[Any, float], None]]] = []
         for topic in STREAMS:
-            read = Reader(topic.type_name).read
+            read = MessageReader(topic.type_name).read
 
             def take(data: bytes, now: float, name: str = topic.name, read: Any = read) -> None:
                 view.reading(name, read(data), now)

@@ -7,7 +7,7 @@ import os
 from typing import Any
 
 from benchmarks import bounds, calibration
-from benchmarks.calibration import Found
+from benchmarks.calibration import CalibrationResult
 from needle_dynamics import (
     ForceSensor,
     ForceSensorParameters,
@@ -23,12 +23,12 @@ from scipy.linalg import toeplitz
 
 
 @pytest.fixture(scope='module')
-def friction() -> list[list[Found]]:
+def friction() -> list[list[CalibrationResult]]:
     return [calibration.friction(1, number) for number in range(2)]
 
 
 @pytest.fixture(scope='module')
-def stiffness() -> list[Found]:
+def stiffness() -> list[CalibrationResult]:
     return calibration.stiffness(1, 0)
 
 
@@ -41,8 +41,8 @@ def found(
     bound: float = 1.0,
     unit: str = 'N',
     case: str = 'a',
-) -> Found:
-    return Found(case, 'x', unit, truth, bound, value, 0.5, low, high)
+) -> CalibrationResult:
+    return CalibrationResult(case, 'x', unit, truth, bound, value, 0.5, low, high)
 
 
 def test_reading_noise_equals_sensor_noise() -> None:
@@ -98,13 +98,13 @@ def test_stiffness_bound_is_invariant_to_rotation() -> None:
         assert one[name][1] == pytest.approx(other[name][1], rel=1e-5)
 
 
-def test_study_is_reproducible_for_seed(friction: list[list[Found]]) -> None:
+def test_study_is_reproducible_for_seed(friction: list[list[CalibrationResult]]) -> None:
     again = np.array([one[3:] for one in calibration.friction(1, 0)])
     assert np.array_equal(again, np.array([one[3:] for one in friction[0]]), equal_nan=True)
     assert friction[0][0].truth != friction[1][0].truth
 
 
-def test_every_case_reports_its_parameters(friction: list[list[Found]]) -> None:
+def test_every_case_reports_its_parameters(friction: list[list[CalibrationResult]]) -> None:
     by_case: dict[str, set[str]] = {}
     for one in friction[0]:
         by_case.setdefault(one.case, set()).add(one.name)
@@ -129,7 +129,7 @@ def test_every_case_reports_its_parameters(friction: list[list[Found]]) -> None:
 
 
 def test_estimates_are_near_ground_truth(
-    friction: list[list[Found]], stiffness: list[Found]
+    friction: list[list[CalibrationResult]], stiffness: list[CalibrationResult]
 ) -> None:
     for one in (*friction[0], *friction[1], *stiffness):
         # No error of a few hundred estimates exceeds four times the 95 % half width.
@@ -137,7 +137,7 @@ def test_estimates_are_near_ground_truth(
             assert abs(one.value - one.truth) < 2.0 * (one.high - one.low), one
 
 
-def test_stiffness_is_reported_by_estimator_and_level(stiffness: list[Found]) -> None:
+def test_stiffness_is_reported_by_estimator_and_level(stiffness: list[CalibrationResult]) -> None:
     cases = {one.case for one in stiffness}
     assert cases == {'K, ordinary', 'K, weighted', 'K, huber', 'K, total'}
     assert sum(one.name == 'k_zz' for one in stiffness) == 4 * 5
@@ -170,7 +170,7 @@ def test_directions_180_degrees_apart_are_equal() -> None:
     assert row.bias == pytest.approx(pi - 3.1)
 
 
-def test_results_are_independent_of_process_count(friction: list[list[Found]]) -> None:
+def test_results_are_independent_of_process_count(friction: list[list[CalibrationResult]]) -> None:
     pairs = list(calibration.studied(calibration.friction, 2, 1, 1))
     assert pairs[1][0] == friction[1][0]
     # Any importable function of seed and number.
@@ -182,7 +182,7 @@ def test_results_are_independent_of_process_count(friction: list[list[Found]]) -
 def test_bars_apply_to_default_cases_with_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, 'cpu_count', lambda: 1)
 
-    def study(seed: int, number: int) -> list[Found]:
+    def study(seed: int, number: int) -> list[CalibrationResult]:
         return [
             found(1.5, 0.5, 2.5 + seed + number, case='(15)'),
             found(1.5, 1.4, 1.6, case='K, ordinary', bound=nan),

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks import batches, rods, solvers, step
 from benchmarks.measure import least_times, NOT_INSTALLED
-from benchmarks.solvers import OpenLoop
+from benchmarks.solvers import OpenLoopCase
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 import numba
 import numpy as np
@@ -21,8 +21,8 @@ FORCE = 3.0
 
 
 @pytest.fixture(scope='module')
-def open_loop() -> OpenLoop:
-    return solvers.OpenLoop()
+def open_loop() -> OpenLoopCase:
+    return solvers.OpenLoopCase()
 
 
 def states() -> Iterator[FloatArray]:
@@ -62,7 +62,7 @@ def test_force_below_friction_causes_no_motion_in_any_solver() -> None:
         assert_allclose(right_hand_side(0.0, state), np.zeros(8), atol=1e-15)
 
 
-def test_run_error_is_relative_tip_error(open_loop: OpenLoop) -> None:
+def test_run_error_is_relative_tip_error(open_loop: OpenLoopCase) -> None:
     run = open_loop.solve('DOP853', 1e-8, 1e-12, open_loop.right_hand_side)
     assert open_loop.error(run.t, run.y) < 1e-6
     wrong = run.y.copy()
@@ -72,7 +72,7 @@ def test_run_error_is_relative_tip_error(open_loop: OpenLoop) -> None:
     assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
 
 
-def test_right_hand_side_accepts_states_outside_range(open_loop: OpenLoop) -> None:
+def test_right_hand_side_accepts_states_outside_range(open_loop: OpenLoopCase) -> None:
     beyond = open_loop.start.copy()
     for remaining in (-1.0, 0.3, np.nan):
         beyond[0] = remaining
@@ -80,7 +80,7 @@ def test_right_hand_side_accepts_states_outside_range(open_loop: OpenLoop) -> No
 
 
 def test_integrator_meets_accuracy_of_timing(
-    open_loop: OpenLoop, monkeypatch: pytest.MonkeyPatch
+    open_loop: OpenLoopCase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A coarser grid of run times is sufficient.
     monkeypatch.setattr(solvers, '_GRID', 8.0 * solvers._GRID)
@@ -89,7 +89,7 @@ def test_integrator_meets_accuracy_of_timing(
     assert 0 < ours.evaluations < open_loop.steps(2e-5, graded=False)
 
 
-def test_steps_are_counted(open_loop: OpenLoop) -> None:
+def test_steps_are_counted(open_loop: OpenLoopCase) -> None:
     assert open_loop.steps(solvers.DURATION / 300, graded=False) == 300
 
 

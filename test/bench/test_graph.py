@@ -8,9 +8,9 @@ from benchmarks import endurance
 from benchmarks import graph as bench_graph
 from benchmarks import pairs as bench_pairs
 from benchmarks.bare import PERIOD, STREAMS
-from benchmarks.graph import Plan
+from benchmarks.graph import GraphPlan
 from benchmarks.measure import Bar
-from benchmarks.page import Section
+from benchmarks.page import PageSection
 from benchmarks.pairs import Figures, PAIRS
 from needle_identification import BagWriter, encode, message_type
 import numpy as np
@@ -20,8 +20,8 @@ import pytest
 @pytest.fixture(scope='module')
 def found(
     tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Plan, list[str], dict[str, list[dict[str, float]]]]:
-    plan = Plan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
+) -> tuple[GraphPlan, list[str], dict[str, list[dict[str, float]]]]:
+    plan = GraphPlan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
     told: list[str] = []
     folder = tmp_path_factory.mktemp('graph')
     with pytest.MonkeyPatch.context() as patch:
@@ -32,7 +32,7 @@ def found(
 
 
 def test_every_node_pair_has_all_metrics(
-    found: tuple[Plan, list[str], dict[str, list[dict[str, float]]]],
+    found: tuple[GraphPlan, list[str], dict[str, list[dict[str, float]]]],
 ) -> None:
     plan, told, pairs = found
     assert tuple(pairs) == PAIRS
@@ -105,10 +105,10 @@ def test_ratio_is_median_over_rounds() -> None:
 
 
 def test_report_has_all_sections(
-    found: tuple[Plan, list[str], dict[str, list[Figures]]], monkeypatch: pytest.MonkeyPatch
+    found: tuple[GraphPlan, list[str], dict[str, list[Figures]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = [
-        ([Section(name, (), [])], [Bar(name, 1.0, limit)])
+        ([PageSection(name, (), [])], [Bar(name, 1.0, limit)])
         for name, limit in (('recorder', 0.0), ('memory', 2.0))
     ]
     monkeypatch.setattr(bench_graph, 'compare_pairs', lambda *_: found[2])

@@ -1,7 +1,7 @@
 """Study of the control laws: evaluation of runs; its metrics are not tested here."""
 
 from benchmarks import laws as study_of_laws
-from benchmarks.laws import Cell, compare, laws, situations, study
+from benchmarks.laws import compare, LawCell, laws, situations, study
 from needle_controller import LAWS, LoopBatch
 from needle_dynamics import ParameterError
 import numpy as np
@@ -26,14 +26,14 @@ def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
 
 def test_limit_cycle_creep_and_lost_needle_are_distinguished() -> None:
     goal, time = np.zeros(1001), np.arange(1001)
-    moving = Cell.of(batch(list(2e-5 * np.sin(0.05 * time))), goal, 1.0)
+    moving = LawCell.of(batch(list(2e-5 * np.sin(0.05 * time))), goal, 1.0)
     assert (moving.cycles, moving.lost) == (1, 0)
     assert str(moving) == '**1 cycle**'
-    creeping = Cell.of(batch(list(1e-4 * np.exp(-0.005 * time))), goal, 1.0)
+    creeping = LawCell.of(batch(list(1e-4 * np.exp(-0.005 * time))), goal, 1.0)
     assert (creeping.cycles, creeping.lost) == (0, 0)
     assert creeping.beyond[0] == 1e-4
-    assert Cell.of(batch([0.0] * 1001, completed=10), goal, 1.0).lost == 1
-    assert Cell.of(batch([6e-3] * 1001), goal, 1.0).lost == 1
+    assert LawCell.of(batch([0.0] * 1001, completed=10), goal, 1.0).lost == 1
+    assert LawCell.of(batch([6e-3] * 1001), goal, 1.0).lost == 1
 
 
 def test_every_scenario_ends_at_rest_within_20_mm() -> None:

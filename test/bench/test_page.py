@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks import measure, page, run
 from benchmarks.measure import Bar, NOT_INSTALLED
-from benchmarks.page import Answer, Section, Tick
+from benchmarks.page import Answer, PageSection, Tick
 from needle_insertion.cli import main
 import numpy as np
 from numpy.testing import assert_allclose
@@ -53,7 +53,7 @@ def test_last_line_is_verdict(
 ) -> None:
     def question(tick: Tick) -> Answer:
         tick('a stage')
-        return [Section('A table', ('a', 'b'), [('1', '22')], 'A note.')], bars
+        return [PageSection('A table', ('a', 'b'), [('1', '22')], 'A note.')], bars
 
     text, found = run.ask('x', 'needle bench x', [question])
     assert found == missed

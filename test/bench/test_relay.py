@@ -3,33 +3,33 @@
 from pathlib import Path
 from typing import Any
 
-from benchmarks.relay import choose, Fault, insert, Link, LINKS, Relay
+from benchmarks.relay import choose, insert, LINKS, MessageFault, Relay, TopicLink
 from needle_ros import contract
 import numpy as np
 import pytest
 
-MOTION = Link('steering', 'controller', contract.JOINT_TRAJECTORY)
-GUIDE = Link('steering', 'plant', contract.JOINT_TRAJECTORY)
-WISH = Link('user', 'steering', contract.TARGET)
-ANSWER = Link('steering', 'user', contract.DIAGNOSTICS)
-COMMAND = Link('controller', 'plant', contract.WRENCH_COMMAND)
+MOTION = TopicLink('steering', 'controller', contract.JOINT_TRAJECTORY)
+GUIDE = TopicLink('steering', 'plant', contract.JOINT_TRAJECTORY)
+WISH = TopicLink('user', 'steering', contract.TARGET)
+ANSWER = TopicLink('steering', 'user', contract.DIAGNOSTICS)
+COMMAND = TopicLink('controller', 'plant', contract.WRENCH_COMMAND)
 
 
 @pytest.mark.parametrize(
     ('fault', 'continuous'),
     [
-        (Fault(MOTION, 2, 'drop', 0.0), False),
-        (Fault(MOTION, 1, 'drop', 0.0), True),
-        (Fault(GUIDE, 1, 'drop', 0.0), False),
-        (Fault(MOTION, 2, 'delay', 0.95), False),
-        (Fault(MOTION, 3, 'duplicate', 0.9), False),
-        (Fault(WISH, 1, 'drop', 0.0), False),
-        (Fault(ANSWER, 1, 'drop', 0.0), True),
-        (Fault(COMMAND, 20, 'drop', 0.0), False),
+        (MessageFault(MOTION, 2, 'drop', 0.0), False),
+        (MessageFault(MOTION, 1, 'drop', 0.0), True),
+        (MessageFault(GUIDE, 1, 'drop', 0.0), False),
+        (MessageFault(MOTION, 2, 'delay', 0.95), False),
+        (MessageFault(MOTION, 3, 'duplicate', 0.9), False),
+        (MessageFault(WISH, 1, 'drop', 0.0), False),
+        (MessageFault(ANSWER, 1, 'drop', 0.0), True),
+        (MessageFault(COMMAND, 20, 'drop', 0.0), False),
     ],
 )
 def test_insertion_with_message_fault_reaches_target(
-    tmp_path: Path, fault: Fault, continuous: bool
+    tmp_path: Path, fault: MessageFault, continuous: bool
 ) -> None:
     outcome = insert(fault, tmp_path, continuous=continuous)
     assert outcome.end == 'target', outcome.line
@@ -47,7 +47,7 @@ def test_random_faults_cover_all_links_and_messages() -> None:
     assert all(0.0 <= fault.delay <= 1.0 for fault in faults)
 
 
-def insert_counts() -> dict[Link, int]:
+def insert_counts() -> dict[TopicLink, int]:
     """Return a number of messages for each link."""
     return {link: 5 + k for k, link in enumerate(LINKS)}
 
@@ -56,7 +56,7 @@ def test_clock_continues_after_late_message(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An older clock message arrives while the plant waits for the answer to a newer sample."""
-    clock, before = Link('plant', 'controller', contract.CLOCK), []
+    clock, before = TopicLink('plant', 'controller', contract.CLOCK), []
     take = Relay._take
 
     def late(self: Relay, sinks: Any, data: bytes) -> None:

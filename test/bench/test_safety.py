@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from benchmarks import safety
-from benchmarks.safety import Cell, cells, measure
+from benchmarks.safety import cells, FaultCell, measure
 from needle_ros.errors import ParameterError
 import pytest
 
@@ -20,14 +20,14 @@ def test_cells_cover_faults_topics_and_moments() -> None:
 @pytest.mark.parametrize(
     ('cell', 'outcome'),
     [
-        (Cell('base_wrench', 'twice', 'moving'), 'borne'),
-        (Cell('joint_states', 'lost', 'moving'), 'no force'),
-        (Cell('joint_states', 'frozen, new stamps', 'moving'), 'no force'),
-        (Cell('tip_deflection', 'a number of 1e300', 'moving'), 'stop'),
-        (Cell('wrench_command', 'a second commander', 'moving'), 'no force'),
+        (FaultCell('base_wrench', 'twice', 'moving'), 'borne'),
+        (FaultCell('joint_states', 'lost', 'moving'), 'no force'),
+        (FaultCell('joint_states', 'frozen, new stamps', 'moving'), 'no force'),
+        (FaultCell('tip_deflection', 'a number of 1e300', 'moving'), 'stop'),
+        (FaultCell('wrench_command', 'a second commander', 'moving'), 'no force'),
     ],
 )
-def test_cell_outcome_is_measured(cell: Cell, outcome: str) -> None:
+def test_cell_outcome_is_measured(cell: FaultCell, outcome: str) -> None:
     """Outcome and recovery of the motion; reproducible."""
     found = measure(cell)
     assert found.outcome == outcome

@@ -8,7 +8,7 @@ from types import ModuleType
 from benchmarks import environments, run
 from benchmarks import study as bench_study
 from benchmarks.kills import again, written
-from benchmarks.study import Plan
+from benchmarks.study import StudyPlan
 from needle_insertion.cli import main
 import pytest
 import yaml
@@ -28,7 +28,7 @@ def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(SMALL))
     monkeypatch.setattr(bench_study, 'STUDY', file)
-    monkeypatch.setitem(bench_study.PLANS, 'quick', Plan(400, 100, 1, (10, 20, 40), 2, 3))
+    monkeypatch.setitem(bench_study.PLANS, 'quick', StudyPlan(400, 100, 1, (10, 20, 40), 2, 3))
     told: list[str] = []
     [rates, memory, tables], bars = bench_study.compare(told.append, 'quick')
     assert [row[0] for row in rates.rows] == list(bench_study.WAYS)

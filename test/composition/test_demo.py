@@ -16,25 +16,25 @@ from needle_insertion.experiment import demo
 from needle_insertion.experiment.demo import DemoError, run
 from needle_insertion.experiment.insertion import (
     COUNTED,
-    Insertion,
     insertion_checks,
+    RecordedInsertion,
     TARGET_DEPTH,
 )
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.truth import compare_friction, compare_stiffness, Comparison
+from needle_insertion.experiment.truth import compare_friction, compare_stiffness, TruthComparison
 import numpy as np
 import pytest
 
 
 def insertion(
     end: float = TARGET_DEPTH, peak: float = TARGET_DEPTH, lag: float = 0.0, complete: float = 1.0
-) -> Insertion:
+) -> RecordedInsertion:
     """Return a synthetic insertion."""
     time = np.linspace(0.0, 10.0, 1001)
     reference = np.linspace(0.02, TARGET_DEPTH, 1001)
     depth = reference - lag
     depth[-2:] = peak, end
-    return Insertion(
+    return RecordedInsertion(
         law='pid',
         depth=np.array([time, depth]),
         reference=np.array([time, reference]),
@@ -62,13 +62,13 @@ def test_insertion_checks_depth_overshoot_tracking_and_messages(
     assert [check.passed for check in insertion_checks(insertion(**changes))] == verdicts
 
 
-def comparison(value: float, symbol: str = 'k_zz', **changes: Any) -> Comparison:
+def comparison(value: float, symbol: str = 'k_zz', **changes: Any) -> TruthComparison:
     """Return a synthetic estimate: ground truth 100, half width of the interval 10."""
     estimate: dict[str, Any] = {
         'name': symbol, 'symbol': symbol, 'unit': 'N/m', 'value': value, 'error': 4.0,
         'interval': (value - 10.0, value + 10.0), 'determined': True,
     }  # fmt: skip
-    return Comparison(estimate=ParameterEstimate(**{**estimate, **changes}), truth=100.0)
+    return TruthComparison(estimate=ParameterEstimate(**{**estimate, **changes}), truth=100.0)
 
 
 @pytest.mark.parametrize(('missed', 'passed'), [(0, True), (4, True), (5, False), (20, False)])

@@ -29,7 +29,7 @@ from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
     DIRECTIONS,
-    Protocol,
+    ExperimentProtocol,
     PROTOCOLS,
     PUSH,
     SHIPPED_BAGS,
@@ -51,7 +51,7 @@ RATE, SPEED = 100.0, 10.0
 
 
 @pytest.mark.parametrize('protocol', PROTOCOLS.values(), ids=PROTOCOLS)
-def test_times_increase(protocol: Protocol) -> None:
+def test_times_increase(protocol: ExperimentProtocol) -> None:
     """Times of points are strictly increasing."""
     assert (np.diff([0.0, *(point.time for point in protocol.points)]) > 0.0).all()
 
@@ -193,7 +193,7 @@ def test_other_bags_are_not_overwritten(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(('protocol', 'rate'), [(FRICTION, 100.0), (STIFFNESS, 40.0)])
 def test_shipped_bags_match_the_command_that_records_them(
-    protocol: Protocol, rate: float, monkeypatch: pytest.MonkeyPatch
+    protocol: ExperimentProtocol, rate: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Parameters and trajectory are current: the command has nothing to record."""
     monkeypatch.delattr(recorder, 'rig')

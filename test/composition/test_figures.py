@@ -16,10 +16,10 @@ from needle_insertion.paper.runs import (
     LAWS,
     needle,
     open_loop,
-    Outcome,
     paper_law,
     PID_KP,
     READINGS,
+    RunOutcome,
 )
 from needle_insertion.report.content import png
 import numpy as np
@@ -43,7 +43,8 @@ def test_the_open_loop_distinguishes_readings_and_formulations() -> None:
     assert 0.028 < hub_time(open_loop('paper_si', 'complete')) < 0.029
     for reading in READINGS:
         complete, printed = (
-            abs(Outcome.of(open_loop(reading, form)).peak) for form in ('complete', 'as_printed')
+            abs(RunOutcome.of(open_loop(reading, form)).peak)
+            for form in ('complete', 'as_printed')
         )
         assert DEFLECTION < complete < 3.0 * DEFLECTION
         assert printed > 50.0 * complete
@@ -71,7 +72,7 @@ def test_inverse_dynamics_cancels_reading_and_formulation(hub_stop: bool) -> Non
     ]
     assert np.ptp(tips, axis=0).max() < 1e-4
     for case in CASES:
-        found = Outcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub_stop))
+        found = RunOutcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub_stop))
         assert found.final < 1e-8
         assert (found.deepest > 0.35) is (not hub_stop)
         # d falls as exp(-0.05 t) without a hub, and is zero on it.
@@ -81,7 +82,7 @@ def test_inverse_dynamics_cancels_reading_and_formulation(hub_stop: bool) -> Non
 @pytest.mark.parametrize('case', CASES)
 def test_pid_leaves_coulomb_friction_over_its_gain(case: tuple[str, ...]) -> None:
     run = closed_loop('pid', *case, hub_stop=True)
-    found = Outcome.of(run)
+    found = RunOutcome.of(run)
     assert found.final < 1e-8
     # 1 %: after 150 s of a time constant of 10 s.
     assert_allclose(found.error, BOUND, rtol=1e-2)
@@ -109,10 +110,10 @@ def test_pid_run_agrees_with_another_solver() -> None:
 def test_tip_keeps_ringing_with_f_y_alone(law: str) -> None:
     for reading in READINGS:
         run = base_alone(law, reading)
-        found = Outcome.of(run)
+        found = RunOutcome.of(run)
         assert found.final > DEFLECTION
         # The base moves as under the modal law.
-        modal = Outcome.of(closed_loop(law, reading, 'complete', hub_stop=True))
+        modal = RunOutcome.of(closed_loop(law, reading, 'complete', hub_stop=True))
         assert_allclose(found.error, modal.error, atol=5e-6)
 
 
@@ -158,5 +159,7 @@ def test_peaks_depend_on_the_initial_shape(law: str, peak: float) -> None:
         method='Radau' if law == 'pid' else 'DOP853',
     )
     assert 1e3 * np.abs(run.tip_deflection).max() == pytest.approx(peak, rel=0.01)
-    least_energy = abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=False)).peak)
+    least_energy = abs(
+        RunOutcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=False)).peak
+    )
     assert 1e3 * least_energy > 2.0 * peak

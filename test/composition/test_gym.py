@@ -7,7 +7,7 @@ from dataclasses import replace
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.errors import InsertionDepthError
 from needle_insertion.gym.insertion import (
     DRAWN,
     InsertionEnv,
@@ -92,7 +92,7 @@ def test_environment_equals_the_integrator() -> None:
         seen, reward, over, _, _ = environment.step(np.array([force / FORCE]))
         try:
             one.advance(PERIOD, force)
-        except InsertedLengthError:
+        except InsertionDepthError:
             assert over
             assert reward == -1.0
             break

@@ -4,7 +4,7 @@ import io
 from threading import Event
 
 from needle_insertion.experiment import progress
-from needle_insertion.experiment.progress import Progress
+from needle_insertion.experiment.progress import ProgressLine
 import pytest
 
 
@@ -28,7 +28,7 @@ class Terminal(io.StringIO):
 def test_each_activity_is_a_line_without_a_terminal() -> None:
     """Changing numbers within an activity add no lines; the last line reports the end."""
     stream = io.StringIO()
-    with Progress('insertion', stream) as show:
+    with ProgressLine('insertion', stream) as show:
         show('starting plant: compiling 1 of 9')
         show('starting plant: compiling 2 of 9')
         show('inserting', 0.1)
@@ -43,7 +43,7 @@ def test_each_activity_is_a_line_without_a_terminal() -> None:
 
 def test_failed_job_is_reported() -> None:
     stream = io.StringIO()
-    with pytest.raises(KeyError), Progress('insertion', stream):
+    with pytest.raises(KeyError), ProgressLine('insertion', stream):
         raise KeyError
     assert stream.getvalue().splitlines()[-1] == 'insertion: failed, 0 s'
 
@@ -54,7 +54,7 @@ def test_terminal_line_is_updated_during_the_job(
     """The line is rewritten while the job is busy."""
     monkeypatch.setattr(progress, '_UPDATE', 0.01)
     stream = Terminal()
-    with Progress('insertion', stream) as show:
+    with ProgressLine('insertion', stream) as show:
         show('inserting', 0.35)
         for _ in range(3):
             stream.written.clear()

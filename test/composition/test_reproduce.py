@@ -10,17 +10,17 @@ from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
 from needle_insertion.commands.reproduce import RESULTS
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.truth import _stiffness, Comparison, Coverage
+from needle_insertion.experiment.truth import _stiffness, Coverage, TruthComparison
 from needle_insertion.paper import figures, identified, mismatch, results
 from needle_insertion.paper.claims import judge
 from needle_insertion.paper.identified import (
     IdentifiedTable,
     identify_table,
-    Line,
+    PublishedValue,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import controllability
-from needle_insertion.report.content import Section
+from needle_insertion.report.content import ReportSection
 import numpy as np
 import pytest
 from support.pages import look_at
@@ -73,14 +73,14 @@ def test_shipped_bags_reproduce_table_2(capsys: pytest.CaptureFixture[str]) -> N
     assert 'of 400' in lines[-1]
 
 
-def line(mean: float, deviation: float | None, count: int = 20) -> Line:
+def line(mean: float, deviation: float | None, count: int = 20) -> PublishedValue:
     """Return a line with published values 10 ± 1."""
     reach = 2.1 * (deviation or 1.0) / np.sqrt(count)
     found = Statistic(
         name='a', symbol='a', unit='N', mean=mean, deviation=deviation, error=0.2,
         interval=(mean - reach, mean + reach), count=count,
     )  # fmt: skip
-    return Line(quantity='a [N]', paper=(10.0, 1.0), found=found, truth=Coverage(19, 20))
+    return PublishedValue(quantity='a [N]', paper=(10.0, 1.0), found=found, truth=Coverage(19, 20))
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_coverage_counts_intervals_with_a_true_value() -> None:
     )
     unknown = ParameterEstimate(name='a', symbol='a', unit='N')
     pairs = ((held, 1.5), (held, 2.5), (unknown, 1.0), (held, None))
-    compared = [Comparison(estimate=e, truth=t) for e, t in pairs]
+    compared = [TruthComparison(estimate=e, truth=t) for e, t in pairs]
     assert Coverage.of(compared) == Coverage(held=1, known=3)
 
 
@@ -211,7 +211,7 @@ def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
     monkeypatch.setattr(judge, '_entries', lambda: entries)
     monkeypatch.setattr(
         figures, 'section',
-        lambda: Section(
+        lambda: ReportSection(
             title='Figures 4 to 8', paragraphs=(), pictures=(figure().picture,)
         ),
     )  # fmt: skip

@@ -12,10 +12,10 @@ from typing import Any
 
 from benchmarks.igtl_peer import free_port
 from needle_insertion.slicer.frames import HEADER
-from needle_insertion.slicer.link import Link
+from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.messages import is_wanted, TARGET
 from needle_insertion.slicer.settings import LinkSettings
-from needle_ros.journal import Journal
+from needle_ros.event_log import EventLog
 import numpy as np
 import pyigtl
 import pytest
@@ -28,9 +28,9 @@ class Desk:
 
     def __init__(self, role: str = 'server', port: int | None = None) -> None:
         self.port = free_port() if port is None else port
-        self.journal, self.ahead = Journal(self.clock), 0.0
+        self.journal, self.ahead = EventLog(self.clock), 0.0
         settings = LinkSettings(role=role, port=self.port)
-        self.link = Link(settings, is_wanted, self.journal, self.clock)
+        self.link = Connection(settings, is_wanted, self.journal, self.clock)
         self.lines: list[str] = []
         self.frames: list[Any] = []
 

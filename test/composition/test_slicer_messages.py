@@ -24,7 +24,14 @@ from needle_insertion.slicer.messages import (
     TIP,
     TIP_EXPECTED,
 )
-from needle_insertion.slicer.needle import LINE, MEASURED, MOST_POINTS, NeedleView, Pose, Shape
+from needle_insertion.slicer.needle import (
+    EntryPose,
+    LINE,
+    MEASURED,
+    MOST_POINTS,
+    NeedleView,
+    Shape,
+)
 from needle_insertion.slicer.registration import Registration, rotation_matrix
 from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.errors import MessageError, ParameterError
@@ -280,7 +287,7 @@ def test_shape_and_tip_are_encoded(
     # y of the tip is along the needle: a step in this direction in the needle's frame.
     ahead = registration.to_image(points[-1] + rotation_matrix(turn)[:, 1])
     np.testing.assert_allclose(1e3 * tip.matrix[:3, 1], ahead - seen[-1], atol=2e-3)
-    (expected,) = received(interpreter.tip_expected(Pose(5, np.array(points[0]), shape.turn)))
+    (expected,) = received(interpreter.tip_expected(EntryPose(5, np.array(points[0]), shape.turn)))
     assert expected.device_name == TIP_EXPECTED
     np.testing.assert_allclose(expected.matrix[:3, 3], seen[0], atol=2e-4)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from needle_controller import (
-    Command,
     Controller,
+    ControllerOutput,
     ControllerSettings,
     Guard,
     Measurement,
@@ -95,7 +95,7 @@ class Late:
         self._controller = controller
         self.period, self.delay = controller.period, controller.delay + late
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         return self._controller.command(measured, load)
 
 

@@ -22,7 +22,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
-from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_identification import BagWriter, encode, message_type, RecordingError
 from needle_insertion.cli import main
@@ -200,7 +200,9 @@ class Message:
     data: bytes
 
 
-def measured(sample: Sample, k: int, torque: float, acting: float | None = None) -> list[Message]:
+def measured(
+    sample: PlantSample, k: int, torque: float, acting: float | None = None
+) -> list[Message]:
     """Return the messages of a sample; ``acting`` is the force in mode simulation [N]."""
     state, at = sample.state, stamp(k)
     m = len(state) // 2

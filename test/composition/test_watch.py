@@ -24,7 +24,7 @@ from needle_identification import encode, RecordingError
 from needle_insertion import cli
 from needle_insertion.watch import recorded
 from needle_insertion.watch.live import Live, RecordedReader
-from needle_insertion.watch.recorded import Playback, Recording
+from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.scene import parameters_of, scene
 from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
 from needle_insertion.watch.view import row, View
@@ -264,7 +264,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_bag_shows_measurements_at_any_time(tmp_path: Path, space: str) -> None:
     """Also of nodes in a namespace."""
     write_watched(tmp_path / 'bag', space)
-    bag = Recording(tmp_path / 'bag')
+    bag = ShownRecording(tmp_path / 'bag')
     assert bag.duration == DURATION
     assert bag.losses == ()
     for time in (1.0, 3.0, 1.0):
@@ -290,7 +290,7 @@ def test_bag_shows_measurements_at_any_time(tmp_path: Path, space: str) -> None:
 def test_bag_of_robot_has_straight_shape(tmp_path: Path) -> None:
     """Depth and force are shown, and the needle is straight."""
     write_bag(tmp_path / 'bag', simulated())
-    bag = Recording(tmp_path / 'bag')
+    bag = ShownRecording(tmp_path / 'bag')
     seen = bag.view(2.0).frame(2.0)
     assert seen['shape'] == 'straight'
     assert seen['depth'] > 0.02
@@ -322,7 +322,7 @@ def test_readable_part_of_damaged_bag_is_shown(watched: Path, tmp_path: Path) ->
     file = tmp_path / 'cut.mcap'
     data = file_of(watched).read_bytes()
     file.write_bytes(data[: 2 * len(data) // 3])
-    bag = Recording(file)
+    bag = ShownRecording(file)
     assert 0.5 < bag.duration < DURATION
     assert bag.losses
     assert bag.view(0.5).frame(0.5)['depth'] == pytest.approx(0.01, abs=1e-3)
@@ -363,7 +363,7 @@ def test_bag_without_content_is_rejected(
     """One line with its name, and status 2."""
     path = unusable(tmp_path, what)
     with pytest.raises(RecordingError):
-        Recording(path)
+        ShownRecording(path)
     assert cli.main(['watch', str(path), '--port', '0']) == 2
     said = capsys.readouterr()
     assert said.out == ''
@@ -375,7 +375,7 @@ def test_bag_without_content_is_rejected(
 def test_playback_follows_speed_and_jumps() -> None:
     """Time advances with the speed, up to the end; jumps are reported."""
     now = 100.0
-    play = Playback(10.0, lambda: now)
+    play = PagePlayback(10.0, lambda: now)
     assert play.playing
     now += 2.0
     assert play.at == 2.0
@@ -404,7 +404,7 @@ def test_playback_follows_speed_and_jumps() -> None:
 def test_invalid_playback_message_is_rejected(message: dict[str, Any]) -> None:
     """The error lists the valid messages."""
     with pytest.raises(ParameterError, match='a recording accepts'):
-        Playback(10.0).take(message)
+        PagePlayback(10.0).take(message)
 
 
 # Server.
@@ -702,7 +702,7 @@ async def test_live_reader_receives_newest_frame() -> None:
 
 def test_recorded_reader_controls_playback(watched: Path) -> None:
     """Frames of the requested time with history; readers are independent."""
-    bag = Recording(watched)
+    bag = ShownRecording(watched)
 
     async def look() -> None:
         one, other = RecordedReader(bag), RecordedReader(bag)

@@ -4,8 +4,8 @@ from math import inf, nan
 from typing import Any
 
 from needle_controller import (
-    Command,
     Controller,
+    ControllerOutput,
     ControllerSettings,
     InverseDynamicsGains,
     Measurement,
@@ -351,7 +351,7 @@ def test_command_detects_non_finite_values(load: float) -> None:
     measured = Measurement(time=0.0, depth=0.02, speed=0.0)
     assert steering.command(measured).is_finite()
     assert not steering.command(measured, nan).is_finite()
-    assert not Command(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
+    assert not ControllerOutput(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
 
 
 def test_depth_range_limits_the_targets() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_controller import Answer, Controller, HardwareSettings, Robot
+from needle_controller import Controller, ForceCommand, HardwareSettings, Robot
 from needle_controller.hardware import dynamic_reading
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
@@ -59,9 +59,9 @@ def moves(**settings: Any) -> Robot:
     return robot
 
 
-def push(stamp: int, force: float = 10.0) -> Answer:
+def push(stamp: int, force: float = 10.0) -> ForceCommand:
     """Return a force command during a motion."""
-    return Answer(stamp, force, 0.0, (0.03, 0.01), (0.0, 0.0))
+    return ForceCommand(stamp, force, 0.0, (0.03, 0.01), (0.0, 0.0))
 
 
 @given(robot=ROBOTS, position=NUMBERS)
@@ -87,7 +87,7 @@ def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None
     settings = robot.settings
     measured = robot.measurement(state(['insertion'], [0.0], [velocity]))
     told = forces(sign=settings.sign, scale=settings.scale, zero=settings.zero)
-    (effort,) = told.command(Answer(0, force)) or [nan]
+    (effort,) = told.command(ForceCommand(0, force)) or [nan]
     assert effort * velocity == pytest.approx(force * measured.speed, rel=1e-9, abs=1e-12)
     assert told.force(effort) == pytest.approx(force, rel=1e-12, abs=1e-12)
     read = robot.measurement(state(['insertion'], [0.0], [velocity], [effort]))
@@ -203,7 +203,7 @@ def test_dynamic_joint_state_is_converted() -> None:
 def test_other_joints_get_zero_effort() -> None:
     """In the order of command_joints."""
     robot = forces(joint='slide', command_joints=('a', 'slide', 'b'), sign=-1.0)
-    assert robot.command(Answer(0, 3.0)) == [0.0, -3.0, 0.0]
+    assert robot.command(ForceCommand(0, 3.0)) == [0.0, -3.0, 0.0]
 
 
 def test_other_joints_hold_their_position() -> None:
@@ -230,12 +230,12 @@ def test_position_command_rests_without_a_reference() -> None:
         (last,) = robot.command(push(stamp)) or [nan]
     assert last == pytest.approx(22.0)
     # A repeated measurement does not stop the motion.
-    assert robot.command(Answer(stamp, 10.0)) == [last]
-    assert robot.command(Answer(stamp + 1)) == [last]
+    assert robot.command(ForceCommand(stamp, 10.0)) == [last]
+    assert robot.command(ForceCommand(stamp + 1)) == [last]
     # Implausible measurements do not change the command.
     robot.measurement(state(['insertion'], [1e9], [0.0], stamp=stamp + 2))
-    assert robot.command(Answer(stamp + 2), stopped=True) == pytest.approx([20.0])
-    assert robot.command(Answer(stamp + 3), stopped=True) == pytest.approx([20.0])
+    assert robot.command(ForceCommand(stamp + 2), stopped=True) == pytest.approx([20.0])
+    assert robot.command(ForceCommand(stamp + 3), stopped=True) == pytest.approx([20.0])
 
 
 def test_friction_change_applies_at_once() -> None:

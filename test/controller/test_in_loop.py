@@ -5,10 +5,10 @@ from typing import Any
 
 from needle_controller import (
     Axis,
-    Command,
     ContinuousInverseDynamics,
     ContinuousPid,
     Controller,
+    ControllerOutput,
     ControllerSettings,
     InverseDynamics,
     InverseDynamicsGains,
@@ -27,7 +27,7 @@ from needle_controller import (
 )
 from needle_dynamics import (
     FloatArray,
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     NeedleError,
     NeedleModel,
@@ -170,9 +170,9 @@ def test_unsupported_models_are_rejected() -> None:
     other = NeedleModel(NeedleParameters(modes=1))
     with pytest.raises(ParameterError, match='same number of modes, got 2 and 1'):
         run_continuous(law, other, other.state_at(0.1), goal(0.1), [0.0, 1.0])
-    with pytest.raises(InsertedLengthError, match='left its range'):
+    with pytest.raises(InsertionDepthError, match='left its range'):
         run_continuous(law, MODEL, STRAIGHT, goal(-0.5), np.linspace(0.0, 20.0, 3))
-    assert issubclass(InsertedLengthError, NeedleError)
+    assert issubclass(InsertionDepthError, NeedleError)
 
 
 def test_tips_of_a_batch_equal_single_tips() -> None:
@@ -257,10 +257,10 @@ class Proportional:
         self.seen: list[Measurement] = []
         self.loads: list[float] = []
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         self.seen.append(measured)
         self.loads.append(load)
-        return Command(force=2000.0 * (0.024 - measured.depth), torque=1e-9)
+        return ControllerOutput(force=2000.0 * (0.024 - measured.depth), torque=1e-9)
 
 
 def test_user_defined_law_runs_in_the_loop() -> None:
@@ -288,7 +288,7 @@ class Blurred:
         self._controller, self._noise = controller, iter(noise)
         self.period, self.delay = controller.period, controller.delay
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         depth, speed, _ = next(self._noise)
         return self._controller.command(
             replace(measured, depth=measured.depth + depth, speed=measured.speed + speed), load

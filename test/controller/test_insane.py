@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from benchmarks.loop import Fault, Loop, Sent
+from benchmarks.loop import Loop, LoopFault, Sent
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Observer, ObserverSettings
@@ -20,7 +20,7 @@ RATE, AT, AFTER, SANE = 100.0, 50, 100, 1000
 TOPICS = ('joint_states', 'base_wrench', 'tip_deflection', 'target')
 
 
-class Insane(Fault):
+class Insane(LoopFault):
     """Replaces the first values by these numbers."""
 
     def __init__(self, values: Sequence[float]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from needle_controller.safety.lateness import Lateness
+from needle_controller.safety.latency_monitor import LatencyMonitor
 from needle_ros.timing import NANOSECONDS
 import pytest
 
@@ -16,7 +16,7 @@ def test_more_than_five_percent_late_commands_give_a_warning(
 ) -> None:
     """In the last full second, and more than one or two."""
     period = 1.0 / rate
-    lateness = Lateness(delay=1, period=period)
+    lateness = LatencyMonitor(delay=1, period=period)
     for k in range(2 * rate + 1):
         now = k * NANOSECONDS // rate
         # Two periods are in time; a little more is not.

@@ -11,12 +11,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import Consistency, Measurement, Observer, ObserverSettings
-from needle_controller.bending import Bending
+from needle_controller.load_estimator import LoadEstimator
 from needle_dynamics import (
     FloatArray,
     ForceSensor,
     ForceSensorParameters,
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     Interval,
     NeedleError,
@@ -27,7 +27,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.analysis import observability
 from needle_dynamics.linearization import linearize, operating_point
-from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 import numpy as np
 from numpy.testing import assert_allclose
@@ -628,7 +628,9 @@ def plant(
     return simulated, parameters.friction.force(SPEED, 0.0)
 
 
-def watch_plant(observer: Observer, simulated: Plant, force: float, count: int) -> list[Sample]:
+def watch_plant(
+    observer: Observer, simulated: Plant, force: float, count: int
+) -> list[PlantSample]:
     """Update the observer by the plant's sensors."""
     needle = simulated.integrator
     observer.reset()
@@ -1024,7 +1026,7 @@ def test_invalid_encoder_samples_do_not_change_the_estimate() -> None:
         with pytest.raises(ParameterError, match='must be finite'):
             observer.update(*bad)
     for depth in (0.0005, 0.21, -1.0):
-        with pytest.raises(InsertedLengthError, match='the estimate is held'):
+        with pytest.raises(InsertionDepthError, match='the estimate is held'):
             observer.update(0.05, depth, 0.0)
     assert_allclose(np.array(observer.modal), np.array(before), rtol=0, atol=0)
     observer.update(0.045, 0.1004, 0.0)
@@ -1137,7 +1139,7 @@ def test_nees_rejects_wrong_shapes() -> None:
 
 def test_inconsistent_observer_is_not_used() -> None:
     """An alternating moment gives a warning and zero load; both end with the moment."""
-    bending = Bending(phantom(), Observer(phantom(), ObserverSettings(), PERIOD))
+    bending = LoadEstimator(phantom(), Observer(phantom(), ObserverSettings(), PERIOD))
     rng, stamps = np.random.default_rng(4), iter(range(0, 10**10, 10**6))
 
     def watch(count: int, size: float) -> None:

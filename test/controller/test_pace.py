@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from needle_controller.safety.pace import Pace
+from needle_controller.safety.rate_monitor import RateMonitor
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.random import Generator
@@ -15,7 +15,7 @@ def judged(
     rate: float, true: float, rng: Generator, *, jitter: float = 0.0, lost: float = 0.0
 ) -> str | None:
     """Return the warning after five seconds of samples, checked every 50 ms."""
-    pace = Pace(rate, 0.1)
+    pace = RateMonitor(rate, 0.1)
     stamps = np.arange(int(5.0 * true)) / true
     stamps += jitter / true * rng.uniform(-1.0, 1.0, stamps.shape)
     stamps = np.sort(stamps)[rng.random(stamps.shape) >= lost]
@@ -55,7 +55,7 @@ def test_correct_rate_gives_no_warning(rate: float) -> None:
 
 def test_rate_monitor_needs_a_second_of_samples() -> None:
     """A few steps give no warning, nor do gaps or repeated samples."""
-    pace = Pace(100.0, 0.1)
+    pace = RateMonitor(100.0, 0.1)
     for k in range(19):
         pace.add(k * 20_000_000, 20_000_000)
         pace.add(k * 20_000_000, 20_000_000)

@@ -6,7 +6,7 @@ from typing import Any
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
-from needle_controller.reference.guide import Guide
+from needle_controller.reference.generator import ReferenceGenerator
 from needle_controller.reference.path import Joined, Path
 from needle_controller.reference.quintic import Quintic
 from needle_dynamics import FloatArray, ParameterError
@@ -199,7 +199,7 @@ class Walk:
     """A guide sampled at 1 kHz around changes."""
 
     def __init__(self, kind: str) -> None:
-        self.guide = Guide(kind, LIMITS, REACH)
+        self.guide = ReferenceGenerator(kind, LIMITS, REACH)
         self.time = 0.0
         self.points: list[Setpoint] = []
 
@@ -317,7 +317,7 @@ narrow_events = st.lists(
 @given(start=inside, events=narrow_events)
 def test_reference_stays_in_the_depth_range(kind: str, start: float, events: list[Any]) -> None:
     """Targets, paths and pauses at its ends, at any speed: it turns before them, smoothly."""
-    guide, time, points = Guide(kind, LIMITS, NARROW), 0.0, []
+    guide, time, points = ReferenceGenerator(kind, LIMITS, NARROW), 0.0, []
     guide.aim(NARROW[1])
     for event, wait in [('resume', 0.3), *events, ('resume', 2.0)]:
         if isinstance(event, float):

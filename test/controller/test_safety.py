@@ -6,10 +6,10 @@ from typing import Any
 from needle_controller import (
     ControllerSettings,
     Guard,
+    InputMonitor,
     Measurement,
     Safety,
     SafetyLimits,
-    Stream,
 )
 from needle_controller.safety.encoders import read_encoders
 from needle_dynamics import NeedleParameters, ParameterError
@@ -21,9 +21,9 @@ SECOND = 1_000_000_000
 MILLISECOND = SECOND // 1000
 
 
-def stream(**options: Any) -> Stream:
+def stream(**options: Any) -> InputMonitor:
     """Return the stream of a force sensor at 1 kHz."""
-    return Stream('base_wrench', 0.5, **options)
+    return InputMonitor('base_wrench', 0.5, **options)
 
 
 def safety(expected: tuple[str, ...] = (), **limits: Any) -> Safety:
@@ -88,7 +88,7 @@ def test_wrong_frames_and_non_finite_values_are_rejected() -> None:
     assert wrench.describe(now).endswith('refused: 1 frame, 3 not finite')
 
 
-def feed(watched: Stream, readings: list[Any]) -> list[str]:
+def feed(watched: InputMonitor, readings: list[Any]) -> list[str]:
     """Return the verdicts on readings at 1 kHz from 10 s on, '' for valid readings."""
     kinds = []
     for i, value in enumerate(readings):

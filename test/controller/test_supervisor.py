@@ -8,15 +8,15 @@ from math import inf, isfinite, nan
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_controller import (
-    Answer,
     Controller,
+    ForceCommand,
     Measurement,
     ObserverSettings,
     SafetyLimits,
     Supervisor,
 )
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
@@ -43,10 +43,12 @@ class Loop:
         if target is not None:
             self.aim(target)
 
-    def aim(self, depth: float) -> Answer | None:
+    def aim(self, depth: float) -> ForceCommand | None:
         return self.supervisor.target(0, '', depth, 0.0, self.now)
 
-    def measure(self, move: float = 0.0, velocity: float = 0.0, late: int = 0) -> Answer | None:
+    def measure(
+        self, move: float = 0.0, velocity: float = 0.0, late: int = 0
+    ) -> ForceCommand | None:
         """Measure a period later."""
         self.now += PERIOD
         self.depth += move
@@ -54,32 +56,32 @@ class Loop:
 
     def encoders(
         self, stamp: int, depth: float, velocity: float, *efforts: float
-    ) -> Answer | None:
+    ) -> ForceCommand | None:
         values = ((depth,), (velocity,), efforts)
         return self.supervisor.encoders(Reading(stamp, '', ('insertion',), values), self.now)
 
-    def wrench(self, axial: float = 0.0, moment: float = 0.0) -> Answer | None:
+    def wrench(self, axial: float = 0.0, moment: float = 0.0) -> ForceCommand | None:
         values = ((0.0, axial, 0.0, moment, 0.0, 0.0),)
         return self.supervisor.wrench(Reading(self.now, 'needle_base', (), values), self.now)
 
-    def tip(self, deflection: float = 0.0) -> Answer | None:
+    def tip(self, deflection: float = 0.0) -> ForceCommand | None:
         values = ((0.0, self.depth, deflection),)
         return self.supervisor.tip(Reading(self.now, 'needle_entry', (), values), self.now)
 
-    def watch(self, nodes: int = 1) -> Answer | None:
+    def watch(self, nodes: int = 1) -> ForceCommand | None:
         return self.supervisor.watch(self.now, {TOPIC: nodes})
 
-    def passes(self, time: int) -> Answer | None:
+    def passes(self, time: int) -> ForceCommand | None:
         self.now += time
         return self.watch()
 
-    def stop(self) -> Answer | None:
+    def stop(self) -> ForceCommand | None:
         return self.supervisor.emergency_stop(self.now).answer
 
-    def clear(self) -> Answer | None:
+    def clear(self) -> ForceCommand | None:
         return self.supervisor.clear_stop(self.now).answer
 
-    def pushes(self) -> Answer:
+    def pushes(self) -> ForceCommand:
         """Measure until a force is commanded."""
         answers = (self.measure() for _ in range(50))
         return next(answer for answer in answers if answer is not None and answer.force > 0.5)
@@ -89,7 +91,7 @@ class Loop:
 
 
 #: Events of a control loop, except for a release of the stop.
-EVENTS: list[Callable[[Loop], Answer | None]] = [
+EVENTS: list[Callable[[Loop], ForceCommand | None]] = [
     Loop.measure,
     lambda loop: loop.measure(1e-6, 1e-3),
     lambda loop: loop.measure(5e-3),
@@ -123,7 +125,8 @@ events = st.lists(st.sampled_from(EVENTS), max_size=40)
 
 @given(events, events)
 def test_stop_gives_zero_force_until_cleared(
-    before: list[Callable[[Loop], Answer | None]], after: list[Callable[[Loop], Answer | None]]
+    before: list[Callable[[Loop], ForceCommand | None]],
+    after: list[Callable[[Loop], ForceCommand | None]],
 ) -> None:
     """No command has a force or a motion, for any events before and after."""
     loop = Loop()
@@ -139,14 +142,14 @@ def test_stop_gives_zero_force_until_cleared(
 
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
 def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
-    happens: list[Callable[[Loop], Answer | None]],
+    happens: list[Callable[[Loop], ForceCommand | None]],
 ) -> None:
     """A nonzero force is finite, within its limit, and answers a measurement."""
     loop = Loop()
     measured = set()
     encoders = loop.supervisor.encoders
 
-    def remember(reading: Reading, now: int) -> Answer | None:
+    def remember(reading: Reading, now: int) -> ForceCommand | None:
         measured.add(reading.stamp)
         return encoders(reading, now)
 
@@ -165,7 +168,7 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
 
 @given(events)
 def test_valid_measurements_restart_the_motion_after_faults(
-    happens: list[Callable[[Loop], Answer | None]],
+    happens: list[Callable[[Loop], ForceCommand | None]],
 ) -> None:
     """After any faults, a second of valid inputs, a cleared stop and a target give a force."""
     loop = Loop()
@@ -190,7 +193,7 @@ def test_valid_measurements_restart_the_motion_after_faults(
 
 @given(st.lists(st.sampled_from(EVENTS[:21]), max_size=30))
 def test_zero_force_without_a_target(
-    happens: list[Callable[[Loop], Answer | None]],
+    happens: list[Callable[[Loop], ForceCommand | None]],
 ) -> None:
     """For any events except a target or a trajectory."""
     loop = Loop(target=None)
@@ -274,9 +277,9 @@ def test_repeated_measurement_gets_the_same_command() -> None:
     """The reference is not published again; after a stop the command is zero."""
     loop = Loop()
     answer = loop.pushes()
-    assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(*answer[:3])
+    assert loop.encoders(loop.now, loop.depth, 0.0) == ForceCommand(*answer[:3])
     loop.stop()
-    assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(loop.now)
+    assert loop.encoders(loop.now, loop.depth, 0.0) == ForceCommand(loop.now)
     # A late measurement gets no command.
     assert loop.encoders(loop.now - PERIOD, loop.depth, 0.0) is None
 
@@ -287,7 +290,7 @@ def test_measurement_beyond_a_limit_gets_one_zero_command_with_its_stamp() -> No
     loop.pushes()
     loop.supervisor.safety.guard.encoders(Measurement(time=0.0, depth=0.02, speed=0.2))
     answer = loop.measure(0.0, 0.2)
-    assert answer == Answer(loop.now)
+    assert answer == ForceCommand(loop.now)
     assert loop.said()[-1] == (
         'stopped: insertion speed 0.2 m/s is beyond the limit of 0.1 m/s (safety.speed); '
         'no force until ~/clear_stop'
@@ -298,14 +301,14 @@ def test_inactive_supervisor_accepts_only_the_stop() -> None:
     """The stop survives configuration, and measurements are not answered."""
     supervisor = Supervisor()
     reading = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
-    assert supervisor.emergency_stop(SECOND).answer == Answer(SECOND)
+    assert supervisor.emergency_stop(SECOND).answer == ForceCommand(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
     assert supervisor.journal.complaint == 'target rejected: the controller is not active'
     assert supervisor.pause(True).message == 'pause refused: the controller is not active'
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
-    assert supervisor.encoders(reading, SECOND) == Answer(SECOND)
+    assert supervisor.encoders(reading, SECOND) == ForceCommand(SECOND)
     assert supervisor.diagnose(SECOND)[:2] == (
         Severity.ERROR,
         'emergency stop; ~/clear_stop releases',
@@ -355,7 +358,7 @@ def test_invalid_observer_settings_are_named() -> None:
 def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
     """Each kind has its own limit; a line without a kind is always logged."""
     times = iter([0.0, 0.5, 1.0, 1.9, 2.1, 2.1])
-    journal = Journal(steady=lambda: next(times))
+    journal = EventLog(steady=lambda: next(times))
     for number in range(5):
         journal.say(Severity.WARNING, f'line {number}', 'stale')
     journal.say(Severity.WARNING, 'another', 'jump')
@@ -419,7 +422,7 @@ def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(
 ) -> None:
     """The commands are equal if it arrives before or after the sample of its stamp."""
 
-    def run(before: int) -> list[Answer | None]:
+    def run(before: int) -> list[ForceCommand | None]:
         loop, answers = Loop(target=None), []
         for k in range(20):
             if k == before:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from needle_dynamics import (
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     NeedleModel,
     NeedleParameters,
@@ -157,7 +157,7 @@ def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.004, 1e-5)
     for step in (None, 1e-5):
-        with pytest.raises(InsertedLengthError, match=r'reached minimum_depth = 0\.001 m while'):
+        with pytest.raises(InsertionDepthError, match=r'reached minimum_depth = 0\.001 m while'):
             simulate(p, start, -2.0, duration=0.02, interval=1e-3, step=step)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from needle_dynamics import (
     FloatArray,
-    InsertedLengthError,
+    InsertionDepthError,
     NeedleError,
     NeedleModel,
     NeedleParameters,
@@ -526,7 +526,7 @@ def test_distance_grows_with_the_deflection() -> None:
         ({'sliding': 'up'}, ParameterError, 'one of insertion, withdrawal'),
         ({'state': np.zeros(6)}, ShapeError, r'shape \(8,\), got \(6,\)'),
         ({'state': np.full(8, np.nan)}, ShapeError, 'must be finite'),
-        ({'state': np.array([0.2, *np.zeros(7)])}, InsertedLengthError, 'insertion depth 0 m'),
+        ({'state': np.array([0.2, *np.zeros(7)])}, InsertionDepthError, 'insertion depth 0 m'),
     ],
 )
 def test_invalid_operating_points_are_rejected(
@@ -552,7 +552,7 @@ def test_invalid_systems_and_maps_are_rejected() -> None:
         controllability_map(preset('paper_si'), 0.1, [0.0], 5e-3)
     with pytest.raises(ShapeError, match='deflections must be a list'):
         controllability_map(preset('paper_si'), [0.1], [], 5e-3)
-    with pytest.raises(InsertedLengthError, match=r'0\.3 m is outside'):
+    with pytest.raises(InsertionDepthError, match=r'0\.3 m is outside'):
         controllability_map(preset('paper_si'), [0.3], [0.0], 5e-3)
     with pytest.raises(StuckError):
         controllability_map(preset('paper_si'), [0.1], [0.0], 0.0)

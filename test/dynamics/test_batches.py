@@ -7,7 +7,7 @@ from typing import Any
 from needle_dynamics import (
     Batch,
     FloatArray,
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     NeedleError,
     NeedleModel,
@@ -144,7 +144,7 @@ def test_run_outside_its_range_is_nan_without_effect_on_others(
     states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004, 0.06)])
     forces = np.array([3.0, -1.0, 2.0])
     found = batch(p, states, forces, workers=workers)
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         simulate(
             p, states[1], -1.0, duration=COUNT * INTERVAL, interval=INTERVAL, step=DEFAULT_STEP
         )
@@ -263,7 +263,7 @@ def test_non_finite_values_are_rejected() -> None:
             batch(constants, wrong, forces)
     wrong = states.copy()
     wrong[3, 0] = 0.2
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         batch(constants, wrong, forces)
 
 

@@ -2,7 +2,7 @@
 
 from math import inf, nan
 
-from needle_dynamics import euler_loads, InsertedLengthError, NeedleParameters
+from needle_dynamics import euler_loads, InsertionDepthError, NeedleParameters
 import numpy as np
 from numpy.polynomial import Polynomial
 import pytest
@@ -37,5 +37,5 @@ def test_fully_inserted_needle_does_not_buckle() -> None:
     needle = NeedleParameters.preset('phantom')
     assert euler_loads(needle, needle.length) == (inf, inf)
     for depth in (-1e-3, nan, inf):
-        with pytest.raises(InsertedLengthError, match='insertion depth must be finite'):
+        with pytest.raises(InsertionDepthError, match='insertion depth must be finite'):
             euler_loads(needle, depth)

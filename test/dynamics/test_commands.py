@@ -6,7 +6,7 @@ from math import inf, nan
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.simulated.commands import Command, Commands
+from needle_dynamics.simulated.commands import AppliedForces, Commands
 from needle_ros.timing import NANOSECONDS
 import pytest
 
@@ -24,15 +24,15 @@ def test_command_acts_from_one_sample_to_the_next() -> None:
     """Zero-order hold: the newest command between two samples acts after the second."""
     commands = made()
     commands.hold(NOW)
-    assert commands.held == Command()
+    assert commands.held == AppliedForces()
     assert commands.offer(NOW, 'needle_base', 1.0, 0.1, NOW + 10) == (True, '')
     assert commands.offer(NOW, '', 2.0, 0.2, NOW + 20) == (True, '')
-    assert commands.held == Command()
+    assert commands.held == AppliedForces()
     commands.hold(NOW + PERIOD)
-    assert commands.held == Command(NOW, 2.0, 0.2)
+    assert commands.held == AppliedForces(NOW, 2.0, 0.2)
     # No newer command: the command is held.
     commands.hold(NOW + 2 * PERIOD)
-    assert commands.held == Command(NOW, 2.0, 0.2)
+    assert commands.held == AppliedForces(NOW, 2.0, 0.2)
 
 
 def test_command_expires_at_the_timeout() -> None:
@@ -42,14 +42,14 @@ def test_command_expires_at_the_timeout() -> None:
     commands.hold(NOW + 100 * PERIOD)
     assert commands.held.force == 2.0
     commands.hold(NOW + 100 * PERIOD + 1)
-    assert commands.held == Command(NOW)
+    assert commands.held == AppliedForces(NOW)
 
 
 def test_zero_stamp_means_now() -> None:
     """Nodes without a clock can publish commands."""
     commands = made()
     commands.offer(0, '', 2.0, 0.0, NOW)
-    assert commands.newest == Command(NOW, 2.0)
+    assert commands.newest == AppliedForces(NOW, 2.0)
 
 
 @pytest.mark.parametrize('age', [100 * PERIOD + 1, -100 * PERIOD - 1])
@@ -61,7 +61,7 @@ def test_commands_with_old_or_future_stamps_are_rejected(age: int) -> None:
     assert not counts
     when = 'old' if age > 0 else 'ahead'
     assert complaint == f'command ignored, its stamp is 0.100 s {when}: command_timeout is 0.1 s'
-    assert commands.newest == Command(NOW, 1.0)
+    assert commands.newest == AppliedForces(NOW, 1.0)
     assert (commands.stale, commands.refused, commands.overtaken) == (1, 0, 0)
 
 
@@ -70,12 +70,12 @@ def test_out_of_order_commands_are_discarded() -> None:
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     assert commands.offer(NOW - PERIOD, '', 2.0, 0.0, NOW) == (False, '')
-    assert commands.newest == Command(NOW, 1.0)
+    assert commands.newest == AppliedForces(NOW, 1.0)
     assert commands.overtaken == 1
     # The clock was set back by an hour.
     back = NOW - 3600 * NANOSECONDS
     assert commands.offer(back, '', 2.0, 0.0, back) == (True, '')
-    assert commands.newest == Command(back, 2.0)
+    assert commands.newest == AppliedForces(back, 2.0)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_invalid_command_sets_zero_force(
     said = f'a command {complaint}; no force is applied'
     assert commands.offer(NOW + 1, frame, force, torque, NOW) == (True, said)
     commands.hold(NOW + PERIOD)
-    assert commands.held == Command(NOW + 1)
+    assert commands.held == AppliedForces(NOW + 1)
     assert commands.refused == 1
 
 
@@ -108,9 +108,9 @@ def test_no_force_acts_with_several_command_publishers() -> None:
     assert commands.count_commanders(3)
     assert commands.rivals == 2
     commands.hold(NOW + PERIOD)
-    assert commands.held == Command(NOW)
+    assert commands.held == AppliedForces(NOW)
     commands.offer(NOW + PERIOD, '', 1.0, 0.0, NOW + PERIOD)
-    assert commands.newest == Command(NOW + PERIOD)
+    assert commands.newest == AppliedForces(NOW + PERIOD)
     assert commands.count_commanders(1)
     commands.offer(NOW + 2 * PERIOD, '', 1.0, 0.0, NOW + 2 * PERIOD)
     assert commands.newest.force == 1.0
@@ -171,7 +171,7 @@ def test_no_command_acts_for_the_timeout_after_a_short_lived_publisher() -> None
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     commands.hush(NOW)
-    assert commands.newest == Command(NOW)
+    assert commands.newest == AppliedForces(NOW)
     for k, acts in ((1, False), (99, False), (100, True)):
         at = NOW + k * PERIOD
         commands.offer(at, '', 2.0, 0.0, at)
@@ -184,10 +184,10 @@ def test_reset_and_activation_discard_commands() -> None:
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     commands.hold(NOW)
     commands.forget()
-    assert commands.held == commands.newest == Command(NOW)
+    assert commands.held == commands.newest == AppliedForces(NOW)
     assert commands.offer(NOW - 1, '', 1.0, 0.0, NOW) == (False, '')
     commands.begin()
-    assert commands.held == commands.newest == Command()
+    assert commands.held == commands.newest == AppliedForces()
 
 
 def test_force_without_the_stamp_of_a_sample_is_rejected() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
+from needle_dynamics.simulated.faults import FaultParameters, FAULTS, SensorFault
 from needle_ros.errors import ParameterError
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def through(
 ) -> list[Any]:
     """Return the published measurements of each call."""
     parameters = FaultParameters(probability=probability, delay=delay, size=size)
-    fault = Fault(kind, parameters, 100.0, seed)
+    fault = SensorFault(kind, parameters, 100.0, seed)
     return [fault.leaves(stamp, values, biased) for stamp, values in STREAM]
 
 
@@ -90,4 +90,4 @@ def test_same_seed_gives_the_same_faults(kind: str) -> None:
 def test_unknown_fault_kind_is_rejected() -> None:
     """The message lists the valid kinds."""
     with pytest.raises(ParameterError, match=r"must be one of drop, delay, .*, got 'rust'"):
-        Fault('rust', FaultParameters(), 100.0, 1)
+        SensorFault('rust', FaultParameters(), 100.0, 1)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import (
     FloatArray,
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     Interval,
     NeedleModel,
@@ -615,10 +615,10 @@ def test_withdrawal_below_the_minimum_keeps_the_last_valid_state(moved: bool) ->
         return it.advance(duration, -1.0, 1e-9)
 
     it, single = (needle(depth=4e-3, tip_deflection=1e-5) for _ in range(2))
-    with pytest.raises(InsertedLengthError, match=r'minimum_depth = 0\.001 m while withdrawing'):
+    with pytest.raises(InsertionDepthError, match=r'minimum_depth = 0\.001 m while withdrawing'):
         go(it, 1.0)
     taken = 0
-    with suppress(InsertedLengthError):
+    with suppress(InsertionDepthError):
         while taken < 10_000:
             go(single, DEFAULT_STEP)
             taken += 1
@@ -632,7 +632,7 @@ def test_withdrawal_below_the_minimum_keeps_the_last_valid_state(moved: bool) ->
     assert 1e-3 <= it.depth < 1e-3 - 1.1 * it.velocity * DEFAULT_STEP
     assert np.isfinite(it.model.acceleration(it.state)).all()
     last = it.state
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         go(it, DEFAULT_STEP)
     # cond(G) eps once more, from rates to momenta and back.
     assert_allclose(it.state, last, rtol=1e-7)
@@ -647,7 +647,7 @@ def test_withdrawal_never_ends_below_the_minimum() -> None:
     """For any fraction of a step before the limit, the last state is valid."""
     for depth in np.linspace(1.2e-3, 1.3e-3, 25):
         it = needle(depth=depth, speed=-2.0, viscous_friction=0.0, coulomb_friction=0.0)
-        with pytest.raises(InsertedLengthError):
+        with pytest.raises(InsertionDepthError):
             it.advance(1e-3)
         # 2e-5 m is one step.
         assert 1e-3 <= it.depth < 1e-3 + 2e-5 + 1e-12
@@ -949,7 +949,7 @@ def test_invalid_states_are_rejected() -> None:
     p = preset('paper_si')
     with pytest.raises(ShapeError):
         Integrator(p, np.zeros(6))
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         Integrator(p, [p.length, *np.zeros(7)])
 
 

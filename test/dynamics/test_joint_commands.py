@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.simulated.joint_commands import JointCommands, Motion
+from needle_dynamics.simulated.joint_commands import JointCommands, JointSetpoints
 from needle_dynamics.simulated.run import Event, MOTION, PlantRun, RESET
 from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
@@ -83,7 +83,7 @@ def test_velocity_without_position_lasts_for_the_timeout() -> None:
         assert motion.goals == pytest.approx({'insertion': 0.051})
         assert motion.within == 0.1
     _, _, motions = asked(commands, START, ('insertion',), (), (0.0,))
-    assert motions == [Motion({'insertion': 0.05}, 0.1)]
+    assert motions == [JointSetpoints({'insertion': 0.05}, 0.1)]
     assert asked(commands, START, ('insertion',), (), (0.0,))[2] == []
     # With a position the velocity has no effect.
     _, _, motions = asked(commands, START, ('insertion',), (0.06,), (0.01,))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import (
     FloatArray,
-    InsertedLengthError,
+    InsertionDepthError,
     NeedleError,
     NeedleModel,
     NeedleParameters,
@@ -285,9 +285,9 @@ def test_depth_outside_its_range_is_rejected(depth: float) -> None:
     of = model()
     state = of.state_at(0.05)
     state[0] = 0.2 - depth
-    with pytest.raises(InsertedLengthError, match=r'outside \[0.001, 0.2\] m'):
+    with pytest.raises(InsertionDepthError, match=r'outside \[0.001, 0.2\] m'):
         of.checked_state(state)
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         of.state_at(depth)
 
 

@@ -10,7 +10,7 @@ from needle_dynamics import (
     FloatArray,
     ForceSensor,
     ForceSensorParameters,
-    InsertedLengthError,
+    InsertionDepthError,
     Integrator,
     NeedleModel,
     NeedleParameters,
@@ -20,7 +20,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
-from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.errors import JobError
 import numpy as np
@@ -56,11 +56,11 @@ def follow(plant: Plant, *points: tuple[float, float | None, float | None]) -> N
     plant.follow(['insertion'], times, [row(d) for d in depths], [row(f) for f in forces])
 
 
-def run(plant: Plant, duration: float) -> list[Sample]:
+def run(plant: Plant, duration: float) -> list[PlantSample]:
     return [plant.advance() for _ in range(round(duration * RATE))]
 
 
-def column(samples: list[Sample], name: str) -> FloatArray:
+def column(samples: list[PlantSample], name: str) -> FloatArray:
     return np.array([getattr(sample, name) for sample in samples])
 
 
@@ -115,7 +115,7 @@ def test_speed_limit_keeps_the_needle_in_the_tissue() -> None:
     follow(plant, (0.0, None, -1000.0))
     # The velocity is reached linearly in the first quarter of the interval.
     assert plant.advance().depth == pytest.approx(0.003 - 0.875 * 0.001 / RATE, rel=1e-9)
-    with pytest.raises(InsertedLengthError, match='minimum_depth'):
+    with pytest.raises(InsertionDepthError, match='minimum_depth'):
         run(plant, 3.0)
 
 
@@ -256,7 +256,7 @@ def test_incompatible_constants_are_rejected() -> None:
     one, other = Integrator(parameters, state), Integrator(parameters, state)
     with pytest.raises(ShapeError):
         one.change(replace(parameters, modes=1))
-    with pytest.raises(InsertedLengthError):
+    with pytest.raises(InsertionDepthError):
         one.change(replace(parameters, length=0.1))
     assert one.model.parameters == parameters
     assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)

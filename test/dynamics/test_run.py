@@ -7,7 +7,7 @@ from typing import Any
 
 from needle_dynamics import JobError, NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.assembly import PlantConstants
-from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.measured import Measurement
 from needle_dynamics.simulated.plant import Plant
 from needle_dynamics.simulated.run import (
@@ -71,7 +71,7 @@ def test_ground_truth_contains_the_acting_command() -> None:
     plant.take(stamp(1))
     plant.commands.offer(stamp(1), '', force, torque, stamp(1))
     assert truth(plant.take(stamp(2)))[8:] == [-force, torque, 0.0, 0.0]
-    assert truth(plant.take(stamp(3), Command(0, 2.0)))[8:10] == [-2.0, 0.0]
+    assert truth(plant.take(stamp(3), AppliedForces(0, 2.0)))[8:10] == [-2.0, 0.0]
     robot = PlantRun({**VALUES, 'mode': 'robot'})
     assert len(truth(robot.take(stamp(1)))) == 8
 

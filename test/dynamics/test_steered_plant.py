@@ -8,14 +8,14 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import (
-    InsertedLengthError,
     Insertion,
+    InsertionDepthError,
     JobError,
     ParameterError,
     SteeredNeedle,
 )
 from needle_dynamics.simulated.assembly import PlantConstants
-from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.measured import Measurement
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_dynamics.simulated.steered import SteeredPlant
@@ -62,7 +62,7 @@ def run(
     for event in events:
         plant.perform(event)
     taken = [
-        {name: numbers for name, _, numbers in plant.take(k * PERIOD, Command(0, force))}
+        {name: numbers for name, _, numbers in plant.take(k * PERIOD, AppliedForces(0, force))}
         for k in range(1, samples + 1)
     ]
     return plant, taken
@@ -308,7 +308,7 @@ def test_preset_includes_its_steering_constants() -> None:
 
 def test_complete_withdrawal_is_an_error() -> None:
     """The limit is the skin, as in `Insertion`."""
-    with pytest.raises(InsertedLengthError, match='the needle reached the skin'):
+    with pytest.raises(InsertionDepthError, match='the needle reached the skin'):
         run({**VALUES, 'mode': 'simulation'}, 500, force=-15.0)
 
 

@@ -4,9 +4,9 @@ from itertools import pairwise
 from pathlib import Path
 import time
 
-from needle_identification import Bag, BagWriter, OfferedQos, RecordingError, Topic
+from needle_identification import Bag, BagTopic, BagWriter, OfferedQos, RecordingError
 from needle_identification.bags import bag as reading
-from needle_identification.bags.playback import Playback, PlaybackSettings
+from needle_identification.bags.playback import BagPlayback, PlaybackSettings
 import pytest
 from rosbags.interfaces import (
     Qos,
@@ -29,7 +29,7 @@ OLD = """
 """
 
 
-def everything(_topic: Topic) -> bool:
+def everything(_topic: BagTopic) -> bool:
     return True
 
 
@@ -100,7 +100,7 @@ def test_a_damaged_receive_time_ends_the_playback(tmp_path: Path, damaged: int) 
             shift = 0 if k != damaged else 10**18 if damaged else -(10**18)
             writer.write('/a', text(str(k)), at + shift)
     bag = Bag(tmp_path / 'bag')
-    play = Playback(bag, {'/a'}, {}, PlaybackSettings(rate=0.0, delay=0.0))
+    play = BagPlayback(bag, {'/a'}, {}, PlaybackSettings(rate=0.0, delay=0.0))
     play.start(paused=False)
     for _ in range(9 if damaged else 1):
         assert play.is_due()
@@ -160,7 +160,7 @@ def test_offered_qos_of_any_version_of_rosbag2_is_read(
     stored: str, found: tuple[OfferedQos, ...]
 ) -> None:
     """Older recordings have numbers instead of names; unreadable profiles are ignored."""
-    assert Topic('/a', TEXT, profiles=stored).offered_qos() == found
+    assert BagTopic('/a', TEXT, profiles=stored).offered_qos() == found
 
 
 @pytest.fixture
@@ -176,16 +176,16 @@ def bag(tmp_path: Path) -> Bag:
     return Bag(tmp_path / 'bag')
 
 
-def playback(bag: Bag, **settings: float) -> Playback:
+def playback(bag: Bag, **settings: float) -> BagPlayback:
     """Return a running playback without delay."""
-    made = Playback(
+    made = BagPlayback(
         bag, {'/a', '/latched'}, {'/latched': 1}, PlaybackSettings(delay=0.0, **settings)
     )
     made.start(paused=False)
     return made
 
 
-def played(made: Playback) -> list[bytes]:
+def played(made: BagPlayback) -> list[bytes]:
     """Play to the end as fast as possible."""
     found: list[bytes] = []
     while made.has_next:

@@ -8,7 +8,7 @@ import json
 from math import pi
 from pathlib import Path
 
-from benchmarks.steering_fit import insertion, NOISE, Truth
+from benchmarks.steering_fit import FitTruth, insertion, NOISE
 from needle_dynamics import bending_length
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
@@ -32,7 +32,7 @@ from numpy.testing import assert_allclose
 import pytest
 import yaml
 
-PLAIN = Truth()
+PLAIN = FitTruth()
 
 TILTED = SteeringSettings(terms=('tilt',), order='together')
 
@@ -80,8 +80,8 @@ def test_the_identification_is_exact_without_noise() -> None:
 
 def test_media_share_the_free_length() -> None:
     """Each has its own bending length, skin and tilt; all intervals contain the true values."""
-    gel = Truth(length=0.03)
-    liver = Truth(length=0.05, skin=0.03, tilt=(0.0, 0.01), medium='liver')
+    gel = FitTruth(length=0.03)
+    liver = FitTruth(length=0.05, skin=0.03, tilt=(0.0, 0.01), medium='liver')
     recordings = [insertion(k, gel) for k in range(10)]
     recordings += [insertion(k, liver) for k in range(20, 30)]
     found = identify_steering(recordings, TILTED)
@@ -109,7 +109,9 @@ def test_indistinguishable_causes_of_drift_are_not_determined() -> None:
     assert 'A motion of the guide in air identifies the frame' in words
     bent = identify_steering(
         [
-            insertion(k, Truth(tilt=(0.0, 0.0), curvature=0.8), lambda depth: pi * (depth > 0.05))
+            insertion(
+                k, FitTruth(tilt=(0.0, 0.0), curvature=0.8), lambda depth: pi * (depth > 0.05)
+            )
             for k in range(6)
         ]
     )
@@ -123,7 +125,7 @@ def test_indistinguishable_causes_of_drift_are_not_determined() -> None:
 @pytest.mark.parametrize('first', [False, True])
 def test_the_order_of_guide_and_needle_is_detected(first: bool) -> None:
     found = identify_steering(
-        [insertion(k, Truth(guide_first=first)) for k in range(4)],
+        [insertion(k, FitTruth(guide_first=first)) for k in range(4)],
         SteeringSettings(terms=('tilt',)),
     )
     assert found.order == ('guide first' if first else 'together')

@@ -10,8 +10,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from needle_controller import LAWS
-from needle_controller.reference.guide import REFERENCES
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.reference.generator import REFERENCES
+from needle_controller.steering.executive import Phase
 from needle_dynamics.compiled.store import SUFFIX
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR

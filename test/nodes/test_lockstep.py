@@ -15,13 +15,13 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import ContinuousInverseDynamics
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.experiment.insertion import target_message
 from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import Sample, SimulatedRun
+from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
@@ -319,7 +319,7 @@ def steer(folder: Path) -> Path:
         run = SimulatedRun(graph, lambda *_: None)
         aim = run.publisher(PointStamped, 'target')
 
-        def act(sample: Sample) -> bool:
+        def act(sample: RunSample) -> bool:
             nonlocal waiting, end
             if waiting and sample.time >= 0.1:
                 waiting = False

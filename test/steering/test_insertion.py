@@ -9,8 +9,8 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as some
 from needle_dynamics import (
-    InsertedLengthError,
     Insertion,
+    InsertionDepthError,
     Integrator,
     NeedleModel,
     NeedleParameters,
@@ -156,13 +156,13 @@ def test_hub_stops_on_the_guide() -> None:
     one.push(1.0, -50.0)
     assert one.depth < 0.18
     one.carry(0.1, 0.05)
-    with pytest.raises(InsertedLengthError, match='the needle reached 180 mm, where its hub'):
+    with pytest.raises(InsertionDepthError, match='the needle reached 180 mm, where its hub'):
         one.carry(10.0, 0.05)
 
 
 def test_motion_out_of_the_skin_is_an_error_without_effect() -> None:
     one = Insertion(NEEDLE, STEERING, depth=0.01)
-    with pytest.raises(InsertedLengthError, match='the needle reached the skin'):
+    with pytest.raises(InsertionDepthError, match='the needle reached the skin'):
         one.push(10.0, -20.0)
     assert one.depth == 0.0
     assert 0.0 < one.time < 10.0

@@ -8,13 +8,13 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller import OuterLoopSettings, ReferenceLimits, SteeringBelief
+from needle_controller import ExecutiveSettings, ReferenceLimits, SteeringPrior
 from needle_controller.reference.path import Path
-from needle_controller.steering.look import Look
-from needle_controller.steering.motion import duration_of, Move, smooth
-from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering.executive import Phase
+from needle_controller.steering.motion import duration_of, JointMotion, smooth
+from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics import ParameterError
-from needle_ros.journal import Severity
+from needle_ros.event_log import Severity
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
@@ -263,7 +263,7 @@ def test_axis_law_with_the_same_limits_accepts_every_motion(
     speed: float, acceleration: float, way: float
 ) -> None:
     """It interpolates the points by cubics, and checks their speed and acceleration."""
-    own = OuterLoopSettings(speed=speed, acceleration=acceleration)
+    own = ExecutiveSettings(speed=speed, acceleration=acceleration)
     begin, end = np.array([0.01, 0.0, 0.0]), np.array([0.01 + way, 0.0, 0.0])
     move = smooth(own.joints, begin, end, duration_of(end - begin, own))
     limits = ReferenceLimits(speed=1.001 * speed, acceleration=acceleration)
@@ -304,7 +304,7 @@ def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> No
 
     follow = robot.follow
 
-    def hear(move: Move | None) -> None:
+    def hear(move: JointMotion | None) -> None:
         nonlocal runs, asked
         if move is not None and robot.loop.phase is Phase.STOPPED:
             asked += 1
@@ -349,11 +349,11 @@ def test_target_after_a_retraction_is_accepted() -> None:
 
 def test_settings_incompatible_with_continuous_are_rejected() -> None:
     with pytest.raises(ParameterError, match='turns must be 0 if continuous'):
-        OuterLoopSettings(continuous=True, turns=2)
+        ExecutiveSettings(continuous=True, turns=2)
     with pytest.raises(ParameterError, match='continuous must be true or false'):
-        OuterLoopSettings(continuous=2.0)  # type: ignore[arg-type]
+        ExecutiveSettings(continuous=2.0)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match='rate must be at least 8 Hz if continuous'):
-        OuterLoopSettings(continuous=True, rate=5.0)
+        ExecutiveSettings(continuous=True, rate=5.0)
 
 
 def test_duplicate_publishers_of_measurements_are_rejected() -> None:
@@ -460,7 +460,7 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
 
 def test_noisy_readings_give_a_warning() -> None:
     """Five times the configured noise."""
-    robot = Robot(belief=SteeringBelief(noise=8e-6))
+    robot = Robot(belief=SteeringPrior(noise=8e-6))
     robot.tick(5)
     robot.aim()
     robot.tick(60)
@@ -471,7 +471,7 @@ def test_noisy_readings_give_a_warning() -> None:
 
 def test_averaged_measurement_rejects_outliers() -> None:
     """Many readings with two outliers; and no readings."""
-    look = Look()
+    look = TipMeasurements()
     assert look.seen(1e-5) is None
     rng = np.random.default_rng(1)
     tips = np.array([1e-3, 0.05, -2e-3]) + 1e-4 * rng.standard_normal((20, 3))
@@ -507,10 +507,10 @@ def test_motions_stay_within_limits_for_any_input(
     robot = Robot(
         replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0, continuous=continuous)
     )
-    moves: list[Move] = []
+    moves: list[JointMotion] = []
     follow = robot.follow
 
-    def keep(move: Move | None) -> None:
+    def keep(move: JointMotion | None) -> None:
         if move is not None:
             moves.append(move)
         follow(move)

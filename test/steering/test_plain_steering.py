@@ -6,8 +6,8 @@ from dataclasses import replace
 from math import inf, sqrt, tau
 from typing import Any
 
-from needle_controller import Guidance, SteeringBelief, SteeringController, SteeringModel
-from needle_controller.steering.trial import drawn, insert
+from needle_controller import GuideSetpoint, SteeringController, SteeringModel, SteeringPrior
+from needle_controller.steering.simulation import drawn, insert
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
 import numpy as np
@@ -17,7 +17,7 @@ import pytest
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
 DEPTHS = np.linspace(0.0, 0.1, 11)
-TRUE = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1)
+TRUE = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
 MODELS = {
     bevel: SteeringModel(NEEDLE, replace(STEERING, bevel_load=(bevel,)), DEPTHS)
     for bevel in (0.0, 0.8)
@@ -174,14 +174,14 @@ class Plain:
         self.turned[k + 1 :] = ways[one]
         return self.best(others[one], tried)[1]
 
-    def plan(self) -> Guidance:
+    def plan(self) -> GuideSetpoint:
         """Advance to the next step."""
         k, last = self.step, self.model.steps - 1
         if k <= last:
             self.guide[k] = self.choose()
         self.step += 1
         at = self.guide[min(k, last)]
-        return Guidance(at.real, at.imag, self.roll)
+        return GuideSetpoint(at.real, at.imag, self.roll)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_a_hundred_insertions_equal_the_plain_formulas(
 
         def both(
             tip: FloatArray | None, ours: SteeringController = ours, plain: Plain = plain
-        ) -> Guidance:
+        ) -> GuideSetpoint:
             assert tip is not None
             to = ours.next(tip)
             plain.see(tip)

@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller.steering.outer_loop import OuterLoop, Phase
+from needle_controller.steering.executive import Phase, SteeringExecutive
 from needle_controller.steering.planning import (
     CancelledError,
     ComputedJob,
@@ -245,7 +245,7 @@ class Planning(Robot):
     def __init__(self) -> None:
         super().__init__()
         Manual.made = []
-        self.loop = OuterLoop(
+        self.loop = SteeringExecutive(
             NEEDLE, STEERING, self.loop._belief, SETTINGS, lambda: self.seconds, Manual
         )
         self.tick(20)

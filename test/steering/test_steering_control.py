@@ -11,12 +11,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import (
-    Guidance,
+    GuideSetpoint,
     OutOfReachError,
-    SteeringBelief,
     SteeringController,
     SteeringFaultError,
     SteeringModel,
+    SteeringPrior,
 )
 from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
 from needle_dynamics import (
@@ -57,7 +57,7 @@ def steer(
 ) -> FloatArray:
     """Insert a needle; return the final tip position. Each measurement has its own noise."""
     rng = np.random.default_rng(seed)
-    to = Guidance(0.0, 0.0)
+    to = GuideSetpoint(0.0, 0.0)
     begun = needle.roll
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
@@ -71,7 +71,7 @@ def steer(
 def test_predictions_agree_with_the_simulated_needle(length: float, skin: float) -> None:
     """The tip at each depth agrees with `SteeredNeedle`, for any guide, tilt and bevel."""
     needle, steering = other(length, skin)
-    alone = SteeringModel(needle, steering, DEPTHS, SteeringBelief(spread=0.0))
+    alone = SteeringModel(needle, steering, DEPTHS, SteeringPrior(spread=0.0))
     assert alone.guide.shape == (1, 21, 20)
     rng = np.random.default_rng(2)
     guide, tilt = 3e-3 * rng.standard_normal((20, 2)), np.array([0.02, -0.01])
@@ -87,7 +87,7 @@ def test_predictions_agree_with_the_simulated_needle(length: float, skin: float)
 
 def test_path_curvature_is_linear_between_depths() -> None:
     """A constant curvature of the path equals the path of a bevel with the corresponding load."""
-    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
+    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(spread=0.0))
     load = NEEDLE.bending_stiffness / 0.035
     # Loads by cells of 1.25 mm, against one load of all cells.
     assert_allclose(alone.causes[0, :, 4:].sum(axis=1), load * alone.causes[0, :, 3], atol=2e-5)
@@ -126,7 +126,10 @@ def test_target_is_hit_within_the_prior_uncertainty(
 def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
     """Of needle and controller, half way in; they end at the same tip as the originals."""
     one, controller = SteeredNeedle(*other(0.9)), SteeringController(MODEL, (2e-3, 1e-3))
-    to, copies = Guidance(0.0, 0.0), list[tuple[SteeredNeedle, SteeringController, Guidance]]()
+    to, copies = (
+        GuideSetpoint(0.0, 0.0),
+        list[tuple[SteeredNeedle, SteeringController, GuideSetpoint]](),
+    )
     rng = np.random.default_rng(3)
     for k, look in enumerate(1e-6 * rng.standard_normal((21, 2))):
         pairs = [(one, controller, to), *copies]
@@ -318,7 +321,7 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ParameterError, match='load_limit must be > 0'):
         SteeringController(MODEL, (0.0, 0.0), load_limit=0.0)
     with pytest.raises(ParameterError, match='spread must be finite'):
-        SteeringBelief(spread=-0.1)
+        SteeringPrior(spread=-0.1)
     controller = SteeringController(MODEL, (0.0, 0.0))
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.next([0.0, 0.0, 0.0])
@@ -347,7 +350,7 @@ def test_baselines_behave_as_published() -> None:
     assert miss['Broyden'] < miss['open']
     # A missing measurement causes no motion.
     rests = Broyden(NEEDLE, STEERING, DEPTHS, target)
-    assert rests.next(None) == Guidance(0.0, 0.0)
+    assert rests.next(None) == GuideSetpoint(0.0, 0.0)
 
 
 #: A nominal needle with a bevel.
@@ -357,7 +360,7 @@ BEVEL_MODEL = SteeringModel(NEEDLE, BEVELED, DEPTHS)
 
 def test_tip_and_load_are_linear_in_guide_roll_and_bevel() -> None:
     """As in a `SteeredNeedle` that is turned in every step; the load after each motion."""
-    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
+    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(spread=0.0))
     rng = np.random.default_rng(2)
     guide, rolls = 3e-3 * rng.standard_normal((20, 2)), np.cumsum(rng.standard_normal(20))
     one = SteeredNeedle(NEEDLE, replace(STEERING, bevel_load=(0.3,)), tilt=(0.02, -0.01))
@@ -410,7 +413,7 @@ def test_bevel_is_turned_towards_the_target(
 def test_guide_with_limited_steps_hits_the_target() -> None:
     """A third of its range per step; targets out of reach are rejected."""
     controller = SteeringController(MODEL, (3e-3, 2e-3), step_limit=2e-3)
-    one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), Guidance(0.0, 0.0), [0.0]
+    one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), GuideSetpoint(0.0, 0.0), [0.0]
     rng = np.random.default_rng(1)
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
@@ -430,7 +433,11 @@ def test_guide_load_stays_within_its_limit() -> None:
     target, loads, miss = (3e-3, 2e-3), {}, {}
     for limit in (np.inf, 2.0):
         controller = SteeringController(MODEL, target, load_limit=limit)
-        one, to, felt = SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)), Guidance(0.0, 0.0), [0.0]
+        one, to, felt = (
+            SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)),
+            GuideSetpoint(0.0, 0.0),
+            [0.0],
+        )
         rng = np.random.default_rng(1)
         for k, depth in enumerate(DEPTHS.tolist()):
             if k:

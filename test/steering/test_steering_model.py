@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import pi
 import time
 
-from needle_controller import SteeringBelief, SteeringModel
+from needle_controller import SteeringModel, SteeringPrior
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 import numpy as np
 from numpy.testing import assert_allclose
@@ -17,7 +17,7 @@ NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
 NEEDLE = replace(NEEDLE, layer_depths=(0.03125,), layer_stiffnesses=(4e4,))
 STEERING = replace(_STEERING, skin_stiffness=400.0, bevel_load=(1.0, 0.5), element=1.25e-3)
 DEPTHS = np.linspace(0.005, 0.08, 16)
-EXACT = SteeringBelief(spread=0.0)
+EXACT = SteeringPrior(spread=0.0)
 
 
 @pytest.mark.parametrize('together', [False, True])

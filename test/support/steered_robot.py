@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from needle_controller import OuterLoop, OuterLoopSettings, SteeringBelief
-from needle_controller.steering.motion import Move
+from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
+from needle_controller.steering.motion import JointMotion
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 from needle_ros.contract import JOINT_TRAJECTORY
 from needle_ros.status import RequestLog, Verdict
@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
-SETTINGS = OuterLoopSettings(look_time=0.2)
+SETTINGS = ExecutiveSettings(look_time=0.2)
 #: Period of the robot and its tracker [ns].
 PERIOD = 10_000_000
 SECOND = 100 * PERIOD
@@ -30,11 +30,11 @@ class Robot:
     """Outer loop, robot and needle in tissue softer than the prior."""
 
     def __init__(
-        self, own: OuterLoopSettings = SETTINGS, belief: SteeringBelief | None = None
+        self, own: ExecutiveSettings = SETTINGS, belief: SteeringPrior | None = None
     ) -> None:
         self.seconds = 0.0
-        self.loop = OuterLoop(
-            NEEDLE, STEERING, belief or SteeringBelief(), own, steady=lambda: self.seconds
+        self.loop = SteeringExecutive(
+            NEEDLE, STEERING, belief or SteeringPrior(), own, steady=lambda: self.seconds
         )
         softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
@@ -56,7 +56,7 @@ class Robot:
             name: RequestLog({JOINT_TRAJECTORY: joints}, steady=lambda: self.seconds)
             for name, joints in self.moved.items()
         }
-        self.rejects: Callable[[str, Move], str] = lambda _name, _move: ''
+        self.rejects: Callable[[str, JointMotion], str] = lambda _name, _move: ''
         self.paused = False
         #: Stamps of the executed motions, by joint.
         self.begun: list[int] = []
@@ -89,7 +89,7 @@ class Robot:
     def joints(stamp: int, at: Any) -> Reading:
         return Reading(stamp, '', NAMES, (tuple(at), (0.0,) * 3, ()))
 
-    def take(self, take: Callable[[Any, int], Move | None], message: Any) -> None:
+    def take(self, take: Callable[[Any, int], JointMotion | None], message: Any) -> None:
         """Pass a message to the loop, and send the returned motion."""
         self.follow(take(message, self.now))
 
@@ -97,13 +97,13 @@ class Robot:
         """Deliver a message; here immediately."""
         deliver()
 
-    def follow(self, move: Move | None) -> None:
+    def follow(self, move: JointMotion | None) -> None:
         """Send a motion to all nodes with joints."""
         if move is not None:
             for name, log in self.logs.items():
                 self.post('joint_trajectory', partial(self.execute, name, log, move))
 
-    def execute(self, name: str, log: RequestLog, move: Move) -> None:
+    def execute(self, name: str, log: RequestLog, move: JointMotion) -> None:
         """Start the motion of the own joints at their positions, and acknowledge it."""
         own = [joint for joint in move.joints if joint in self.moved[name]]
         if not own:

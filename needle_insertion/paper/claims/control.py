@@ -18,10 +18,10 @@ from needle_insertion.paper.runs import (
     INVERSE_DYNAMICS_KV,
     LAWS,
     open_loop,
-    Outcome,
     PID_KP,
     PID_KV,
     READINGS,
+    RunOutcome,
 )
 import numpy as np
 
@@ -65,7 +65,7 @@ def _positive_definite() -> Finding:
     # The textbook form holds the force of the last sample for a period of 1 ms.
     decay = exp(-p.viscous_friction / p.moving_mass * 1e-3)
     textbook = decay - (1.0 - decay) * PID_KV / p.viscous_friction
-    ends = [Outcome.of(_with_hub(law)).final for law in LAWS]
+    ends = [RunOutcome.of(_with_hub(law)).final for law in LAWS]
     return finding(
         {'at_1_khz': slow, 'at_1_mhz': fast, 'textbook': textbook},
         always=max(slow, fast) < 1.0,
@@ -99,7 +99,7 @@ def _turns(run: LoopRun) -> int:
 
 def _tip_varies() -> Finding:
     """Test figure 4 by the peak of the tip deflection."""
-    found = [Outcome.of(open_loop(*case)) for case in CASES]
+    found = [RunOutcome.of(open_loop(*case)) for case in CASES]
     return finding(
         {
             'turns': _turns(open_loop(*CASES[0])),
@@ -119,7 +119,7 @@ def _smoother() -> Finding:
     free_run = open_loop('paper_mm', 'complete')
     free, controlled = rate(free_run), max(rate(_with_hub(law)) for law in LAWS)
     alone = min(rate(base_alone(law, 'paper_mm')) for law in LAWS)
-    peaks = [1e3 * abs(Outcome.of(run).peak) for run in (free_run, *map(_with_hub, LAWS))]
+    peaks = [1e3 * abs(RunOutcome.of(run).peak) for run in (free_run, *map(_with_hub, LAWS))]
     return finding(
         {
             'free': free,
@@ -135,12 +135,14 @@ def _smoother() -> Finding:
 def _zero_deflection() -> Finding:
     """Test the remaining deflection under inverse dynamics."""
     modal = max(
-        Outcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
+        RunOutcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
         for case in CASES
         for hub in (False, True)
     )
-    alone = min(Outcome.of(base_alone('inverse_dynamics', reading)).final for reading in READINGS)
-    pid = Outcome.of(_with_hub('pid')).final
+    alone = min(
+        RunOutcome.of(base_alone('inverse_dynamics', reading)).final for reading in READINGS
+    )
+    pid = RunOutcome.of(_with_hub('pid')).final
     return finding(
         {'modal_nm': 1e9 * modal, 'alone_mm': 1e3 * alone, 'pid_nm': 1e9 * pid},
         always=alone < 1e-6,
@@ -154,7 +156,7 @@ def _fully_inserted() -> Finding:
         closed_loop('inverse_dynamics', 'paper_si', 'complete', hub_stop=hub)
         for hub in (False, True)
     )
-    deepest, stopped = Outcome.of(free).deepest, Outcome.of(held).deepest
+    deepest, stopped = RunOutcome.of(free).deepest, RunOutcome.of(held).deepest
     return finding(
         {'deepest_cm': 100.0 * deepest, 'arrival': hub_time(held)},
         always=deepest <= 0.2,
@@ -165,7 +167,7 @@ def _fully_inserted() -> Finding:
 def _minimum_deflection() -> Finding:
     """Compare the PID gains with four other pairs of gains by the peak deflection."""
     pairs = (1.0, 1.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)
-    peaks = {pair: 1e3 * abs(Outcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
+    peaks = {pair: 1e3 * abs(RunOutcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
     best = min(peaks, key=lambda pair: peaks[pair])
     paper = peaks[1.0, 1.0]
     return finding(

@@ -17,7 +17,7 @@ from needle_insertion.paper.claims import (
 )
 from needle_insertion.paper.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
 from needle_insertion.paper.mismatch import Mismatch
-from needle_insertion.report.content import Grid, Section
+from needle_insertion.report.content import Grid, ReportSection
 import yaml
 
 
@@ -63,10 +63,10 @@ def _judged(entry: dict[str, Any], tables: Tables, study: Mismatch) -> Claim:
     return Claim(**words, verdict=finding.verdict, numbers=finding.numbers)
 
 
-def section(found: list[Claim]) -> Section:
+def section(found: list[Claim]) -> ReportSection:
     """Return the section of the results page: number of verdicts, and table of claims."""
     verdicts = [one.verdict for one in found]
-    return Section(
+    return ReportSection(
         title='Claims of the paper',
         paragraphs=(
             (

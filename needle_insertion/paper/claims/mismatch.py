@@ -14,8 +14,8 @@ from needle_insertion.paper.runs import (
     DEPTH,
     LAWS,
     needle,
-    Outcome,
     paper_law,
+    RunOutcome,
 )
 import numpy as np
 
@@ -38,7 +38,7 @@ def _informed(study: Mismatch) -> Finding:
         method='DOP853',
     )
     inverse, pid = (
-        1e3 * abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).error)
+        1e3 * abs(RunOutcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).error)
         for law in LAWS
     )
     finals, at_once = (

@@ -15,8 +15,8 @@ from needle_insertion.paper.runs import (
     hub_time,
     needle,
     open_loop,
-    Outcome,
     READINGS,
+    RunOutcome,
 )
 import numpy as np
 from scipy.linalg import eigh
@@ -104,7 +104,7 @@ def _two_modes_cause() -> Finding:
 
 def _deflection_changes() -> Finding:
     """Test whether only an initial deflection grows during insertion."""
-    peaks = {case: abs(Outcome.of(open_loop(*case)).peak) for case in CASES}
+    peaks = {case: abs(RunOutcome.of(open_loop(*case)).peak) for case in CASES}
     straight = max(
         float(np.abs(open_loop(reading, 'complete', 0.0).tip_deflection).max())
         for reading in READINGS
@@ -183,7 +183,7 @@ def _transients() -> Finding:
     """Test static models by the decay time of a deflection."""
     p = NeedleParameters.preset('phantom')
     fade = p.linear_density * 2.0 / p.tissue_damping
-    rings = Outcome.of(open_loop('paper_mm', 'complete')).final
+    rings = RunOutcome.of(open_loop('paper_mm', 'complete')).final
     return finding(
         {'rings_mm': 1e3 * rings, 'fade_ms': 1e3 * fade},
         always=False,

@@ -11,7 +11,7 @@ _BORNE: Final = 0.05
 _FEW: Final = 3.0
 
 
-class Lateness:
+class LatencyMonitor:
     """
     Count the commands that are later than the delay of the control laws.
 

@@ -18,7 +18,7 @@ _NORMAL: Final = 1.4826
 _FEW: Final = 3
 
 
-class Seen(NamedTuple):
+class AveragedTipMeasurement(NamedTuple):
     """
     Result of an averaged tip measurement.
 
@@ -41,7 +41,7 @@ class Seen(NamedTuple):
     frozen: bool
 
 
-class Look:
+class TipMeasurements:
     """Averaged tip measurement at a depth, or during the motion through it."""
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ class Look:
         """Add a reading of the tip, x, y, z [m], at a distance before the depth [m]."""
         self._readings.append((*tip, before))
 
-    def seen(self, noise: float) -> Seen | None:
+    def seen(self, noise: float) -> AveragedTipMeasurement | None:
         """
         Return the mean without outliers, or during motion a fitted line at the depth; or None.
 
@@ -71,7 +71,7 @@ class Look:
             scatter = np.maximum(_NORMAL * np.median(off, axis=0), noise * sqrt(len(tips)))
             kept = np.asarray((off <= _OUTLIER * scatter).all(axis=1))
             if kept.sum() < basis.shape[1]:
-                return Seen(_fitted(basis, tips)[0], 0.0, 1, frozen=False)
+                return AveragedTipMeasurement(_fitted(basis, tips)[0], 0.0, 1, frozen=False)
         tips, basis = tips[kept], basis[kept]
         found, count = np.linalg.lstsq(basis, tips, rcond=None)[0], len(tips)
         left, error = tips - basis @ found, 0.0
@@ -86,7 +86,7 @@ class Look:
         if frozen:
             # Exactly, so that measurements can be compared.
             tip[[0, 2]] = across[0]
-        return Seen(tip, error, count, frozen)
+        return AveragedTipMeasurement(tip, error, count, frozen)
 
 
 def _fitted(basis: FloatArray, tips: FloatArray) -> FloatArray:

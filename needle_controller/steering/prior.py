@@ -8,7 +8,7 @@ from needle_ros.settings import check_constants, constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringBelief:
+class SteeringPrior:
     """
     Prior uncertainty of needle, tissue, guide, path and sensor.
 

@@ -15,26 +15,26 @@ from math import ceil, sqrt
 from time import monotonic
 from typing import Final
 
-from needle_controller.safety.stream import Stream
-from needle_controller.steering.belief import SteeringBelief
+from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.steering.controller import (
-    Guidance,
+    GuideSetpoint,
     SteeringController,
     SteeringFaultError,
     TipEstimate,
 )
-from needle_controller.steering.look import Look, Seen
 from needle_controller.steering.monitor import MotionMonitor
-from needle_controller.steering.motion import duration_of, Move, smooth
+from needle_controller.steering.motion import duration_of, JointMotion, smooth
 from needle_controller.steering.planning import ComputedJob, Job, Progress, StartJob
+from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import OuterLoopSettings
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.tip_measurement import AveragedTipMeasurement, TipMeasurements
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import ENTRY, INSERTION, JOINT_STATES, ROLL, TARGET, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
-from needle_ros.journal import Journal, Severity
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.status import RequestLog, RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
@@ -99,7 +99,7 @@ _DESCRIPTIONS: Final = {
 }
 
 
-class OuterLoop:
+class SteeringExecutive:
     """
     Execute a steered insertion, and stop it on any fault.
 
@@ -113,20 +113,20 @@ class OuterLoop:
         Nominal needle and tissue.
     steering : SteeringParameters
         Their constants for steering.
-    belief : SteeringBelief
+    belief : SteeringPrior
         Prior uncertainty of all constants.
-    settings : OuterLoopSettings
+    settings : ExecutiveSettings
         Steps, tip measurements and limits.
     steady : callable
-        As for `Journal`.
+        As for `EventLog`.
     start : callable
         Starts the computation of a plan, see `StartJob`.
 
     Attributes
     ----------
-    settings : OuterLoopSettings
+    settings : ExecutiveSettings
         As given.
-    journal : Journal
+    journal : EventLog
         Lines for the log.
     requests : RequestLog
         Targets, and the answers to them.
@@ -145,18 +145,18 @@ class OuterLoop:
         self,
         needle: NeedleParameters,
         steering: SteeringParameters,
-        belief: SteeringBelief,
-        settings: OuterLoopSettings,
+        belief: SteeringPrior,
+        settings: ExecutiveSettings,
         steady: Callable[[], float] = monotonic,
         start: StartJob = ComputedJob,
     ) -> None:
         self._needle, self._steering, self._belief = needle, steering, belief
         self.settings = settings
-        self.journal = Journal(steady)
+        self.journal = EventLog(steady)
         self.requests = RequestLog({TARGET: (INSERTION,)}, ('', ENTRY), steady)
         timeout = settings.measurement_timeout
-        self._joint_stream = Stream(JOINT_STATES.name, timeout, jumps=_JUMPS)
-        self._tip_stream = Stream(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
+        self._joint_stream = InputMonitor(JOINT_STATES.name, timeout, jumps=_JUMPS)
+        self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self.phase, self.fault = Phase.IDLE, ''
         self.control: SteeringController | None = None
         self.expected: TipEstimate | None = None
@@ -178,7 +178,7 @@ class OuterLoop:
         self._due = 0
         self._monitor = MotionMonitor(settings.joints, settings.tolerances)
         #: Creates the motion again, from the present positions.
-        self._again: Callable[[int], Move | None] = lambda _now: None
+        self._again: Callable[[int], JointMotion | None] = lambda _now: None
         #: Stamp of the newest motion [ns], unique for each motion.
         self._stamp = 0
         #: Positions of the stop, stamp [ns] and insertion depth [m] of the last check for rest,
@@ -190,19 +190,19 @@ class OuterLoop:
         self._scatter = 0.0
         #: Stamp [ns] and insertion depth [m] at the start of rest.
         self._rest: tuple[int, float] | None = None
-        self._look: Look | None = None
+        self._look: TipMeasurements | None = None
         #: Stamps between which readings belong to a measurement at rest [ns].
         self._span = 0, 0
         #: Continuous: measurements at the depths, the last depth that was passed, positions of the
         #: guide before and after the next one [m], and when it was sent last [ns].
-        self._passing: dict[int, Look] = {}
+        self._passing: dict[int, TipMeasurements] = {}
         self._passed = 0
         self._between = np.zeros((2, 2))
         self._sent = 0
         #: An earlier stamp [ns] and insertion depth [m], and insertion speed [m/s].
         self._before: tuple[int, float] | None = None
         self._speed = 0.0
-        self._seen: Seen | None = None
+        self._seen: AveragedTipMeasurement | None = None
         #: Depth of the tip less the insertion depth, at the first measurement [m].
         self._ahead: float | None = None
         self._warned = False
@@ -229,7 +229,7 @@ class OuterLoop:
 
     def target(
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
-    ) -> Move | None:
+    ) -> JointMotion | None:
         """
         Plan an insertion to a target and begin it; during an insertion, change its target.
 
@@ -246,7 +246,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send.
 
         """
@@ -364,7 +364,7 @@ class OuterLoop:
         self.requests.answer(TARGET, self._wanted[0], verdict, why)
         self.journal.say(Severity.INFO, f'planning cancelled: {why}')
 
-    def _begin_if_planned(self, now: int) -> Move | None:
+    def _begin_if_planned(self, now: int) -> JointMotion | None:
         """Begin the insertion once its plan is computed."""
         job = self._job
         if job is None or not job.done:
@@ -391,7 +391,7 @@ class OuterLoop:
         straight[1:3] = 0.0
         return self._send(Phase.GUIDING, straight, now)
 
-    def stop(self, why: str, now: int, silence: float = 0.0) -> Move | None:
+    def stop(self, why: str, now: int, silence: float = 0.0) -> JointMotion | None:
         """
         Stop the insertion: needle and guide brake to rest at their positions; cancel a plan.
 
@@ -406,7 +406,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send; None if no joint has to be stopped.
 
         """
@@ -428,18 +428,18 @@ class OuterLoop:
         self._halt, self._halted, self._stops = end, None, _STOPS
         return self._send_stop(now)
 
-    def _send_stop(self, now: int) -> Move | None:
+    def _send_stop(self, now: int) -> JointMotion | None:
         if self._halt is None:
             return None
         end, joints = self._halt, self.settings.joints
-        halt = Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
+        halt = JointMotion(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
         self._stops -= 1
         halt = self._stamped(halt, now)
         self._monitor.forget()
         self._monitor.stream(halt)
         return halt
 
-    def _stop_again(self, stamp: int, depth: float, now: int) -> Move | None:
+    def _stop_again(self, stamp: int, depth: float, now: int) -> JointMotion | None:
         """Send the stop again to a needle that still moves."""
         if self._halted is None:
             self._halted = stamp, depth
@@ -459,7 +459,7 @@ class OuterLoop:
         )
         return self._send_stop(now)
 
-    def hear(self, node: str, status: RequestStatus, now: int) -> Move | None:
+    def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
         """
         Process the status of another node: its answers to the motions.
 
@@ -474,7 +474,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send.
 
         """
@@ -491,7 +491,7 @@ class OuterLoop:
 
     # Measurements.
 
-    def joints(self, reading: Reading, now: int) -> Move | None:
+    def joints(self, reading: Reading, now: int) -> JointMotion | None:
         """
         Process `joint_states`.
 
@@ -504,7 +504,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send.
 
         """
@@ -544,7 +544,7 @@ class OuterLoop:
             return self._follow(reading.stamp, now)
         return self._wait(reading.stamp, now)
 
-    def _repeat(self, now: int) -> Move | None:
+    def _repeat(self, now: int) -> JointMotion | None:
         """Send the motion again: the message may have been lost."""
         failure = f'{self._missed(self._monitor.pending)}: {self._monitor.failure()}'
         if self._monitor.exhausted:
@@ -582,7 +582,7 @@ class OuterLoop:
                 )
         return ' and '.join(missed)
 
-    def _wait(self, stamp: int, now: int) -> Move | None:
+    def _wait(self, stamp: int, now: int) -> JointMotion | None:
         """Wait until needle and guide rest at their goal."""
         if stamp < self._due or self._at is None:
             return None
@@ -599,11 +599,11 @@ class OuterLoop:
             self._rest = stamp, depth
         elif stamp - self._rest[0] >= self.settings.settle_time * NANOSECONDS:
             self.phase = Phase.MEASURING
-            self._look = Look()
+            self._look = TipMeasurements()
             self._span = stamp, stamp + round(self.settings.look_time * NANOSECONDS)
         return None
 
-    def tip(self, reading: Reading, now: int) -> Move | None:
+    def tip(self, reading: Reading, now: int) -> JointMotion | None:
         """
         Process `tip_deflection`.
 
@@ -614,7 +614,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send.
 
         """
@@ -634,11 +634,11 @@ class OuterLoop:
             depth = float(self._at[0]) - self._speed * (now - reading.stamp) / NANOSECONDS
             at = int(np.searchsorted(self._depths, depth))
             if 0 < at < len(self._depths):
-                look = self._passing.setdefault(at, Look())
+                look = self._passing.setdefault(at, TipMeasurements())
                 look.take(tip, float(self._depths[at]) - depth)
         return None
 
-    def watch(self, now: int) -> Move | None:
+    def watch(self, now: int) -> JointMotion | None:
         """
         Check for missing inputs, and whether a plan is computed; call it ten times a second.
 
@@ -649,7 +649,7 @@ class OuterLoop:
 
         Returns
         -------
-        Move or None
+        JointMotion or None
             Motion to send.
 
         """
@@ -691,7 +691,7 @@ class OuterLoop:
 
     # Steps.
 
-    def _step(self, now: int) -> Move | None:
+    def _step(self, now: int) -> JointMotion | None:
         """End a measurement of the tip, and begin the next step."""
         control, look, self._look = self.control, self._look, None
         if control is None or look is None or self._at is None:
@@ -717,7 +717,11 @@ class OuterLoop:
         return self._send(Phase.GUIDING, goal, now)
 
     def _take(
-        self, control: SteeringController, look: Look | None, at: int, depth: float | None = None
+        self,
+        control: SteeringController,
+        look: TipMeasurements | None,
+        at: int,
+        depth: float | None = None,
     ) -> None:
         """Update the controller by a tip measurement, which may have no readings."""
         if look is None:
@@ -732,7 +736,7 @@ class OuterLoop:
         self._scatter = max(self._scatter, seen.error * sqrt(seen.readings))
         control.see(seen.tip[[0, 2]], at, max(seen.error, self._scatter / sqrt(seen.readings)))
 
-    def _planned_at(self, control: SteeringController, k: int) -> Guidance:
+    def _planned_at(self, control: SteeringController, k: int) -> GuideSetpoint:
         """Plan the next step, and log a new warning."""
         to = control.plan()
         self.expected = control.expected()
@@ -744,7 +748,7 @@ class OuterLoop:
 
     # Continuous insertion.
 
-    def _insert(self, now: int, begin: float, *, again: bool = False) -> Move:
+    def _insert(self, now: int, begin: float, *, again: bool = False) -> JointMotion:
         """Send the needle to the target depth."""
         start, end = np.array([begin]), self._depths[[-1]]
         self._goal = np.array([end[0], *self._between[1]])
@@ -762,7 +766,7 @@ class OuterLoop:
         at = float(self._at[0]) if self._at is not None else 0.0
         return min(max(at, float(self._origin[0])), float(self._goal[0]))
 
-    def _follow(self, stamp: int, now: int) -> Move | None:
+    def _follow(self, stamp: int, now: int) -> JointMotion | None:
         """Send the guide with the needle, and plan at each passed depth."""
         control, at = self.control, self._at
         if control is None or at is None:
@@ -802,7 +806,7 @@ class OuterLoop:
         self._monitor.stream(move)
         return move
 
-    def _end_guide(self, now: int, *, again: bool = False) -> Move | None:
+    def _end_guide(self, now: int, *, again: bool = False) -> JointMotion | None:
         """Send the guide to the end of the last step, with a check of its arrival."""
         if self._at is None:
             return None
@@ -813,8 +817,8 @@ class OuterLoop:
 
     def _guide_to(
         self, position: FloatArray, velocity: FloatArray, duration: float, now: int
-    ) -> Move:
-        move = Move(
+    ) -> JointMotion:
+        move = JointMotion(
             self.settings.joints[1:3],
             np.array([duration]),
             position[np.newaxis],
@@ -833,7 +837,7 @@ class OuterLoop:
             )
         try:
             if k > 1:
-                self._take(control, self._passing.pop(k - 1, Look()), k - 1)
+                self._take(control, self._passing.pop(k - 1, TipMeasurements()), k - 1)
         except SteeringFaultError as error:
             return str(error)
         to = self._planned_at(control, k)
@@ -843,7 +847,7 @@ class OuterLoop:
 
     # Faults and motions.
 
-    def _slip(self, seen: Seen | None, depth: float) -> str:
+    def _slip(self, seen: AveragedTipMeasurement | None, depth: float) -> str:
         """Return the fault if tip depth and insertion depth differ, '' if not."""
         if seen is None:
             return ''
@@ -860,13 +864,13 @@ class OuterLoop:
             'than the needle was inserted: it slips, or the sensor measures another needle'
         )
 
-    def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:
+    def _send(self, phase: Phase, goal: FloatArray, now: int) -> JointMotion | None:
         """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         self._origin, self._goal = self._goal, goal
         return self._move(now, self._origin)
 
-    def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> Move | None:
+    def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> JointMotion | None:
         duration = duration_of(self._goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)
         if np.abs(self._goal - begin).max() < _SAME:
@@ -881,7 +885,7 @@ class OuterLoop:
         self._monitor.begin(move, begin, again=again)
         return move
 
-    def _stamped(self, move: Move, now: int) -> Move:
+    def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
         self._stamp = max(now, self._stamp + 1)
         return move._replace(stamp=self._stamp)

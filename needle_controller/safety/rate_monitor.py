@@ -17,7 +17,7 @@ _BORNE: Final = 0.2
 _SHARE: Final = 0.9
 
 
-class Pace:
+class RateMonitor:
     """
     Compare the time between two measurements, by their stamps, with the period.
 

@@ -33,7 +33,7 @@ class Refusal(NamedTuple):
         return self.kind in (REPEATED, DROPPED)
 
 
-class Stream:
+class InputMonitor:
     """
     Check the messages of one topic.
 

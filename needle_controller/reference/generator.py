@@ -18,7 +18,7 @@ REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
 }
 
 
-class Guide:
+class ReferenceGenerator:
     """
     Reference generator: moves to a target or along a path, and can be paused.
 

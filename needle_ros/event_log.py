@@ -28,7 +28,7 @@ class Severity(IntEnum):
         return bytes([self])
 
 
-class Journal:
+class EventLog:
     """
     Event log: collects log lines until the node publishes them.
 

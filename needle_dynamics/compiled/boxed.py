@@ -18,14 +18,14 @@ _Value = TypeVar('_Value')
 
 @structref.register
 class _HeldType(types.StructRef):  # type: ignore[misc, name-defined]
-    """Numba's type of `Held`."""
+    """Numba's type of `Boxed`."""
 
     def preprocess_fields(self, fields: Any) -> Any:
         """Return the fields with non-literal types."""
         return tuple((name, types.unliteral(kind)) for name, kind in fields)  # type: ignore[attr-defined]
 
 
-class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
+class Boxed(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     """
     A value that compiled functions take without conversion; its arrays are not copied.
 
@@ -39,30 +39,30 @@ class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     value: _Value
     _kept: _Value
 
-    def __new__(cls, value: _Value) -> Held[_Value]:
+    def __new__(cls, value: _Value) -> Boxed[_Value]:
         held = _hold(value)
         held._kept = value
         return held
 
-    def __reduce__(self) -> tuple[type[Held[_Value]], tuple[_Value]]:
+    def __reduce__(self) -> tuple[type[Boxed[_Value]], tuple[_Value]]:
         """Pickle the value, which is converted again in the copy."""
-        return Held, (self._kept,)
+        return Boxed, (self._kept,)
 
 
-structref.define_proxy(Held, _HeldType, ['value'])
+structref.define_proxy(Boxed, _HeldType, ['value'])
 
 
 def held_type(value: Any) -> Any:
-    """Return Numba's type of `Held` for Numba's type of the value."""
+    """Return Numba's type of `Boxed` for Numba's type of the value."""
     return _HeldType([('value', value)])
 
 
 def prepare_hold(kind: Any) -> None:
-    """Load or compile the conversion to a `Held` type; other types need no conversion."""
+    """Load or compile the conversion to a `Boxed` type; other types need no conversion."""
     if isinstance(kind, _HeldType):
         _hold.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
 
 
 @compiled
-def _hold(value: _Value) -> Held[_Value]:
-    return Held(value)
+def _hold(value: _Value) -> Boxed[_Value]:
+    return Boxed(value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Answer(NamedTuple):
+class ForceCommand(NamedTuple):
     """
     Force command in response to a measurement.
 
@@ -29,9 +29,9 @@ class Answer(NamedTuple):
     error: tuple[float, ...] = ()
 
 
-class Reply(NamedTuple):
+class ServiceResult(NamedTuple):
     """Result of a service call, with a force command to publish or None."""
 
     success: bool
     message: str
-    answer: Answer | None = None
+    answer: ForceCommand | None = None

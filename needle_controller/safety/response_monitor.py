@@ -21,7 +21,7 @@ class _Mark(NamedTuple):
     aim: float
 
 
-class Following:
+class ResponseMonitor:
     """
     Compare the commanded force with the response that the robot reports.
 

@@ -12,7 +12,7 @@ from needle_ros.contract import Topic
 import numpy as np
 
 
-class Quantity(NamedTuple):
+class Variable(NamedTuple):
     """A variable that may differ from sample to sample."""
 
     #: Value if it is not in the population.
@@ -25,7 +25,7 @@ class Quantity(NamedTuple):
     high: float = inf
 
 
-class Figure(NamedTuple):
+class Metric(NamedTuple):
     """A metric of a sample."""
 
     #: SI unit; '' for yes or no.
@@ -33,7 +33,7 @@ class Figure(NamedTuple):
     meaning: str
 
 
-class Seen(NamedTuple):
+class MeasuredRun(NamedTuple):
     """A message of a robot or a sensor in a replayed sample."""
 
     topic: Topic
@@ -43,13 +43,13 @@ class Seen(NamedTuple):
     values: Sequence[float]
 
 
-class Protocol(Interface):
+class Scenario(Interface):
     """Interface of a scenario, which is simulated with each sample."""
 
     #: Variables of a sample.
-    quantities: Mapping[str, Quantity]
+    quantities: Mapping[str, Variable]
     #: Metrics, the primary metric first.
-    figures: Mapping[str, Figure]
+    figures: Mapping[str, Metric]
 
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
@@ -60,27 +60,29 @@ class Protocol(Interface):
         Returns each metric, shape (n,): 1 for yes, NaN for a missing value.
         """
 
-    def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
         """Simulate one sample again; yield measurements and commands in time order per topic."""
 
 
 # Imported on demand: a study needs a single scenario.
 
 
-def _steering(settings: Mapping[str, Any]) -> Protocol:
+def _steering(settings: Mapping[str, Any]) -> Scenario:
     from needle_insertion.study.steering import SteeringProtocol
 
     return SteeringProtocol(settings)
 
 
-def _insertion(settings: Mapping[str, Any]) -> Protocol:
+def _insertion(settings: Mapping[str, Any]) -> Scenario:
     from needle_insertion.study.insertion import InsertionProtocol
 
     return InsertionProtocol(settings)
 
 
 #: Constructor of each scenario from the settings of a study.
-PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Protocol]]] = {
+PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
     'steering': _steering,
     'insertion': _insertion,
 }

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from math import hypot
 from typing import NamedTuple
 
-from needle_controller.steering.belief import SteeringBelief
-from needle_controller.steering.controller import Guidance
+from needle_controller.steering.controller import GuideSetpoint
+from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -17,7 +17,7 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Truth:
+class GroundTruth:
     """
     Ground truth of a simulated needle, and the rotation of its sensor.
 
@@ -58,10 +58,10 @@ class Truth:
 def drawn(
     needle: NeedleParameters,
     steering: SteeringParameters,
-    belief: SteeringBelief,
+    belief: SteeringPrior,
     rng: np.random.Generator,
     seed: int,
-) -> Truth:
+) -> GroundTruth:
     """
     Sample a true needle from the prior uncertainty of a nominal needle.
 
@@ -79,7 +79,7 @@ def drawn(
         path_noise_length=belief.path_noise_length,
     )
     x, z = tilt.tolist()
-    return Truth(
+    return GroundTruth(
         needle=needle, steering=steering, tilt=(x, z), bevel=bevel, frame=frame, seed=seed
     )
 
@@ -108,10 +108,10 @@ class Inserted(NamedTuple):
 
 
 def insert(
-    truth: Truth,
+    truth: GroundTruth,
     depths: FloatArray,
     look: Callable[[FloatArray], FloatArray | None],
-    controller: Callable[[FloatArray | None], Guidance],
+    controller: Callable[[FloatArray | None], GuideSetpoint],
     watch: Callable[[SteeredNeedle], object] | None = None,
 ) -> Inserted:
     """
@@ -122,7 +122,7 @@ def insert(
     for the next step. ``watch`` is called with the needle after each step.
     """
     one = truth.start()
-    begun, to, way, turns, load = one.roll, Guidance(0.0, 0.0), 0.0, 0, 0.0
+    begun, to, way, turns, load = one.roll, GuideSetpoint(0.0, 0.0), 0.0, 0, 0.0
     for k, depth in enumerate(depths.tolist()):
         if k:
             one.move(guide=to[:2], roll=begun + to.roll)

@@ -16,7 +16,7 @@ import numpy as np
 _LOOK: Final = 25
 
 
-class Bending:
+class LoadEstimator:
     """
     Load of the bent needle: estimated by an observer, from the simulation, or zero.
 
