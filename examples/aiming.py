@@ -1,7 +1,7 @@
 """
-Bring the tip of a needle to a target, in tissue that is softer than believed.
+Steer the tip of a needle to a target, in tissue that is softer than the nominal model.
 
-The guide moves after each look at the tip. A guide that rests misses by millimeters.
+The guide moves after each tip measurement. With a fixed guide the error is several millimeters.
 """
 
 from dataclasses import replace
@@ -32,7 +32,7 @@ def main() -> None:
 
     for name, tip in (('steered', one.tip), ('open loop', alone.tip)):
         print(f'{name}: {1e3 * np.hypot(*(tip[[0, 2]] - TARGET)):.2f} mm from the target')
-    print(f'bending length found: {100.0 * controller.bending:.0f} % of the believed one')
+    print(f'estimated bending length: {100.0 * controller.bending:.0f} % of the nominal value')
 
 
 if __name__ == '__main__':

@@ -1,8 +1,8 @@
 """
 Simulate many needles at once, on all cores.
 
-How deep does a needle go in one second if its friction is known only as Table 1 of the paper
-gives it: a mean and a standard deviation over twenty needles?
+Depth after one second of a needle with uncertain friction: mean and standard deviation over
+twenty needles from Table 1 of the paper.
 """
 
 from needle_dynamics import NeedleModel, NeedleParameters, simulate_batch

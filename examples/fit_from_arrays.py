@@ -1,8 +1,8 @@
 """
 Estimate friction from NumPy arrays, without a bag.
 
-The arrays here are made up: a needle that moves in and out at four velocities, with noise on the
-force. Put your own in their place: time, inserted length, velocity (or None) and force.
+The arrays here are synthetic: a needle that moves in and out at four velocities, with noise on
+the force. Replace them by your own: time, insertion depth, velocity (or None) and force.
 """
 
 from needle_identification import identify_friction, Recording
@@ -19,7 +19,7 @@ def strokes(rng: np.random.Generator) -> Recording:
         0.0,
     ]
     velocity = np.repeat(pattern, int(RATE))
-    # A real robot does not change its velocity at once.
+    # The acceleration of a real robot is finite.
     velocity = np.convolve(velocity, np.full(50, 1.0 / 50.0), mode='same')
     force = 0.5 * np.sign(velocity) + 250.0 * velocity
     return Recording(
@@ -32,7 +32,7 @@ def strokes(rng: np.random.Generator) -> Recording:
 
 
 def main() -> None:
-    """Identify, and print each parameter with its interval and each warning."""
+    """Identify friction, and print each parameter with its interval and each warning."""
     estimate = identify_friction(strokes(np.random.default_rng(seed=1)))
     for parameter in estimate.parameters:
         low, high = parameter.interval

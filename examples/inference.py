@@ -1,10 +1,10 @@
 """
-Infer how a needle bends and how its path wanders, from looks at its tip, without a likelihood.
+Infer bending length and path noise from tip measurements by simulation-based inference.
 
-The path of a needle wanders, and its frame, tilt and bevel are not known either. Nobody can write
-down how likely some looks are. But looks are easily simulated: for thousands of needles of a
-population, from which a neural network learns the posterior (NPE of the package sbi). Then it is
-tried on needles that it has not seen: an interval of 95 % must hold the truth in 95 of 100.
+Frame, tilt and bevel are nuisance variables, and the likelihood of the tip measurements has no
+closed form. A neural network learns the posterior from simulated insertions of a population (NPE
+of the package sbi). It is tested on further needles: an interval of 95 % must contain the true
+value in 95 of 100.
 
 Needs sbi, which brings PyTorch: pip install sbi
 """
@@ -23,8 +23,8 @@ from needle_dynamics.steering.parameters import with_lengths
 from needle_insertion.study.study import made
 import numpy as np
 
-#: What differs from needle to needle. Bending length and path noise are inferred; nobody asks for
-#: the others.
+#: Variables of the population. Bending length and path noise are inferred; the others are nuisance
+#: variables.
 POPULATION = {
     'bending_length': {'lognormal': [1.0, 0.2], 'within': [0.5, 2.0]},
     'path_noise': {'lognormal': [3e-4, 1.0], 'within': [1e-5, 1e-2]},
@@ -37,14 +37,14 @@ POPULATION = {
     'bevel_z': {'normal': [0, 0.1], 'within': [-0.5, 0.5]},
 }
 
-#: Depths of the looks [m], and what a look may be wrong by [m].
+#: Depths of the tip measurements [m], and their noise [m].
 DEPTHS = np.linspace(0.0, 0.1, 41)
 NOISE = 4e-5
 
-#: A stiffer layer from 40 mm on: the tissue is not the same everywhere.
+#: Depth of a second layer [m], and its stiffness relative to the first.
 LAYER, STIFFER = 0.04, 2.0
 
-#: Needles to learn from and to try it on, and draws of each posterior.
+#: Needles for training, needles for the test, and samples of each posterior.
 NEEDLES, TRIALS, DRAWS = 20_000, 1000, 1000
 
 
@@ -55,7 +55,7 @@ def population(count: int, seed: int) -> dict[str, FloatArray]:
 
 
 def guides() -> FloatArray:
-    """Return where the guide is at each look [m]: the needle must bend to tell how it does."""
+    """Return the guide positions at each measurement [m]; the motion makes the needle bend."""
     guide = np.zeros((len(DEPTHS), 2))
     guide[(DEPTHS > 0.01) & (DEPTHS <= 0.05), 0] = 4e-3
     guide[DEPTHS > 0.03, 1] = -4e-3
@@ -63,7 +63,7 @@ def guides() -> FloatArray:
 
 
 def looks(drawn: dict[str, FloatArray], seed: int) -> FloatArray:
-    """Insert needles, and look at their tips on the way [m]; shape (needles, looks, 2)."""
+    """Simulate insertions; return tip measurements [m], shape (needles, measurements, 2)."""
     needle, steering, _ = STEERING_PRESETS['bending_35mm']
     k = needle.tissue_stiffness
     needle = replace(needle, layer_depths=(LAYER,), layer_stiffnesses=(STIFFER * k,))
@@ -93,11 +93,11 @@ def looks(drawn: dict[str, FloatArray], seed: int) -> FloatArray:
 
 
 def summary(seen: FloatArray) -> FloatArray:
-    """Return the numbers from which is learned, shape (needles, 2 x 8 + 2 x 4)."""
-    # Where the tip goes [mm], without the first look: it is at the skin.
+    """Compute the summary statistics, shape (needles, 2 x 8 + 2 x 4)."""
+    # Tip positions [mm], without the first measurement, which is at the skin.
     coarse = 1e3 * seen[:, 5::5].reshape(len(seen), -1)
-    # How far it turns over longer and longer ways: noise of the looks is in the short ones,
-    # that of the path in the long ones.
+    # Change of slope over increasing distances: measurement noise dominates at short distances,
+    # path noise at long distances.
     turns = []
     for way in (1, 2, 4, 8):
         second = seen[:, 2 * way :] - 2.0 * seen[:, way:-way] + seen[:, : -2 * way]
@@ -106,19 +106,19 @@ def summary(seen: FloatArray) -> FloatArray:
 
 
 def unknown(drawn: dict[str, FloatArray]) -> FloatArray:
-    """Return what is to be inferred, shape (needles, 2): logarithms, which have no bounds."""
+    """Return logarithms of the inferred variables, shape (needles, 2); they have no bounds."""
     return np.log10(np.stack([drawn['bending_length'], drawn['path_noise']], axis=1))
 
 
 def learn(values: FloatArray, numbers: FloatArray) -> Any:
-    """Return the posterior that a network has learned."""
+    """Train the network, and return a function that samples its posterior."""
     try:
         from sbi.inference import NPE
         import torch
     except ModuleNotFoundError as error:
         raise SystemExit('this example needs sbi: pip install sbi') from error
     torch.manual_seed(1)
-    # The network is small: a second thread would cost more than it gains.
+    # The network is small: a second thread would slow down the training.
     torch.set_num_threads(1)
     given = [torch.as_tensor(one, dtype=torch.float32) for one in (values, numbers)]
     trainer = NPE(density_estimator='maf', show_progress_bars=False)
@@ -131,7 +131,7 @@ def learn(values: FloatArray, numbers: FloatArray) -> Any:
 
 
 def main() -> None:
-    """Simulate, learn, and check."""
+    """Simulate the population, train the network, and test the coverage."""
     begin = time.monotonic()
     drawn = population(NEEDLES + TRIALS, seed=1)
     values, numbers = unknown(drawn), summary(looks(drawn, seed=2))
@@ -157,7 +157,7 @@ def main() -> None:
 
 
 def show(truths: FloatArray, draws: FloatArray, ranks: FloatArray) -> Figure:
-    """Draw found over true values, the posterior of one needle, and how often intervals hold."""
+    """Plot estimated over true values, the posterior of two needles, and the coverage."""
     figure = Figure(figsize=(10.0, 6.4), layout='constrained')
     above, below = figure.subplots(2, 3)
     labels = ('log10 of relative bending length', 'log10 of path noise [rad^2/m]')

@@ -1,8 +1,8 @@
 """
-Estimate the deflection of the needle from measurements: encoders and a slow tip sensor.
+Estimate the deflection of the needle from measurements of encoders and a slow tip sensor.
 
 The measurements here are simulated: 1000 samples per second of depth and velocity, and 50 of the
-tip, with a noise of 0.1 mm. Put your own in their place.
+tip, with a noise of 0.1 mm. Replace them by your own.
 """
 
 from needle_controller import Observer, ObserverSettings
@@ -13,7 +13,7 @@ PERIOD = 1e-3
 
 
 def main() -> None:
-    """Observe an insertion of one second, and compare the estimate with the truth."""
+    """Observe an insertion of one second, and compare the estimate with the ground truth."""
     rng = np.random.default_rng(seed=1)
     parameters = NeedleParameters.preset('phantom')
     needle = Integrator(parameters, NeedleModel(parameters).state_at(0.1, tip_deflection=2e-3))

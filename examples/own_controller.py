@@ -1,8 +1,8 @@
 """
-Close the loop around the simulated needle with a control law of your own.
+Close the loop with the simulated needle and your own control law.
 
 A law is any object with a sample period, a delay and a method `command`. The shipped controller
-is one, too, so that both run in the same loop.
+is such an object, so that both run in the same loop.
 """
 
 from needle_controller import Controller, ControllerOutput, Measurement, run_controller
@@ -13,17 +13,17 @@ TARGET = 0.05
 
 
 class Spring:
-    """A spring to the target, and damping; the delay is in periods."""
+    """Spring to the target with damping; the delay is in periods."""
 
     period, delay = 1e-3, 1
 
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
-        """Return the force for a measurement; `load` is the known force of a bent needle."""
+        """Compute the force for a measurement; `load` [N] is the force of a bent needle."""
         return ControllerOutput(force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.speed)
 
 
 def main() -> None:
-    """Insert from 2 cm for 5 s with both, and print how far from the target they stop."""
+    """Insert from 2 cm for 5 s with both, and print their final distances from the target."""
     needle = NeedleParameters.preset('phantom')
     start = NeedleModel(needle).state_at(depth=0.02)
     shipped = Controller(needle)

@@ -1,7 +1,7 @@
 """
-Plot an insertion: depth and tip deflection over time, and the shape of the needle.
+Plot depth and tip deflection of an insertion over time, and the shape of the needle.
 
-The picture is written to `insertion.png`, or to the file named on the command line.
+The picture is written to `insertion.png`, or to the file given on the command line.
 """
 
 import sys

@@ -1,8 +1,8 @@
 """
-Drivers of two robots that know nothing of the needle: how to drive them with parameters only.
+Simulate two robot drivers with their own topics, joints and units, for `hardware.*` parameters.
 
-The first one takes efforts as a forward controller of ros2_control does, the second one follows
-positions. Run one of them, and the controller with the parameters in docs/howto/own-robot.md.
+The first driver accepts efforts, like a forward controller of ros2_control; the second follows
+positions. Run a driver, and the controller with the parameters in docs/howto/own-robot.md.
 """
 
 from math import copysign, exp
@@ -20,19 +20,19 @@ PERIOD = 0.005
 
 
 class Mass:
-    """0.5 kg with friction, on a slide that counts out of the tissue."""
+    """Mass of 0.5 kg with friction, on a slide that is positive out of the tissue."""
 
     position, velocity, effort = 0.18, 0.0, 0.0
 
     def move(self, h: float) -> None:
-        """Move for a time [s]."""
+        """Advance the mass by a time [s]."""
         push = self.velocity + self.effort * h / 0.5
         self.velocity = copysign(max(abs(push) - 0.5 * h / 0.5, 0.0), push) / (1 + 300 * h / 0.5)
         self.position += self.velocity * h
 
 
 class ForceRobot(Node):
-    """Drives the mass by efforts; a force sensor that looks out of the tissue feels the needle."""
+    """Driver with effort commands and a force sensor whose z axis points out of the tissue."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('force_robot', **options)
@@ -43,11 +43,11 @@ class ForceRobot(Node):
         self.create_timer(PERIOD, self.sample)
 
     def on_command(self, message: Float64MultiArray) -> None:
-        """Take a command."""
+        """Store a command."""
         self.mass.effort = message.data[0]
 
     def sample(self) -> None:
-        """Move, and say what is measured."""
+        """Advance the mass, and publish the measurements."""
         mass, now = self.mass, self.get_clock().now()
         mass.move((now - self.last).nanoseconds * 1e-9)
         self.last = now
@@ -61,7 +61,7 @@ class ForceRobot(Node):
 
 
 class PositionRobot(Node):
-    """A stage that counts in mm and follows positions with a lag of 20 ms; nothing else."""
+    """Driver of a stage in mm that follows position commands with a lag of 20 ms."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('position_robot', **options)
@@ -72,11 +72,11 @@ class PositionRobot(Node):
         self.last = self.get_clock().now()
 
     def on_command(self, message: JointTrajectory) -> None:
-        """Take a command."""
+        """Store a command."""
         self.goal = message.points[-1].positions[0]
 
     def sample(self) -> None:
-        """Move, and say what is measured."""
+        """Advance the stage, and publish the measured position."""
         now = self.get_clock().now()
         h, self.last = (now - self.last).nanoseconds * 1e-9, now
         self.position += (self.goal - self.position) * (1.0 - exp(-h / 0.02))

@@ -1,5 +1,5 @@
 """
-Simulate a needle that is pushed into tissue with a constant force.
+Simulate the insertion of a needle into tissue with a constant force.
 
 The preset `phantom` has the constants of the paper with damping added. Units are SI: m, N, s.
 """

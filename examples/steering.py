@@ -1,15 +1,16 @@
 """
 Steer a needle with its guide, in tissue that it cuts.
 
-The guide moves when the tip is 30 mm deep. What the tip does then depends on the depth: a shift
-moves it the same way near the skin, and the other way further in.
+The guide moves when the tip is 30 mm deep. The response of the tip depends on the depth: a shift
+of the guide moves the tip in the same direction near the skin, and in the opposite direction at
+larger depths.
 """
 
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 
 
 def main() -> None:
-    """Insert to 100 mm, with a shift of the guide by 2 mm on the way."""
+    """Insert to 100 mm, with a shift of the guide by 2 mm at a depth of 30 mm."""
     needle, steering, source = STEERING_PRESETS['bending_35mm']
     print(f'needle and tissue: {source}')
 

@@ -123,9 +123,9 @@ def main() -> int:
         if rate > LIMIT:
             failed = True
             worst = sorted(found[kind], key=lambda item: -item[0])[:_PRINTED]
-            for _, text, terms in worst:
+            for _, text, replacements in worst:
                 line = ' '.join(text.content.split())[:100]
-                sys.stdout.write(f'  {text.path}:{text.line}: {line} -> {terms}\n')
+                sys.stdout.write(f'  {text.path}:{text.line}: {line} -> {replacements}\n')
     return int(failed)
 
 

@@ -1,4 +1,4 @@
-"""One page for each public module of the packages, written into docs/api before Sphinx reads."""
+"""Generate one page in docs/api for each public module of the packages, before Sphinx reads."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -33,13 +33,13 @@ def _title(text: str, line: str = '=') -> str:
 
 
 def _children(name: str) -> list[str]:
-    """List the public modules of a package, which has its own name as a path."""
+    """List the public modules of a package; its name is also its path."""
     path = SOURCE / name.replace('.', '/')
     return [f'{name}.{found.name}' for found in iter_modules([str(path)]) if found.name[0] != '_']
 
 
 def _home(package: str, name: str) -> str:
-    """Return the module that defines a name which the root of a package offers."""
+    """Return the module that defines a public name of the root of a package."""
     value = getattr(sys.modules[package], name)
     inside = [key for key in sys.modules if key.startswith(f'{package}.')]
     defining = (key for key in inside if name in vars(sys.modules[key]).get('__annotations__', ()))
@@ -47,7 +47,7 @@ def _home(package: str, name: str) -> str:
 
 
 def _public_names(name: str) -> str:
-    """Tell where the names are that a package offers at its root."""
+    """Write the table of the public names of a package with their modules."""
     rows = ''
     for public in getattr(import_module(name), '__all__', ()):
         home = _home(name, public)
@@ -63,9 +63,9 @@ def _public_names(name: str) -> str:
 
 
 def _page(name: str, folder: Path) -> None:
-    """Write the page of a module and the pages of what is in it."""
+    """Write the page of a module and the pages of its submodules."""
     children = _children(name)
-    # A long name is broken at its dots, by spaces of no width.
+    # Zero-width spaces allow a line break at each dot of a long name.
     text = _title(name.replace('.', '.\u200b')) + f'.. automodule:: {name}\n'
     if children:
         text += '\n' + _public_names(name)
@@ -79,7 +79,7 @@ def _page(name: str, folder: Path) -> None:
 
 
 def write_pages(app: Sphinx) -> None:
-    """Write all pages, and none of a module that is no more."""
+    """Write all pages, and delete the pages of earlier modules."""
     folder = Path(app.srcdir) / 'api'
     folder.mkdir(exist_ok=True)
     for old in folder.glob('*.rst'):
@@ -100,7 +100,7 @@ def _range(meta: Mapping[str, Any]) -> str:
 def list_fields(
     _app: Sphinx, what: str, _name: str, value: object, _options: object, lines: list[str]
 ) -> None:
-    """Add the fields of settings to a class, with what their metadata say of them."""
+    """Add a table of the fields of settings, with their metadata, to a class docstring."""
     items = fields(value) if what == 'class' and is_dataclass(value) else ()
     described = [item for item in items if 'description' in item.metadata]
     if described:
@@ -122,7 +122,7 @@ def list_fields(
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
-    """Lead a reference to a name at the root of a package to where the name is defined."""
+    """Resolve a reference to a public name of a package to its definition."""
     package, _, name = node.get('reftarget', '').rpartition('.')
     if package not in PACKAGES or name not in getattr(import_module(package), '__all__', ()):
         return None
@@ -134,17 +134,17 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element)
 def skip_aliases(
     _app: Sphinx, _what: str, _name: str, value: object, _skip: object, _options: object
 ) -> bool | None:
-    """Leave out the fields of named tuples: their class has them in its signature."""
+    """Skip the fields of named tuples: the signature of their class has them."""
     return True if type(value).__name__ == '_tuplegetter' else None
 
 
 class Names(SphinxPostTransform):
-    """Leads from the dotted names of a page to where they are documented."""
+    """Link the dotted names of a page to their documentation."""
 
     default_priority = 5
 
     def run(self, **_arguments: object) -> None:
-        """Wrap the names, and let a column of a table break them at dots and underscores."""
+        """Add links, and allow line breaks at dots and underscores in table columns."""
         documented = self.env.get_domain('py').data['objects']
         for node in list(self.document.findall(literal)):
             name = node.astext()
@@ -166,7 +166,7 @@ class Names(SphinxPostTransform):
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Write the pages before Sphinx looks for them, and find what they refer to."""
+    """Connect the generation of pages and the resolution of references to Sphinx."""
     app.connect('builder-inited', write_pages)
     app.connect('autodoc-process-docstring', list_fields)
     app.connect('autodoc-skip-member', skip_aliases)

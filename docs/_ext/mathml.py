@@ -1,4 +1,4 @@
-"""Equations as MathML, which every browser shows by itself: no script and no network."""
+"""Render equations as MathML, which browsers display without script and network."""
 
 import re
 from typing import Any
@@ -11,7 +11,7 @@ from sphinx.errors import ExtensionError
 from sphinx.util.math import get_node_equation_number
 from sphinx.writers.html5 import HTML5Translator
 
-#: docutils sets the index of a dotted letter below the letter.
+#: A dotted letter with an index: docutils sets the index below the letter.
 DOTTED = re.compile(
     r'<munderover>\s*(<mi>.*</mi>)\s*(<m[in]>.*</m[in]>)\s*(<mo[^>]*>[˙¨]</mo>)\s*</munderover>'
 )
@@ -20,7 +20,7 @@ DOTTED = re.compile(
 def _mathml(node: nodes.Element, *, block: bool) -> str:
     text = node.astext()
     try:
-        # Fonts without mathematics set what is marked as an accent into the letter below.
+        # Fonts without mathematics draw a marked accent into the letter below it.
         equation = tex2mathml(text, as_block=block).replace(' accent="true"', '')
     except MathError as error:
         raise ExtensionError(f'no MathML for {text!r}: {error}') from None
@@ -34,7 +34,7 @@ def visit_inline(translator: HTML5Translator, node: nodes.math) -> None:
 
 
 def visit_block(translator: HTML5Translator, node: nodes.math_block) -> None:
-    """Write an equation on lines of its own."""
+    """Write an equation as a separate block."""
     translator.body.append(f'<div class="equation">{_mathml(node, block=True)}')
     if node['number']:
         number = get_node_equation_number(translator, node)
@@ -44,6 +44,6 @@ def visit_block(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the renderer as the one of HTML pages."""
+    """Register the renderer of HTML pages."""
     app.add_html_math_renderer('mathml', (visit_inline, None), (visit_block, None))
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

@@ -1,4 +1,4 @@
-"""Pages of the site that stand elsewhere in the repository, and the links to and between them."""
+"""Include pages from outside docs/ in the site, and rewrite their links."""
 
 from os.path import relpath
 from pathlib import Path
@@ -9,7 +9,7 @@ from sphinx.application import Sphinx
 
 DOCS = Path(__file__).parents[1]
 REPOSITORY = DOCS.parent
-#: Files outside docs/, and where the site has them.
+#: Files outside docs/, and their paths in the site.
 PAGES = {
     REPOSITORY / 'README.md': DOCS / 'repository' / 'readme.md',
     REPOSITORY / 'CHANGELOG.md': DOCS / 'repository' / 'changelog.md',
@@ -22,7 +22,7 @@ LINK = re.compile(r'\]\((?!\w+:|#)([^)#\s]+)')
 
 
 def rewrite(text: str, source: Path, page: Path) -> str:
-    """Return Markdown whose links hold seen from a page of the site, not from its source file."""
+    """Rewrite links relative to a source file as links relative to a page of the site."""
 
     def link(match: re.Match[str]) -> str:
         target = (source.parent / match[1]).resolve()
@@ -32,10 +32,10 @@ def rewrite(text: str, source: Path, page: Path) -> str:
 
 
 def copy_pages(_app: Sphinx) -> None:
-    """Copy the pages before Sphinx looks for them."""
+    """Copy the pages before Sphinx searches for sources."""
     for source, page in PAGES.items():
         page.parent.mkdir(exist_ok=True)
-        # The home page includes the README, so that its links are those of the home page.
+        # The home page includes the README: links are relative to the home page.
         seen = (
             DOCS / 'index.md'
             if source.name == 'README.md' and source.parent == REPOSITORY
@@ -54,7 +54,7 @@ def correct_links(app: Sphinx, name: str, content: list[str]) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Copy the pages, and correct the others as they are read."""
+    """Connect the copying of pages and the correction of links to Sphinx."""
     app.connect('builder-inited', copy_pages)
     app.connect('source-read', correct_links)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

@@ -1,8 +1,8 @@
 """
-Draw bending.png: a needle on its way through tissue, in both planes, to scale.
+Draw bending.png: shapes of a needle during an insertion, in both planes, to scale.
 
-The bevel pushes the tip along z, until the needle is turned half way. The guide has gone aside
-along x before the needle was deep, so that the tip goes the other way.
+The bevel pushes the tip along z, until the needle is rolled half way. The guide moves along x at
+a small depth, so that the tip moves in the opposite direction.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WAY = (
 
 
 def insert() -> tuple[SteeredNeedle, list[FloatArray]]:
-    """Return the needle at its end, and its points on the way."""
+    """Return the needle at the end of the insertion, and its shapes at each depth."""
     preset = STEERING_PRESETS['bending_35mm']
     one = SteeredNeedle(preset.needle, replace(preset.steering, bevel_load=(1.5,)))
     shapes = []

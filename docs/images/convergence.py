@@ -1,9 +1,9 @@
 """
-Draw convergence.png: how a needle of n modes converges to a clamped beam on an elastic foundation.
+Draw convergence.png: convergence of n modes to a clamped beam on an elastic foundation.
 
 Left the first three natural frequencies at three quarters of the needle's length, right the tip
-deflection under a lateral force at the tip, at several inserted lengths, both against the exact
-beam. A line ends where the condition of G rejects another mode.
+deflection under a lateral force at the tip, at several insertion depths, both relative to the
+exact beam. A line ends where the condition of G rejects another mode.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from needle_dynamics.parameters import LARGEST_CONDITION, MOST_MODES
 import numpy as np
 from scipy.linalg import eigh
 
-#: Inserted lengths over the needle's length: deep, less deep, half.
+#: Insertion depths over the needle's length.
 DEPTHS = (1.0, 0.9, 0.75, 0.5)
 
 P = NeedleParameters()

@@ -1,9 +1,10 @@
 """
-Draw steering.png: needles that bend in tissue, to scale, and what the guide can do.
+Draw steering.png: needles that bend in tissue, to scale, and the authority of the guide.
 
-Above three needles at 100 mm, each about the path that it cut: its bevel always to one side, its
-bevel turned half way in, and without a bevel but with a guide that moved early. Below the shift of
-the resting tip per shift of the guide, by depth and bending length; it is zero on the line.
+Above three needles at 100 mm, each with the path that it cut: with a fixed bevel, with a bevel
+rolled half way through the insertion, and without a bevel but with an early guide motion. Below
+the static shift of the tip per shift of the guide, by depth and bending length; it is zero on the
+line.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ EI = PAPER.bending_stiffness
 #: Bending length and free length [m], and curvature of the bevel [1/m].
 LENGTH, FREE, CURVATURE = 0.035, 0.04, 2.0
 
-#: Depth that the needles reach [m].
+#: Final depth of the needles [m].
 DEPTH = 0.1
 
 

@@ -1,8 +1,8 @@
 """
-Draw targets.png: how near to their targets needles end, by controller.
+Draw targets.png: distribution of the final distance from the target, by controller.
 
-Part of the needles that end within a distance, of the first case of `needle bench steering` and of
-needles with a bevel that is turned.
+Fraction of the needles that end within a distance, for the first case of `needle bench steering`
+and for needles with a bevel that is rolled.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def draw() -> Figure:
 
 
 def show(axes: Axes, found: Sequence[SteeringOutcome], names: Sequence[str]) -> None:
-    """Draw the part of the needles within each distance."""
+    """Draw the fraction of the needles within each distance."""
     counted = [one for one in found if one.reachable and not one.refused]
     for name in names:
         miss = np.sort([1e3 * one.ends[name].miss for one in counted])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks import damage, noises
-from benchmarks.noises import Kind, LINES, recorded
+from benchmarks.noises import LINES, NoiseKind, recorded
 from needle_identification import identify_friction, read_friction_recording
 from needle_ros.process_pool import processes
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 
 
 def test_force_without_noise_equals_ground_truth() -> None:
-    kind = Kind(white=0.0, position_counts=0.0)
+    kind = NoiseKind(white=0.0, position_counts=0.0)
     recording, truth = recorded(kind, np.random.default_rng(0))
     moving = np.abs(recording.speed) > 0.0
     expected = truth['coulomb_friction'] * np.sign(recording.speed)

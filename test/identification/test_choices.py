@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import exp, log
 from typing import Any
 
-from benchmarks.noises import Kind, recorded
+from benchmarks.noises import NoiseKind, recorded
 from needle_dynamics import ParameterError
 from needle_identification import (
     FrictionEstimate,
@@ -179,7 +179,7 @@ def test_presliding_samples_are_discarded(seed: int) -> None:
 
 
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
-    recording, truth = recorded(Kind(speed_noise=1e-3), np.random.default_rng(3))
+    recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
     assert any('took the speed from the positions' in words for words in found.warnings)
     for name, value in truth.items():
@@ -191,9 +191,9 @@ def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
 
 
 @pytest.mark.parametrize(
-    'kind', [Kind(), Kind(white=0.005, counts=0.02), Kind(counts=0.01, white=0.0)]
+    'kind', [NoiseKind(), NoiseKind(white=0.005, counts=0.02), NoiseKind(counts=0.01, white=0.0)]
 )
-def test_only_saturated_samples_are_detected_as_clipped(kind: Kind) -> None:
+def test_only_saturated_samples_are_detected_as_clipped(kind: NoiseKind) -> None:
     for seed in range(10):
         recording, truth = recorded(kind, np.random.default_rng(seed))
         assert not cut_off(recording.force).any()
@@ -212,14 +212,14 @@ def test_false_suggestions_are_rare_over_all_recordings() -> None:
     wrong = 0
     for study in range(3):
         rng = np.random.default_rng(study)
-        made = [recorded(Kind(duration=20.0), rng)[0] for _ in range(20)]
+        made = [recorded(NoiseKind(duration=20.0), rng)[0] for _ in range(20)]
         found = [identify_friction(one, among=len(made)) for one in made]
         wrong += any(advised(one) for one in found) or bool(summarize(found).warnings)
     assert wrong <= 1
 
 
 def test_pooled_recordings_reveal_a_drift_too_small_for_each_recording() -> None:
-    drift = Kind(truth={'force_drift': 2.5e-4}, duration=20.0)
+    drift = NoiseKind(truth={'force_drift': 2.5e-4}, duration=20.0)
     made = [recorded(drift, np.random.default_rng(seed))[0] for seed in range(20)]
     found = [identify_friction(one, among=len(made)) for one in made]
     alone = [one for one in found if advised(one)]

@@ -11,8 +11,7 @@ from geometry_msgs.msg import PointStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics.plant_node import PlantNode
-from needle_identification import BagTopic
-from needle_identification import deserialize, encode
+from needle_identification import BagTopic, deserialize, encode
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 from needle_ros import wire
