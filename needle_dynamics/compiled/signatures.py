@@ -32,7 +32,7 @@ def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
     Annotations are numbers, arrays of `needle_dynamics.arrays` with a known number of dimensions,
     tuples, named tuples of these, and `Boxed` named tuples.
     """
-    hints = get_type_hints(function, localns={'Held': Boxed}, include_extras=True)
+    hints = get_type_hints(function, localns={'Boxed': Boxed}, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     try:
         return tuple(numba_type(hints[name]) for name in names)
