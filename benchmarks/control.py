@@ -83,7 +83,9 @@ def jobs() -> dict[str, Callable[[], object]]:
         # Oscillation within the tissue, with an unlimited duration.
         phase = clock[0] % 10.0
         depth = _DEPTH + _SPEED * min(phase, 10.0 - phase)
-        observer.update(clock[0], depth, _SPEED if phase < 5.0 else -_SPEED, next(samples))
+        observer.update(
+            round(1e9 * clock[0]), depth, _SPEED if phase < 5.0 else -_SPEED, next(samples)
+        )
         return observer.load
 
     found: dict[str, Callable[[], object]] = {}

@@ -18,14 +18,15 @@ def main() -> None:
     parameters = NeedleParameters.preset('phantom')
     needle = Integrator(parameters, NeedleModel(parameters).state_at(0.1, tip_deflection=2e-3))
     observer = Observer(parameters, ObserverSettings(tip_noise=1e-4), PERIOD)
-    observer.update(0.0, needle.depth, needle.velocity)
+    observer.update(0, needle.depth, needle.velocity)
     for sample in range(1, 1001):
         time = sample * PERIOD
+        stamp = round(1e9 * time)
         seen = needle.advance(PERIOD, force=4.0)
         # The third argument is the velocity; a fourth would be the wrench at the base.
-        observer.update(time, needle.depth, needle.velocity)
+        observer.update(stamp, needle.depth, needle.velocity)
         if sample % 20 == 0:
-            observer.add_tip(time, seen.tip_deflection + rng.normal(0.0, 1e-4))
+            observer.add_tip(stamp, seen.tip_deflection + rng.normal(0.0, 1e-4))
         if sample in (20, 100, 1000):
             estimate, deviation = observer.tip_deflection
             true = needle.model.tip_deflection(needle.state)

@@ -9,7 +9,6 @@ from needle_controller.controller import Measurement
 from needle_controller.observer.observer import Observer
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 #: Samples between two consistency checks of the observer.
@@ -67,7 +66,7 @@ class LoadEstimator:
     def take_tip(self, stamp: int, deflection: float) -> None:
         """Add a deflection of the tip [m] with its stamp [ns]."""
         if self.observer is not None:
-            self.observer.add_tip(stamp / NANOSECONDS, deflection)
+            self.observer.add_tip(stamp, deflection)
 
     def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
         """
@@ -81,7 +80,7 @@ class LoadEstimator:
         if stamp > measured:
             self._waiting = stamp, lateral, moment
         else:
-            self.observer.add_wrench(stamp / NANOSECONDS, lateral, moment)
+            self.observer.add_wrench(stamp, lateral, moment)
 
     def take_truth(self, state: Sequence[float]) -> None:
         """
@@ -110,7 +109,7 @@ class LoadEstimator:
         if wrench is not None and wrench[0] <= stamp:
             self._waiting = None
         self.load = 0.0
-        observer.update(stamp / NANOSECONDS, measured.depth, measured.speed, own)
+        observer.update(stamp, measured.depth, measured.speed, own)
         self._updates += 1
         if self._updates % _LOOK == 0:
             self._judge(observer)

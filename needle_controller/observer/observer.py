@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import ceil, inf, isfinite, nan
+from operator import index
 from typing import Final
 
 from needle_controller.compiled.filter import (
@@ -35,6 +36,7 @@ from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import FloatArray, InsertionDepthError, NeedleModel, NeedleParameters
 from needle_dynamics.model import ROUNDING
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
+from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -130,7 +132,8 @@ class Observer:
         self._modal, self._jacobian = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
         #: Tip deflection, its standard deviation, and load at the present depth, once computed.
         self._estimate: tuple[float, float, float] | None = None
-        self._origin: float | None = None
+        #: Stamp of the first sample [ns]: times of the filter are relative to it.
+        self._origin: int | None = None
         self._time = self._depth = self._velocity = 0.0
         self._slot = self._oldest = self._count = 0
         self.reset()
@@ -141,14 +144,15 @@ class Observer:
         self.refused = self.restarts = 0
         self.warning: str | None = None
         self._begun = False
-        self._waiting: list[tuple[float, float, float]] = []
+        self._waiting: list[tuple[int, float, float]] = []
 
     def _warm_up(self) -> None:
         """Compile or load the kernels before time is critical."""
         depth = self.model.parameters.length
-        self.update(0.0, depth, 0.0)
-        self.update(self.period, depth, 0.0)
-        self.add_tip(self.period, 0.0)
+        period = round(self.period * NANOSECONDS)
+        self.update(0, depth, 0.0)
+        self.update(period, depth, 0.0)
+        self.add_tip(period, 0.0)
         self._look()
         self._origin = None
         self.reset()
@@ -157,7 +161,7 @@ class Observer:
 
     def update(
         self,
-        time: float,
+        stamp: int,
         depth: float,
         speed: float,
         wrench: tuple[float, float] | None = None,
@@ -171,8 +175,8 @@ class Observer:
 
         Parameters
         ----------
-        time : float
-            Time of the sample [s]. Steps within 1 % of the period count as one period.
+        stamp : int
+            Time of the sample [ns]. Steps within 1 % of the period count as one period.
         depth, speed : float
             Insertion depth [m] and velocity [m/s], positive into the tissue.
         wrench : tuple of float, optional
@@ -182,18 +186,18 @@ class Observer:
         Raises
         ------
         ParameterError
-            If time, depth or speed is not finite, or the speed is implausible; the estimate does
-            not change.
+            If the stamp is not an integer, depth or speed is not finite, or the speed is
+            implausible; the estimate does not change.
         InsertionDepthError
             If the depth is outside its range; the estimate does not change.
 
         """
         needle = self._filter.needle
         fastest = needle.length / self.period
-        if not (isfinite(time) and isfinite(depth) and abs(speed) <= fastest):
+        if not (isfinite(depth) and abs(speed) <= fastest):
             raise ParameterError(
-                'time, depth and speed must be finite, and the speed at most a needle length in '
-                f'a period, {fastest:g} m/s, got {time!r}, {depth!r} and {speed!r}'
+                'depth and speed must be finite, and the speed at most a needle length in '
+                f'a period, {fastest:g} m/s, got {depth!r} and {speed!r}'
             )
         slack = ROUNDING * needle.length
         if not needle.minimum_depth <= depth <= needle.maximum_depth + slack:
@@ -202,11 +206,11 @@ class Observer:
                 f'inserted length {depth:.6g} m is outside [{low:g}, {needle.maximum_depth:g}] m '
                 '(minimum_depth to the hub); the estimate is held'
             )
-        # An integer would trigger a compilation for its type.
-        time, depth, speed = float(time), min(float(depth), needle.maximum_depth), float(speed)
         if self._origin is None:
-            self._origin = time
-        time -= self._origin
+            self._origin = _checked(stamp)
+        time = self._seconds(stamp)
+        # An integer would trigger a compilation for its type.
+        depth, speed = min(float(depth), needle.maximum_depth), float(speed)
         elapsed, history = time - self._time, self.settings.history
         if self._begun:
             if -history <= elapsed <= 0.0:
@@ -227,26 +231,31 @@ class Observer:
         self._time, self._depth, self._velocity = time, depth, speed
         if self._waiting:
             waiting, self._waiting = self._waiting, []
-            for stamp, lateral, moment in waiting:
-                self.add_wrench(stamp, lateral, moment)
+            for earlier, lateral, moment in waiting:
+                self.add_wrench(earlier, lateral, moment)
 
-    def add_wrench(self, stamp: float, lateral: float, moment: float) -> None:
+    def _seconds(self, stamp: int) -> float:
+        """Return a time relative to the first sample [s]; exact for any epoch of the clock."""
+        return (_checked(stamp) - (self._origin or 0)) / NANOSECONDS
+
+    def add_wrench(self, stamp: int, lateral: float, moment: float) -> None:
         """
         Process a base wrench that arrives separately from the encoder sample of the same time.
 
         Parameters
         ----------
-        stamp : float
-            Time of the wrench [s], on the clock of `update`: the time of an encoder sample, which
+        stamp : int
+            Time of the wrench [ns], on the clock of `update`: the time of an encoder sample, which
             may arrive later.
         lateral, moment : float
             As for `update`; nan if missing.
 
         """
-        if not (self._begun and isfinite(stamp) and (isfinite(lateral) or isfinite(moment))):
+        time = self._seconds(stamp)
+        if not (self._begun and (isfinite(lateral) or isfinite(moment))):
             self.refused += 1
             return
-        time, slack = float(stamp) - (self._origin or 0.0), _SAME * self.period
+        slack = _SAME * self.period
         if time > self._time + slack and len(self._waiting) < _WAITING:
             self._waiting.append((stamp, lateral, moment))
             return
@@ -262,24 +271,24 @@ class Observer:
         sample['moment'] = moment if isfinite(moment) else nan
         self._replay(float(samples[(slot or self._slots) - 1]['time']))
 
-    def add_tip(self, stamp: float, deflection: float) -> None:
+    def add_tip(self, stamp: int, deflection: float) -> None:
         """
         Process a sample of the tip deflection, with any delay within the history.
 
         Parameters
         ----------
-        stamp : float
-            End of the exposure [s], plus ``tip_latency``, on the clock of `update`. It may be
+        stamp : int
+            End of the exposure [ns], plus ``tip_latency``, on the clock of `update`. It may be
             later than the last encoder sample, and earlier than previous tip samples.
         deflection : float
             Mean deflection over the exposure [m].
 
         """
-        if not (self._begun and isfinite(stamp) and isfinite(deflection)):
+        end = self._seconds(stamp) - self.settings.tip_latency
+        if not (self._begun and isfinite(deflection)):
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
-        end = float(stamp) - self.settings.tip_latency - (self._origin or 0.0)
         start = end - exposure
         slack = _OVERLAP * exposure
         oldest = float(self._filter.samples[self._oldest]['time'])
@@ -460,3 +469,11 @@ class Observer:
     def _normal_covariance(self) -> FloatArray:
         modal = len(self._jacobian)
         return self._filter.covariances[self._slot, :modal, :modal]
+
+
+def _checked(stamp: int) -> int:
+    """Return a stamp as an integer: seconds as a float would lose digits of Unix time."""
+    try:
+        return index(stamp)
+    except TypeError:
+        raise ParameterError(f'a stamp must be an integer [ns], got {stamp!r}') from None

@@ -70,8 +70,8 @@ def test_controller_recovers_from_implausible_inputs(
 def test_observer_rejects_an_implausible_velocity() -> None:
     """It is finite, and would give a load of 1e296 N."""
     observer = Observer(PHANTOM, ObserverSettings(), 1e-3)
-    observer.update(0.0, 0.05, 0.0)
+    observer.update(0, 0.05, 0.0)
     with pytest.raises(ParameterError, match='the speed at most a needle length in a period'):
-        observer.update(1e-3, 0.05, 1e60)
-    observer.update(2e-3, 0.05, 0.0)
+        observer.update(1_000_000, 0.05, 1e60)
+    observer.update(2_000_000, 0.05, 0.0)
     assert abs(observer.load) < 1.0
