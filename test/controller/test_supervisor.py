@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from math import inf, isfinite, nan
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -31,12 +33,16 @@ class Loop:
     """A supervisor with a target, its time, and all its commands."""
 
     def __init__(
-        self, target: float | None = 0.1, observed: ObserverSettings | None = None
+        self,
+        target: float | None = 0.1,
+        observed: ObserverSettings | None = None,
+        limits: SafetyLimits | None = None,
     ) -> None:
         self.seconds = 0.0
         self.supervisor = Supervisor(steady=lambda: self.seconds)
         self.now = 100 * SECOND
-        self.supervisor.configure(Controller(PHANTOM), SafetyLimits(tracking_error=0.1), observed)
+        limits = limits or SafetyLimits(tracking_error=0.1)
+        self.supervisor.configure(Controller(PHANTOM), limits, observed)
         self.supervisor.retract_depth = 0.01
         self.supervisor.activate(self.now, {TOPIC: 1})
         self.depth = 0.02
@@ -195,9 +201,36 @@ def test_valid_measurements_restart_the_motion_after_faults(
 def test_zero_force_without_a_target(
     happens: list[Callable[[Loop], ForceCommand | None]],
 ) -> None:
-    """For any events except a target or a trajectory."""
+    """For any events except a target or a trajectory; a measurement still has an answer."""
     loop = Loop(target=None)
     assert all(answer.force == 0.0 for event in happens if (answer := event(loop)) is not None)
+    loop.passes(0)
+    loop.depth = 0.02
+    last = loop.measure()
+    assert last is not None
+    assert last.force == 0.0
+
+
+def test_all_safety_limits_are_read_by_the_supervisor() -> None:
+    """In a motion with measurements of all sensors; reads of other classes do not count."""
+    read = set()
+
+    class Recorded(SafetyLimits):
+        def __getattribute__(self, name: str) -> Any:
+            read.add(name)
+            return super().__getattribute__(name)
+
+    limits = Recorded(tracking_error=0.1)
+    # The checks of the values read all of them.
+    read.clear()
+    loop = Loop(observed=ObserverSettings(), limits=limits)
+    for _ in range(20):
+        loop.measure()
+        loop.wrench()
+        loop.tip()
+        loop.watch()
+    loop.clear()
+    assert {one.name for one in fields(SafetyLimits)} <= read
 
 
 class Robot:
