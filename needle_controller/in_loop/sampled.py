@@ -93,12 +93,12 @@ def run_controller(
 
     Raises
     ------
-    InsertedLengthError
+    InsertionDepthError
         If the needle leaves its range.
 
     Examples
     --------
-    >>> from needle_controller import Command, Controller, run_controller
+    >>> from needle_controller import Controller, ControllerOutput, run_controller
     >>> from needle_dynamics import NeedleModel, NeedleParameters
     >>> plant = NeedleParameters.preset('phantom')
     >>> start = NeedleModel(plant).state_at(0.02)
@@ -113,7 +113,7 @@ def run_controller(
     >>> class Proportional:
     ...     period, delay = 1e-3, 1
     ...     def command(self, measured, load=0.0):
-    ...         return Command(force=2000.0 * (0.022 - measured.depth))
+    ...         return ControllerOutput(force=2000.0 * (0.022 - measured.depth))
     >>> run = run_controller(Proportional(), plant, start, duration=0.5)
     >>> bool(run.depth[-1] < 0.022)
     True
@@ -248,7 +248,7 @@ def run_batch(
     ------
     ShapeError
         If the numbers of runs do not agree.
-    ParameterError, InsertedLengthError
+    ParameterError, InsertionDepthError
         If a value is invalid.
 
     """
