@@ -125,7 +125,7 @@ def operating_point(
 
     Raises
     ------
-    InsertedLengthError
+    InsertionDepthError
         If ``depth`` is outside its range.
     ShapeError
         If a number is not finite.
@@ -184,7 +184,7 @@ def linearize(
         If the needle is at rest, friction there has no derivative, and ``sliding`` is not given.
     ParameterError
         If an input is not finite or ``sliding`` is unknown.
-    ShapeError, InsertedLengthError
+    ShapeError, InsertionDepthError
         If the state is not valid.
 
     Examples

@@ -335,7 +335,7 @@ class NeedleModel:
         ------
         ParameterError
             If an input is not finite.
-        ShapeError, InsertedLengthError
+        ShapeError, InsertionDepthError
             If the state is not valid.
 
         """

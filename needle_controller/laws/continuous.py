@@ -137,7 +137,7 @@ class ContinuousLaw(ABC):
 
         Raises
         ------
-        ShapeError, InsertedLengthError
+        ShapeError, InsertionDepthError
             If the state, the goal or the integral is invalid.
 
         """

@@ -124,7 +124,7 @@ def simulate_batch(
     ------
     ShapeError
         If the numbers of runs are inconsistent.
-    ParameterError, InsertedLengthError
+    ParameterError, InsertionDepthError
         If a value is not valid.
 
     Examples

@@ -111,7 +111,7 @@ class Integrator:
     ------
     ParameterError
         If ``step`` or ``tolerance`` is not positive and finite.
-    ShapeError, InsertedLengthError
+    ShapeError, InsertionDepthError
         If the state is not valid.
     ToleranceError
         From `advance`, if the tolerance cannot be met.
@@ -157,7 +157,7 @@ class Integrator:
 
         Raises
         ------
-        ShapeError, InsertedLengthError
+        ShapeError, InsertionDepthError
             If the state is invalid for the new constants; the old constants are kept.
 
         """
@@ -235,7 +235,7 @@ class Integrator:
 
         Raises
         ------
-        ParameterError, InsertedLengthError, ToleranceError
+        ParameterError, InsertionDepthError, ToleranceError
             As `advance`.
 
         """
@@ -261,7 +261,7 @@ class Integrator:
 
         Raises
         ------
-        ParameterError, InsertedLengthError, ToleranceError
+        ParameterError, InsertionDepthError, ToleranceError
             As `advance`.
 
         """

@@ -197,7 +197,7 @@ class Plant:
 
         Raises
         ------
-        ShapeError, InsertedLengthError
+        ShapeError, InsertionDepthError
             If the state is invalid for the new constants; the old constants are kept.
 
         """
@@ -219,7 +219,7 @@ class Plant:
 
         Raises
         ------
-        InsertedLengthError
+        InsertionDepthError
             If the needle left the tissue.
 
         """
@@ -281,7 +281,7 @@ class Plant:
 
         Raises
         ------
-        InsertedLengthError
+        InsertionDepthError
             If the needle left the tissue.
 
         """

@@ -178,7 +178,7 @@ def simulate(
     ------
     ParameterError, ShapeError
         If an argument is not valid.
-    InsertedLengthError
+    InsertionDepthError
         If the needle leaves its range.
     ToleranceError
         If the tolerance cannot be met.

@@ -75,7 +75,7 @@ class PaperFigure:
     ----------
     picture : Picture
         Figure and caption.
-    outcomes : Mapping[tuple of str, Outcome]
+    outcomes : Mapping[tuple of str, RunOutcome]
         Metrics of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
 
     """

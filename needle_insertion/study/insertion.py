@@ -266,7 +266,7 @@ class InsertionProtocol:
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """Compute the metrics of sampled needles, as `Protocol.run`."""
+        """Compute the metrics of sampled needles, as `Scenario.run`."""
         rows = [
             self._row({name: float(values[k]) for name, values in drawn.items()})
             for k in range(len(streams))

@@ -178,7 +178,7 @@ class SteeringProtocol:
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """Compute the metrics of sampled needles, as `Protocol.run`."""
+        """Compute the metrics of sampled needles, as `Scenario.run`."""
         count = len(streams)
         each = {
             name: drawn.get(name, np.full(count, one.default))
