@@ -36,8 +36,8 @@ LARGEST_DEFLECTION: Final = 2e-3
 #: Column heads of `OperatingPoint.row`.
 POINT_HEADS: Final = (
     'depth, tip, speed',
-    *('controllable', 'not controllable', 'margin', 'weakest'),
-    *('observable', 'not observable', 'margin', 'weakest'),
+    *('ctrb', 'not ctrb', 'margin', 'weakest'),
+    *('obsv', 'not obsv', 'margin', 'weakest'),
     'tip / base travel',
 )
 

@@ -239,7 +239,7 @@ def test_all_results_are_sections_of_one_page(
     assert '1 of 4 hold' in seen.text
     # Means of the shipped bags in the units of the paper, not of ours.
     assert 'From the shipped simulated recordings: 0.3 with an STD of 0.044 N s/mm' in seen.text
-    assert 'From the shipped simulated recordings: k_zz falls by' in seen.text.replace(
+    assert 'From the shipped simulated recordings: k_zz decreases by' in seen.text.replace(
         'kzz', 'k_zz'
     )
     assert [width > 0 for _, width in seen.images] == [True] * 3
