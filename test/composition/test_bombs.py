@@ -206,7 +206,7 @@ def one_line(folder: Path) -> Path:
     [
         pytest.param(ros1_chunk, 'NEEDLE_BAG_FACTOR=10 raises', id='chunk of ROS 1'),
         pytest.param(matlab, 'NEEDLE_BAG_FACTOR=10 raises', id='matlab'),
-        pytest.param(one_line, 'is no table', id='one line'),
+        pytest.param(one_line, 'is not a table', id='one line'),
         pytest.param(zstd_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd messages'),
         pytest.param(lz4_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='lz4 messages'),
         pytest.param(zstd_file, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd file'),

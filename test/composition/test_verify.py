@@ -510,7 +510,7 @@ def test_a_single_changed_sample_is_located(
     assert found == (stamp(70), 70, topic, quantity, recorded)
     # Tolerance for the rounding of the sum above.
     assert first['computed'] == pytest.approx(recorded - 0.125, abs=1e-12)
-    assert 'this one was altered' in result.reason
+    assert 'one was altered in transit' in result.reason
 
 
 @pytest.mark.parametrize(
