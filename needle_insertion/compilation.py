@@ -31,7 +31,7 @@ MODULES: Final = (
     'needle_dynamics.compiled.normal_modes',
     'needle_dynamics.compiled.oscillator',
     # Needs Gymnasium, which is optional.
-    *(('needle_insertion.gym.pushed',) if find_spec('gymnasium') else ()),
+    *(('needle_study.gym.pushed',) if find_spec('gymnasium') else ()),
 )
 
 

@@ -17,13 +17,17 @@ MAY_IMPORT = {
     'needle_dynamics': {'needle_ros'},
     'needle_controller': {'needle_dynamics', 'needle_ros'},
     'needle_identification': {'needle_dynamics', 'needle_ros'},
+    'needle_study': {'needle_controller', 'needle_dynamics', 'needle_ros'},
     'needle_insertion': {
         'needle_controller',
         'needle_dynamics',
         'needle_identification',
         'needle_ros',
+        'needle_study',
     },
 }
+#: Packages without nodes.
+NO_NODES = {'needle_study'}
 #: The top package may import any external package.
 TOP = 'needle_insertion'
 ROS = re.compile(r'(rclpy|rcl_\w+|ros\w+_py|ament_\w+|launch(_\w+)?|\w+_(msgs|srvs|interfaces))$')
@@ -69,7 +73,7 @@ def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
 def violations(path: str, source: str) -> list[str]:
     """Return the rule violations of a file; the path is relative to the root."""
     package = path.partition('/')[0]
-    is_node = path.endswith('_node.py')
+    is_node = path.endswith('_node.py') and package not in NO_NODES
     found = []
     for line, name in imports(path, source):
         root, *parts = name.split('.')
@@ -163,6 +167,10 @@ def test_no_file_mentions_a_forbidden_word() -> None:
             'import needle_insertion',
             'not import needle_insertion',
         ),
+        ('needle_controller/a.py', 'from needle_study import engine', 'not import needle_study'),
+        ('needle_study/a.py', 'import needle_insertion.cli', 'not import needle_insertion'),
+        ('needle_study/a_node.py', 'import rclpy', 'may import rclpy'),
+        ('needle_study/a.py', 'from needle_ros.base_node import x', 'import a node'),
         ('needle_dynamics/a.py', 'import rclpy', 'may import rclpy'),
         ('needle_dynamics/a.py', 'import numpy, rclpy.node', 'may import rclpy'),
         ('needle_dynamics/a.py', 'def f():\n    from rclpy.node import Node', ':2: only'),

@@ -23,6 +23,7 @@ PACKAGES = (
     'needle_dynamics',
     'needle_controller',
     'needle_identification',
+    'needle_study',
     'needle_insertion',
 )
 SOURCE = Path(__file__).parents[2]

@@ -12,8 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.boxed import Boxed
-from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
 from needle_ros.errors import ParameterError
+from needle_study.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
 import numpy as np
 
 #: Depth at the start, and range of target depths [m].

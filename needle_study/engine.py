@@ -23,9 +23,9 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
-from needle_insertion.study.study import made, Study
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.files import write_whole
+from needle_study.study import made, Study
 import pyarrow as pa
 from pyarrow import parquet
 

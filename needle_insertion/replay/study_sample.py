@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from needle_identification import BagWriter
-from needle_insertion.study.engine import Results
-from needle_insertion.study.summary import picked
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.wire import Template
+from needle_study.engine import Results
+from needle_study.summary import picked
 import numpy as np
 
 
-def replay(results: Results, number: int, bag: Path) -> bool:
+def replay_sample(results: Results, number: int, bag: Path) -> bool:
     """
     Record a sample to a bag; return whether there was a table to compare with.
 

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from needle_controller import SteeringPrior
 from needle_controller.steering.simulation import drawn, GroundTruth
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
-from needle_insertion.gym.pushed import BOUND
 from needle_ros.errors import ParameterError
+from needle_study.gym.pushed import BOUND
 import numpy as np
 
 #: Default distribution of the unknown disturbances of a needle.

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
-from needle_insertion.study.distribution import Distribution, distribution
-from needle_insertion.study.reading import check_names, mapping, one_of
-from needle_insertion.study.scenario import PROTOCOLS, Scenario
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
+from needle_study.distribution import Distribution, distribution
+from needle_study.reading import check_names, mapping, one_of
+from needle_study.scenario import PROTOCOLS, Scenario
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri

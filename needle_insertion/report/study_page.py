@@ -11,10 +11,10 @@ from matplotlib.figure import Figure as Drawing
 from needle_dynamics import FloatArray
 from needle_insertion.report.content import Grid, Picture, ReportSection
 from needle_insertion.report.page import write_page
-from needle_insertion.study.engine import Results
-from needle_insertion.study.scenario import Metric
-from needle_insertion.study.study import Study
-from needle_insertion.study.summary import (
+from needle_study.engine import Results
+from needle_study.scenario import Metric
+from needle_study.study import Study
+from needle_study.summary import (
     batches,
     column,
     Estimate,
@@ -50,7 +50,7 @@ _MISSING: Final = 'Samples without a value of a metric are excluded from it.'
 _WORST: Final = 10
 
 
-def write(results: Results, path: Path) -> None:
+def write_study(results: Results, path: Path) -> None:
     """Write the page of a study whose table is complete."""
     study, table = results.study, results.table
     figures, drawn = study.protocol.figures, list(study.population)

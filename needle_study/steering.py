@@ -26,12 +26,12 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import with_lengths
-from needle_insertion.study.reading import check_names, mapping, one_of
-from needle_insertion.study.scenario import MeasuredRun, Metric, Variable
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
 from needle_ros.timing import NANOSECONDS
+from needle_study.reading import check_names, mapping, one_of
+from needle_study.scenario import MeasuredRun, Metric, Variable
 import numpy as np
 
 OURS: Final = 'ours'

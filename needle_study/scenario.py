@@ -70,13 +70,13 @@ class Scenario(Interface):
 
 
 def _steering(settings: Mapping[str, Any]) -> Scenario:
-    from needle_insertion.study.steering import SteeringProtocol
+    from needle_study.steering import SteeringProtocol
 
     return SteeringProtocol(settings)
 
 
 def _insertion(settings: Mapping[str, Any]) -> Scenario:
-    from needle_insertion.study.insertion import InsertionProtocol
+    from needle_study.insertion import InsertionProtocol
 
     return InsertionProtocol(settings)
 
