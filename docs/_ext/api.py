@@ -25,6 +25,7 @@ PACKAGES = (
     'needle_identification',
     'needle_study',
     'needle_insertion',
+    'reproduction',
 )
 SOURCE = Path(__file__).parents[2]
 

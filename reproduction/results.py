@@ -11,18 +11,18 @@ from typing import Any, Final
 
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS
-from needle_insertion.paper import claims, controllability, figures, mismatch, needle_constants
-from needle_insertion.paper.identified import (
+from needle_insertion.experiment.tables import TABLE_1, TABLE_2
+from needle_insertion.report.content import ReportSection
+from needle_insertion.report.page import write_page
+from needle_insertion.report.text import filled, table
+from reproduction import claims, controllability, figures, mismatch, needle_constants
+from reproduction.identified import (
     IdentifiedTable,
     identify_table,
     ReproduceError,
     TABLES,
     VERDICTS,
 )
-from needle_insertion.paper.tables import TABLE_1, TABLE_2
-from needle_insertion.report.content import ReportSection
-from needle_insertion.report.page import write_page
-from needle_insertion.report.text import filled, table
 from tqdm import tqdm
 
 #: Tables that decide about a result.

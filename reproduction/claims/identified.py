@@ -7,10 +7,10 @@ from typing import Final
 
 from needle_dynamics import FloatArray
 from needle_identification import asymmetry, StiffnessSettings
-from needle_insertion.paper.claims.claim import Finding, finding, Tables
-from needle_insertion.paper.runs import hub_time, open_loop, READINGS
-from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
+from reproduction.claims.claim import Finding, finding, Tables
+from reproduction.runs import hub_time, open_loop, READINGS
 
 #: Newton seconds per meter in the paper's N s/mm, and newtons per meter in its kN/m.
 _THOUSAND: Final = 1e3

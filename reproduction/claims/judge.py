@@ -7,7 +7,8 @@ from importlib.resources import files
 from types import ModuleType
 from typing import Any
 
-from needle_insertion.paper.claims import (
+from needle_insertion.report.content import Grid, ReportSection
+from reproduction.claims import (
     analysis,
     assumptions,
     control,
@@ -15,9 +16,8 @@ from needle_insertion.paper.claims import (
     mismatch,
     needle,
 )
-from needle_insertion.paper.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
-from needle_insertion.paper.mismatch import Mismatch
-from needle_insertion.report.content import Grid, ReportSection
+from reproduction.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
+from reproduction.mismatch import Mismatch
 import yaml
 
 

@@ -43,7 +43,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Print a result and write its page; return 1 if a result does not hold."""
     # Takes two seconds to import; invalid options are reported without it.
-    from needle_insertion.paper.results import campaigns, results, VERDICT_HEADS, write_results
+    from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
 
     folder = options.output or (_OUTPUT if options.what == 'all' else None)
     for path in (folder, options.record):

@@ -6,8 +6,9 @@ from math import exp, sqrt
 
 from needle_controller import Axis, LoopRun, Pid, PidGains, stability_limit
 from needle_dynamics import NeedleParameters
-from needle_insertion.paper.claims.claim import Finding, finding
-from needle_insertion.paper.runs import (
+import numpy as np
+from reproduction.claims.claim import Finding, finding
+from reproduction.runs import (
     base_alone,
     CASES,
     closed_loop,
@@ -23,7 +24,6 @@ from needle_insertion.paper.runs import (
     READINGS,
     RunOutcome,
 )
-import numpy as np
 
 
 def _with_hub(law: str, factors: tuple[float, float] = (1.0, 1.0)) -> LoopRun:

@@ -6,10 +6,10 @@ from dataclasses import replace
 from math import log, pi
 
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_insertion.paper.beam import ENTRIES, whole_needle
-from needle_insertion.paper.claims.claim import Finding, finding
-from needle_insertion.paper.runs import DEFLECTION, DEPTH, FORCE, hub_time, needle, open_loop
 import numpy as np
+from reproduction.beam import ENTRIES, whole_needle
+from reproduction.claims.claim import Finding, finding
+from reproduction.runs import DEFLECTION, DEPTH, FORCE, hub_time, needle, open_loop
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 from needle_controller import run_continuous
 from needle_dynamics import NeedleModel
-from needle_insertion.paper.claims.claim import Finding, finding
-from needle_insertion.paper.mismatch import Mismatch
-from needle_insertion.paper.runs import (
+import numpy as np
+from reproduction.claims.claim import Finding, finding
+from reproduction.mismatch import Mismatch
+from reproduction.runs import (
     closed_loop,
     DEFLECTION,
     DEPTH,
@@ -17,7 +18,6 @@ from needle_insertion.paper.runs import (
     paper_law,
     RunOutcome,
 )
-import numpy as np
 
 
 def _informed(study: Mismatch) -> Finding:

@@ -6,8 +6,9 @@ from functools import cache
 from math import pi, sqrt
 
 from needle_dynamics import FloatArray, Integrator, mode_shapes, NeedleModel, NeedleParameters
-from needle_insertion.paper.claims.claim import Finding, finding
-from needle_insertion.paper.runs import (
+import numpy as np
+from reproduction.claims.claim import Finding, finding
+from reproduction.runs import (
     CASES,
     DEFLECTION,
     DEPTH,
@@ -18,7 +19,6 @@ from needle_insertion.paper.runs import (
     READINGS,
     RunOutcome,
 )
-import numpy as np
 from scipy.linalg import eigh
 
 

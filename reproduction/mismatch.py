@@ -28,10 +28,10 @@ from needle_controller import (
     Setpoint,
 )
 from needle_dynamics import DEFAULT_PRESET, FloatArray, NeedleModel, NeedleParameters
-from needle_insertion.paper.figures import LAW_COLORS
-from needle_insertion.paper.runs import LAWS
 from needle_insertion.report.content import Grid, Picture, ReportSection
 import numpy as np
+from reproduction.figures import LAW_COLORS
+from reproduction.runs import LAWS
 
 #: Largest relative deviation of the uniform distributions, and the sampled constants.
 WIDTH: Final = 0.3

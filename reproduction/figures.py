@@ -9,7 +9,9 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray, NeedleParameters
-from needle_insertion.paper.runs import (
+from needle_insertion.report.content import Grid, Picture, ReportSection
+import numpy as np
+from reproduction.runs import (
     base_alone,
     CASES,
     closed_loop,
@@ -22,8 +24,6 @@ from needle_insertion.paper.runs import (
     RunOutcome,
     SHOWN,
 )
-from needle_insertion.report.content import Grid, Picture, ReportSection
-import numpy as np
 
 LAW_COLORS: Final[Mapping[str, str]] = {'inverse_dynamics': '#c25a00', 'pid': '#1f5fa8'}
 

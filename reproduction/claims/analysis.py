@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 from needle_dynamics import Analysis
-from needle_insertion.paper.claims.claim import Finding, finding
-from needle_insertion.paper.controllability import DEFLECTIONS, DEPTHS, SPEED
-from needle_insertion.paper.runs import CASES, needle
 from needle_insertion.report.controllability import analyze_points
+from reproduction.claims.claim import Finding, finding
+from reproduction.controllability import DEFLECTIONS, DEPTHS, SPEED
+from reproduction.runs import CASES, needle
 
 
 @cache
