@@ -16,8 +16,8 @@ from needle_identification import (
     read_topic,
     SteeringSettings,
 )
-from needle_insertion.experiment.insertion import record_insertion
-from needle_insertion.experiment.progress import Show
+from needle_insertion.demo.insertion import record_insertion
+from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check

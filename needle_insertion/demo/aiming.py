@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.experiment.bending import read_needles
-from needle_insertion.experiment.insertion import RATE, SETTLING, target_message, WARM_UP
-from needle_insertion.experiment.node_process import GraphError
-from needle_insertion.experiment.progress import Show
-from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
+from needle_insertion.demo.bending import read_needles
+from needle_insertion.demo.insertion import RATE, SETTLING
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle

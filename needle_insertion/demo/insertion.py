@@ -11,12 +11,11 @@ from geometry_msgs.msg import PointStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.experiment.progress import Show
-from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.progress import Show
 from needle_insertion.report.text import Check
-from needle_ros.contract import ENTRY
-from needle_ros.timing import NANOSECONDS, seconds
+from needle_ros.timing import seconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
@@ -29,9 +28,6 @@ START_DEFLECTION: Final = 5e-4
 #: Topics sampled at `RATE`, whose messages are counted.
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
 
-
-#: Time before the target is sent, until all sensors have reported [s].
-WARM_UP: Final = 0.1
 
 #: Recorded time after the nominal arrival, for ramps and settling [s].
 SETTLING: Final = 1.6
@@ -94,15 +90,6 @@ def record_insertion(
             'plant': {'depth': START_DEPTH, 'rate': RATE, **given},
         }
         run.record(bag, nodes, act)
-
-
-def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
-    """Return a target x, y, z [m] with a stamp [ns]."""
-    message = PointStamped()
-    message.header.frame_id = ENTRY
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
-    message.point.x, message.point.y, message.point.z = point
-    return message
 
 
 def read_insertion(law: str, bag: Path) -> RecordedInsertion:

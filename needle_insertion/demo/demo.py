@@ -20,16 +20,15 @@ from needle_identification import (
     summarize_stiffness,
     write_result,
 )
-from needle_insertion.experiment.aiming import (
+from needle_insertion.demo.aiming import (
     aiming_checks,
     animate_aiming,
     draw_aiming,
     read_aimed,
     record_aimed,
 )
-from needle_insertion.experiment.bending import bending_checks, draw_bending, record_bending
-from needle_insertion.experiment.campaign import Campaign
-from needle_insertion.experiment.insertion import (
+from needle_insertion.demo.bending import bending_checks, draw_bending, record_bending
+from needle_insertion.demo.insertion import (
     draw_insertions,
     insertion_checks,
     RATE,
@@ -41,7 +40,7 @@ from needle_insertion.experiment.insertion import (
     START_DEPTH,
     TARGET_DEPTH,
 )
-from needle_insertion.experiment.progress import ProgressLine
+from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS
 from needle_insertion.experiment.record import rig
 from needle_insertion.experiment.truth import (
@@ -50,6 +49,7 @@ from needle_insertion.experiment.truth import (
     Coverage,
     TruthComparison,
 )
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_figures import (
     friction_data,

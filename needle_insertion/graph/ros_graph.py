@@ -16,7 +16,7 @@ from typing import Any, Final, IO
 from domain_coordinator import domain_id
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from needle_insertion.experiment.node_process import GraphError, NodeProcess
+from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_ros.network import domain_of, LOCAL, stay_local
 from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client

@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
 from needle_identification.recorder_node import is_hidden
-from needle_insertion.experiment.node_process import GraphError
-from needle_insertion.experiment.progress import Show
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.progress import Show
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, profile, SENSOR
+from needle_ros.contract import ENTRY
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader
 from rclpy.duration import Duration
@@ -23,6 +25,9 @@ from std_msgs.msg import Header
 
 #: Key on /diagnostics of a plant: number of nodes in lock-step.
 IN_LOCKSTEP: Final = 'nodes in lock-step'
+
+#: Time before the target is sent, until all sensors have reported [s].
+WARM_UP: Final = 0.1
 
 #: Timeout of the arrival of a message on a busy machine [s].
 _ARRIVAL: Final = Duration(seconds=30.0)
@@ -43,6 +48,15 @@ class RunSample(NamedTuple):
     time: float
     #: Insertion depth [m].
     depth: float
+
+
+def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
+    """Return a target x, y, z [m] with a stamp [ns]."""
+    message = PointStamped()
+    message.header.frame_id = ENTRY
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+    message.point.x, message.point.y, message.point.z = point
+    return message
 
 
 class Witness:
