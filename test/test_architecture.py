@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 import re
 
@@ -67,10 +68,10 @@ NOT_OURS = {
 }
 
 
-def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
-    """Yield line and qualified name of all imports of a file, at any level."""
+def imports(path: str, tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield line and qualified name of all imports in the syntax tree of a file."""
     package = path.removesuffix('.py').split('/')[:-1]
-    for node in ast.walk(ast.parse(source, path)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -91,7 +92,7 @@ def violations(path: str, source: str) -> list[str]:
     package = path.partition('/')[0]
     is_node = path.endswith('_node.py') and package not in NO_NODES
     found = []
-    for line, name in imports(path, source):
+    for line, name in imports(path, ast.parse(source, path)):
         root, *parts = name.split('.')
         where = f'{path}:{line}: '
         if root in MAY_IMPORT and root != package and root not in MAY_IMPORT[package]:
@@ -107,6 +108,43 @@ def violations(path: str, source: str) -> list[str]:
     return sorted(set(found))
 
 
+class WithoutFunctions(ast.NodeTransformer):
+    """Remove all functions of a syntax tree."""
+
+    def visit_FunctionDef(self, _node: ast.FunctionDef) -> None:
+        """Remove a function."""
+
+
+def import_circle(files: Mapping[str, str]) -> list[str]:
+    """Return a circle of modules that import each other when they are imported, or []."""
+    paths = {
+        path.removesuffix('.py').removesuffix('/__init__').replace('/', '.'): path
+        for path in files
+    }
+    graph = {}
+    for module, path in paths.items():
+        tree = WithoutFunctions().visit(ast.parse(files[path], path))
+        found = [name for _, name in imports(path, tree)]
+        # A name is a module, or a name in a module.
+        used = {name if name in paths else name.rpartition('.')[0] for name in found}
+        graph[module] = (used & paths.keys()) - {module}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def repeated_classes(files: Mapping[str, str]) -> list[str]:
+    """Return the public names of classes that several files define, with the files."""
+    found: dict[str, list[str]] = {}
+    for path, source in files.items():
+        for node in ast.parse(source, path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                found.setdefault(node.name, []).append(path)
+    return [f'{name}: {", ".join(paths)}' for name, paths in found.items() if len(paths) > 1]
+
+
 def forbidden_words(path: str, content: str) -> list[str]:
     """Return the lines with a word that must not be published."""
     return [
@@ -117,9 +155,13 @@ def forbidden_words(path: str, content: str) -> list[str]:
     ]
 
 
-def sources() -> list[Path]:
-    """List the Python files of the packages."""
-    return [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob('*.py'))]
+def sources() -> dict[str, str]:
+    """Return the Python files of the packages, by their paths relative to the root."""
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text('utf-8')
+        for package in MAY_IMPORT
+        for path in sorted((ROOT / package).rglob('*.py'))
+    }
 
 
 def texts() -> Iterator[Path]:
@@ -137,11 +179,7 @@ def texts() -> Iterator[Path]:
 
 def test_packages_import_lower_layers_only() -> None:
     """Packages import downwards, and ROS and bags only in the designated files."""
-    broken = [
-        line
-        for path in sources()
-        for line in violations(path.relative_to(ROOT).as_posix(), path.read_text('utf-8'))
-    ]
+    broken = [line for path, source in sources().items() for line in violations(path, source)]
     assert not broken, '\n'.join(broken)
 
 
@@ -149,7 +187,17 @@ def test_all_packages_are_checked() -> None:
     """The rules cover every package, and each has files."""
     there = {path.parent.name for path in ROOT.glob('*/__init__.py')}
     assert there == set(MAY_IMPORT)
-    assert there == {path.relative_to(ROOT).parts[0] for path in sources()}
+    assert there == {path.partition('/')[0] for path in sources()}
+
+
+def test_files_do_not_import_each_other_in_circles() -> None:
+    """Every file can be read after the files that it imports."""
+    assert import_circle(sources()) == []
+
+
+def test_names_of_public_classes_are_unique() -> None:
+    """A name of a class identifies it, in all packages."""
+    assert repeated_classes(sources()) == []
 
 
 def test_no_file_mentions_a_forbidden_word() -> None:
@@ -240,3 +288,23 @@ def test_forbidden_word_is_reported(word: str) -> None:
         f'docs/a.md:2: mentions {word}'
     ]
     assert forbidden_words('docs/a.md', 'shared work') == []
+
+
+def test_import_circle_is_reported() -> None:
+    """Imports inside functions do not count."""
+    files = {
+        'needle_ros/a.py': 'from needle_ros import b',
+        'needle_ros/b.py': 'class B:\n    from needle_ros.c import C',
+        'needle_ros/c.py': 'from needle_ros.a import A\nclass C:\n    pass',
+    }
+    assert set(import_circle(files)) == {'needle_ros.a', 'needle_ros.b', 'needle_ros.c'}
+    later = {**files, 'needle_ros/c.py': 'def f():\n    import needle_ros.a'}
+    assert import_circle(later) == []
+
+
+def test_repeated_class_is_reported() -> None:
+    files = {
+        'needle_ros/a.py': 'class A:\n    class B:\n        pass\nclass _C:\n    pass',
+        'tools/a.py': 'class A:\n    pass\nclass B:\n    pass\nclass _C:\n    pass',
+    }
+    assert repeated_classes(files) == ['A: needle_ros/a.py, tools/a.py']
