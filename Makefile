@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test description launch docs tools setup.py
+SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_study needle_insertion reproduction benchmarks examples test description launch docs tools setup.py
 
 .PHONY: demo test check docs format setup compiled lock bags results bench clean
 

@@ -47,12 +47,12 @@ setup(
     long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     python_requires='>=3.10',
-    packages=find_packages(include=['needle_*']),
+    packages=find_packages(include=['needle_*', 'reproduction*']),
     package_data={
         '': ['py.typed'],
         'needle_ros': ['*.xml'],
         'needle_insertion.report': ['templates/*'],
-        'needle_insertion.paper.claims': ['*.yaml'],
+        'reproduction.claims': ['*.yaml'],
         'needle_insertion.watch': ['page/*'],
     },
     data_files=[

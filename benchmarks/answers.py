@@ -17,7 +17,7 @@ from time import monotonic
 from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticArray
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND

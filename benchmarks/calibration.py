@@ -51,7 +51,7 @@ from needle_insertion.experiment.protocol import (
     PROTOCOLS,
     START_DEPTH,
 )
-from needle_insertion.paper.tables import FORCE_LEVELS
+from needle_insertion.experiment.tables import FORCE_LEVELS
 from needle_ros.process_pool import processes
 import numpy as np
 

@@ -14,8 +14,8 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import cpu_seconds, Pair, PAIRS
 from needle_identification import Bag
-from needle_insertion.experiment.node_process import GraphError
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import Graph
 import numpy as np
 
 #: Bar on the growth of the memory of a node [MB].

@@ -12,7 +12,7 @@ import gymnasium
 
 #: Environments of the suite, and two of classic control.
 NAMES: Final = (
-    'needle_insertion.gym:NeedleInsertion-v0', 'needle_insertion.gym:NeedleSteering-v0',
+    'needle_study.gym:NeedleInsertion-v0', 'needle_study.gym:NeedleSteering-v0',
     'CartPole-v1', 'Pendulum-v1',
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ import subprocess
 import time
 from typing import Final, NamedTuple
 
-from needle_insertion.study.engine import TABLE
+from needle_study.engine import TABLE
 import numpy as np
 import psutil
 

@@ -16,10 +16,10 @@ from typing import Any, Final
 from benchmarks.kills import kill_workers, Losses
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
-from needle_insertion.study.engine import chunk, order, TABLE
-from needle_insertion.study.study import made
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
+from needle_study.engine import chunk, order, TABLE
+from needle_study.study import made
 import numpy as np
 import yaml
 

@@ -23,8 +23,8 @@ from needle_controller.controller_node import ControllerNode
 from needle_controller.steering.executive import Phase
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.experiment.node_process import GraphError
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator
 from needle_insertion.report.text import table
 from needle_ros import contract

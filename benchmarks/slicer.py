@@ -13,7 +13,7 @@ from benchmarks.measure import Bar, number
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import cpu_seconds
 from geometry_msgs.msg import PointStamped
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import COMMAND
 import numpy as np
 

@@ -14,8 +14,8 @@ from benchmarks.measure import Bar
 from benchmarks.page import Tick
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from needle_insertion.experiment.node_process import GraphError, NodeProcess
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.node_process import GraphError, NodeProcess
+from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from sensor_msgs.msg import JointState
 

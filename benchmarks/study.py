@@ -28,9 +28,9 @@ from benchmarks.page import Answer, PageSection, Tick
 import dask
 from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
-from needle_insertion.study import engine
-from needle_insertion.study.study import made, read_study, Study
 from needle_ros.process_pool import processes
+from needle_study import engine
+from needle_study.study import made, read_study, Study
 import numpy as np
 import psutil
 import yaml

@@ -24,7 +24,7 @@ from typing import Final
 from benchmarks.measure import Bar
 from benchmarks.pairs import cpu_seconds
 from diagnostic_msgs.msg import DiagnosticArray
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from needle_ros.errors import JobError
 import numpy as np
 from rclpy.node import Node

@@ -32,7 +32,7 @@ html_show_copyright = False
 
 # Only references to our own names must resolve: nothing is downloaded to resolve the others.
 nitpicky = True
-nitpick_ignore_regex = [('py:.*', r'(?!(needle_|benchmarks)).*')]
+nitpick_ignore_regex = [('py:.*', r'(?!(needle_|reproduction|benchmarks)).*')]
 default_role = 'py:obj'
 suppress_warnings = ['config.cache']
 

@@ -20,7 +20,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray, insert_batch, STEERING_PRESETS
 from needle_dynamics.steering.parameters import with_lengths
-from needle_insertion.study.study import made
+from needle_study.study import made
 import numpy as np
 
 #: Variables of the population. Bending length and path noise are inferred; the others are nuisance

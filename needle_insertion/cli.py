@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from io import TextIOWrapper
 import os
+from pathlib import Path
 import re
 import shlex
 import signal
@@ -19,7 +20,7 @@ from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, NeedleError
 
-#: Help text of each subcommand; the key is its module in `needle_insertion.commands`.
+#: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
 COMMANDS: Final[Mapping[str, str]] = {
     'compile': 'compile all functions for this machine, once',
     'demo': 'insertion, recording, identification and a report',
@@ -36,6 +37,11 @@ COMMANDS: Final[Mapping[str, str]] = {
     'verify': 'compute recorded runs again and compare',
     'bench': 'measure speed and accuracy (from a clone)',
 }
+
+#: Modules of the subcommands of the packages above this one, which are loaded by their names only.
+ABOVE: Final[Mapping[str, str]] = {'reproduce': 'reproduction.command', 'bench': 'benchmarks.run'}
+
+_ROOT: Final = Path(__file__).parents[1]
 
 #: ASCII substitutes of table characters, by character.
 _PLAIN: Final = {'±': '+-', '−': '-', '–': '-'}
@@ -75,7 +81,7 @@ def _run(words: list[str]) -> int:
     command: Subcommand | None = None
     COMMAND.set(shlex.join(['needle', *words]))
     if chosen in COMMANDS:
-        command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
+        command = _load(chosen)
         words = _joined(words, command.signed)
     parser = _parser(chosen, command)
     if '_ARGCOMPLETE' in os.environ:
@@ -109,6 +115,20 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     for name in _SIGNALS:
         signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _load(name: str) -> Subcommand:
+    """Import a subcommand; the benchmarks are not installed."""
+    if name == 'bench':
+        if not (_ROOT / 'benchmarks').is_dir():
+            _Parser(prog='needle bench').error(
+                'only a clone of the repository has the benchmarks; run it from there'
+            )
+        # The clone is not on the import path.
+        sys.path.insert(0, str(_ROOT))
+    module = ABOVE.get(name, f'needle_insertion.commands.{name}')
+    command: Subcommand = import_module(module).COMMAND
+    return command
 
 
 def _parser(chosen: str, command: Subcommand | None) -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@ import os
 from typing import Final
 
 from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
-from needle_insertion.experiment.progress import ProgressLine
+from needle_insertion.progress import ProgressLine
 from needle_ros.process_pool import processes
 
 #: Modules with kernels, the slowest to compile first.
@@ -31,7 +31,7 @@ MODULES: Final = (
     'needle_dynamics.compiled.normal_modes',
     'needle_dynamics.compiled.oscillator',
     # Needs Gymnasium, which is optional.
-    *(('needle_insertion.gym.pushed',) if find_spec('gymnasium') else ()),
+    *(('needle_study.gym.pushed',) if find_spec('gymnasium') else ()),
 )
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 import re
 
@@ -17,15 +18,35 @@ MAY_IMPORT = {
     'needle_dynamics': {'needle_ros'},
     'needle_controller': {'needle_dynamics', 'needle_ros'},
     'needle_identification': {'needle_dynamics', 'needle_ros'},
+    'needle_study': {'needle_controller', 'needle_dynamics', 'needle_ros'},
     'needle_insertion': {
         'needle_controller',
         'needle_dynamics',
         'needle_identification',
         'needle_ros',
+        'needle_study',
     },
+    'reproduction': {
+        'needle_controller',
+        'needle_dynamics',
+        'needle_identification',
+        'needle_insertion',
+        'needle_ros',
+    },
+    'benchmarks': {
+        'needle_controller',
+        'needle_dynamics',
+        'needle_identification',
+        'needle_insertion',
+        'needle_ros',
+        'needle_study',
+    },
+    'tools': set(),
 }
-#: The top package may import any external package.
-TOP = 'needle_insertion'
+#: Packages without nodes.
+NO_NODES = {'needle_study'}
+#: These packages may import any external package.
+TOP = {'needle_insertion', 'reproduction', 'benchmarks', 'tools'}
 ROS = re.compile(r'(rclpy|rcl_\w+|ros\w+_py|ament_\w+|launch(_\w+)?|\w+_(msgs|srvs|interfaces))$')
 BAGS = {'mcap', 'rosbags'}
 BAG_READERS = 'needle_identification/bags/'
@@ -47,10 +68,10 @@ NOT_OURS = {
 }
 
 
-def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
-    """Yield line and qualified name of all imports of a file, at any level."""
+def imports(path: str, tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield line and qualified name of all imports in the syntax tree of a file."""
     package = path.removesuffix('.py').split('/')[:-1]
-    for node in ast.walk(ast.parse(source, path)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -69,14 +90,14 @@ def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
 def violations(path: str, source: str) -> list[str]:
     """Return the rule violations of a file; the path is relative to the root."""
     package = path.partition('/')[0]
-    is_node = path.endswith('_node.py')
+    is_node = path.endswith('_node.py') and package not in NO_NODES
     found = []
-    for line, name in imports(path, source):
+    for line, name in imports(path, ast.parse(source, path)):
         root, *parts = name.split('.')
         where = f'{path}:{line}: '
         if root in MAY_IMPORT and root != package and root not in MAY_IMPORT[package]:
             found.append(f'{where}{package} must not import {root}')
-        if package == TOP:
+        if package in TOP:
             continue
         if not is_node and ROS.match(root):
             found.append(f'{where}only *_node.py may import {root}')
@@ -85,6 +106,43 @@ def violations(path: str, source: str) -> list[str]:
         if root in BAGS and not path.startswith(BAG_READERS):
             found.append(f'{where}only {BAG_READERS} may import {root}')
     return sorted(set(found))
+
+
+class WithoutFunctions(ast.NodeTransformer):
+    """Remove all functions of a syntax tree."""
+
+    def visit_FunctionDef(self, _node: ast.FunctionDef) -> None:
+        """Remove a function."""
+
+
+def import_circle(files: Mapping[str, str]) -> list[str]:
+    """Return a circle of modules that import each other when they are imported, or []."""
+    paths = {
+        path.removesuffix('.py').removesuffix('/__init__').replace('/', '.'): path
+        for path in files
+    }
+    graph = {}
+    for module, path in paths.items():
+        tree = WithoutFunctions().visit(ast.parse(files[path], path))
+        found = [name for _, name in imports(path, tree)]
+        # A name is a module, or a name in a module.
+        used = {name if name in paths else name.rpartition('.')[0] for name in found}
+        graph[module] = (used & paths.keys()) - {module}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def repeated_classes(files: Mapping[str, str]) -> list[str]:
+    """Return the public names of classes that several files define, with the files."""
+    found: dict[str, list[str]] = {}
+    for path, source in files.items():
+        for node in ast.parse(source, path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                found.setdefault(node.name, []).append(path)
+    return [f'{name}: {", ".join(paths)}' for name, paths in found.items() if len(paths) > 1]
 
 
 def forbidden_words(path: str, content: str) -> list[str]:
@@ -97,9 +155,13 @@ def forbidden_words(path: str, content: str) -> list[str]:
     ]
 
 
-def sources() -> list[Path]:
-    """List the Python files of the packages."""
-    return [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob('*.py'))]
+def sources() -> dict[str, str]:
+    """Return the Python files of the packages, by their paths relative to the root."""
+    return {
+        path.relative_to(ROOT).as_posix(): path.read_text('utf-8')
+        for package in MAY_IMPORT
+        for path in sorted((ROOT / package).rglob('*.py'))
+    }
 
 
 def texts() -> Iterator[Path]:
@@ -117,19 +179,25 @@ def texts() -> Iterator[Path]:
 
 def test_packages_import_lower_layers_only() -> None:
     """Packages import downwards, and ROS and bags only in the designated files."""
-    broken = [
-        line
-        for path in sources()
-        for line in violations(path.relative_to(ROOT).as_posix(), path.read_text('utf-8'))
-    ]
+    broken = [line for path, source in sources().items() for line in violations(path, source)]
     assert not broken, '\n'.join(broken)
 
 
 def test_all_packages_are_checked() -> None:
     """The rules cover every package, and each has files."""
-    there = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
+    there = {path.parent.name for path in ROOT.glob('*/__init__.py')}
     assert there == set(MAY_IMPORT)
-    assert there == {path.relative_to(ROOT).parts[0] for path in sources()}
+    assert there == {path.partition('/')[0] for path in sources()}
+
+
+def test_files_do_not_import_each_other_in_circles() -> None:
+    """Every file can be read after the files that it imports."""
+    assert import_circle(sources()) == []
+
+
+def test_names_of_public_classes_are_unique() -> None:
+    """A name of a class identifies it, in all packages."""
+    assert repeated_classes(sources()) == []
 
 
 def test_no_file_mentions_a_forbidden_word() -> None:
@@ -163,6 +231,13 @@ def test_no_file_mentions_a_forbidden_word() -> None:
             'import needle_insertion',
             'not import needle_insertion',
         ),
+        ('needle_controller/a.py', 'from needle_study import engine', 'not import needle_study'),
+        ('needle_study/a.py', 'import needle_insertion.cli', 'not import needle_insertion'),
+        ('needle_study/a_node.py', 'import rclpy', 'may import rclpy'),
+        ('needle_study/a.py', 'from needle_ros.base_node import x', 'import a node'),
+        ('needle_insertion/a.py', 'import reproduction.command', 'not import reproduction'),
+        ('needle_insertion/a.py', "import_module('benchmarks.run')", 'not import benchmarks'),
+        ('reproduction/a.py', 'from benchmarks import run', 'not import benchmarks'),
         ('needle_dynamics/a.py', 'import rclpy', 'may import rclpy'),
         ('needle_dynamics/a.py', 'import numpy, rclpy.node', 'may import rclpy'),
         ('needle_dynamics/a.py', 'def f():\n    from rclpy.node import Node', ':2: only'),
@@ -213,3 +288,23 @@ def test_forbidden_word_is_reported(word: str) -> None:
         f'docs/a.md:2: mentions {word}'
     ]
     assert forbidden_words('docs/a.md', 'shared work') == []
+
+
+def test_import_circle_is_reported() -> None:
+    """Imports inside functions do not count."""
+    files = {
+        'needle_ros/a.py': 'from needle_ros import b',
+        'needle_ros/b.py': 'class B:\n    from needle_ros.c import C',
+        'needle_ros/c.py': 'from needle_ros.a import A\nclass C:\n    pass',
+    }
+    assert set(import_circle(files)) == {'needle_ros.a', 'needle_ros.b', 'needle_ros.c'}
+    later = {**files, 'needle_ros/c.py': 'def f():\n    import needle_ros.a'}
+    assert import_circle(later) == []
+
+
+def test_repeated_class_is_reported() -> None:
+    files = {
+        'needle_ros/a.py': 'class A:\n    class B:\n        pass\nclass _C:\n    pass',
+        'tools/a.py': 'class A:\n    pass\nclass B:\n    pass\nclass _C:\n    pass',
+    }
+    assert repeated_classes(files) == ['A: needle_ros/a.py, tools/a.py']

@@ -43,12 +43,15 @@ RUN = {
 #: Packages with exported names.
 PACKAGES = ('needle_dynamics', 'needle_controller', 'needle_identification')
 
+#: Python files of all installed packages.
+SOURCES = sorted([*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('reproduction/**/*.py')])
+
 #: Modules with examples in their docstrings.
-WITH_EXAMPLES = sorted(
+WITH_EXAMPLES = [
     '.'.join(path.relative_to(ROOT).with_suffix('').parts)
-    for path in ROOT.glob('needle_*/**/*.py')
+    for path in SOURCES
     if '>>> ' in path.read_text(encoding='utf-8')
-)
+]
 
 
 def blocks(text: str, *languages: str) -> list[str]:
@@ -175,8 +178,7 @@ def test_architecture_names_every_folder_once() -> None:
     named = re.findall(r'^\| `((?:\w+/)+)` \|', page, flags=re.MULTILINE)
     assert len(named) == len(set(named))
     assert all((ROOT / name).is_dir() for name in named)
-    sources = ROOT.glob('needle_*/**/*.py')
-    assert {f'{path.parent.relative_to(ROOT)}/' for path in sources} <= set(named)
+    assert {f'{path.parent.relative_to(ROOT)}/' for path in SOURCES} <= set(named)
 
 
 def test_links_in_the_documentation_exist() -> None:
@@ -203,7 +205,7 @@ def test_commands_in_the_documentation_are_valid() -> None:
     assert len(lines) > 20
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
-        command = import_module(f'needle_insertion.commands.{words[0]}').COMMAND
+        command = cli._load(words[0])
         joined = cli._joined(words, command.signed)
         cli._parser(words[0], command).parse_args(joined)
 

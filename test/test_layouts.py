@@ -10,7 +10,7 @@ from typing import Any
 import xml.etree.ElementTree as ET
 
 from diagnostic_msgs.msg import DiagnosticArray
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 import pytest
 from rosbags.highlevel import AnyReader
 import yaml

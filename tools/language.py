@@ -86,7 +86,7 @@ def texts_of_code(path: str, source: str) -> Iterator[Text]:
 
 def texts(root: Path) -> Iterator[Text]:
     """Yield all text of a checkout that is written by hand."""
-    for path in sorted(root.glob('needle_*/**/*.py')):
+    for path in sorted([*root.glob('needle_*/**/*.py'), *root.glob('reproduction/**/*.py')]):
         yield from texts_of_code(str(path.relative_to(root)), path.read_text('utf-8'))
     for path in sorted(root.glob('test/**/*.py')):
         for k, line in enumerate(path.read_text('utf-8').splitlines(), 1):

@@ -23,7 +23,9 @@ PACKAGES = (
     'needle_dynamics',
     'needle_controller',
     'needle_identification',
+    'needle_study',
     'needle_insertion',
+    'reproduction',
 )
 SOURCE = Path(__file__).parents[2]
 

@@ -43,13 +43,14 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Compute the missing samples, and write table and page."""
     try:
-        from needle_insertion.study import engine, page
-        from needle_insertion.study.replay import replay
+        from needle_insertion.replay.study_sample import replay_sample
+        from needle_insertion.report.study_page import write_study
+        from needle_study import engine
     except ModuleNotFoundError as error:
         raise ParameterError(
             f"needle study needs {error.name}: pip install 'needle_insertion[study]'"
         ) from error
-    from needle_insertion.study.study import read_study
+    from needle_study.study import read_study
     from tqdm import tqdm
 
     study = read_study(options.study)
@@ -61,7 +62,7 @@ def _run(options: argparse.Namespace) -> int:
     results = engine.Results(folder, study)
     if options.replay is not None:
         bag = folder / f'sample_{options.replay}'
-        compared = replay(results, options.replay, bag)
+        compared = replay_sample(results, options.replay, bag)
         same = 'the same numbers as in the table' if compared else 'there is no table yet'
         sys.stdout.write(f'sample {options.replay}: {bag}; {same}\n')
         return 0
@@ -75,7 +76,7 @@ def _run(options: argparse.Namespace) -> int:
         ):
             engine.compute(results, executor, count, bar.update)
     file = folder / 'study.html'
-    page.write(results, file)
+    write_study(results, file)
     sys.stdout.write(f'{study.samples} samples: {results.table}\npage: {file}\n')
     return 0
 
@@ -84,7 +85,7 @@ def _run(options: argparse.Namespace) -> int:
 def _executor(
     scheduler: str | None, workers: int
 ) -> Iterator[tuple[Callable[[], AbstractContextManager[Executor]], int]]:
-    from needle_insertion.study import engine
+    from needle_study import engine
 
     if scheduler is None:
         yield partial(processes, workers), workers

@@ -1,1 +1,1 @@
-"""Run the experiments of the paper and the demo in a graph of nodes."""
+"""Run the experiments of the paper in a graph of nodes, and compare with the true values."""

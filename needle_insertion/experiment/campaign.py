@@ -8,7 +8,7 @@ from typing import Any, Final
 from needle_dynamics.simulated.force_sensor import HIGHEST_RATE
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import ExperimentProtocol, indenter_name
-from needle_insertion.paper.tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment.tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import ParameterError
 
 #: Sample rates at which strokes and presses are resolved [Hz].

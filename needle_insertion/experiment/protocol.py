@@ -8,7 +8,7 @@ from math import cos, pi, sin
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from needle_insertion.paper.tables import FORCE_LEVELS
+from needle_insertion.experiment.tables import FORCE_LEVELS
 
 #: Recordings shipped with the source tree.
 SHIPPED_BAGS: Final = Path(__file__).parents[2] / 'bags'

@@ -14,7 +14,7 @@ from needle_dynamics import JobError, ParameterError
 from needle_identification import message_counts, read_topic, RecordingError
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import ExperimentProtocol, SPEED
-from needle_insertion.experiment.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
+from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.timing import seconds

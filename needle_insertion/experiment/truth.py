@@ -14,7 +14,7 @@ from needle_identification import (
     StiffnessEstimate,
 )
 from needle_insertion.experiment.protocol import indenter_name
-from needle_insertion.paper.tables import TABLE_1, TABLE_2
+from needle_insertion.experiment.tables import TABLE_1, TABLE_2
 import numpy as np
 from scipy.special import bdtr
 

@@ -10,10 +10,9 @@ import sys
 from time import monotonic
 from typing import Any, Final
 
-from needle_insertion.experiment.insertion import WARM_UP
-from needle_insertion.experiment.node_process import GraphError, NodeProcess
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.experiment.simulated_run import IN_LOCKSTEP, RunSample, Witness
+from needle_insertion.graph.node_process import GraphError, NodeProcess
+from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.graph.simulated_run import IN_LOCKSTEP, RunSample, WARM_UP, Witness
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from needle_controller import LAWS
 from needle_controller.steering.executive import Phase
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator, RequestOutcome, State
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.requests import CONTROLLER, STEERING

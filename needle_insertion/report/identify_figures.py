@@ -19,7 +19,7 @@ from needle_identification import (
     StiffnessEstimate,
     StiffnessSummary,
 )
-from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_2
+from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_2
 from needle_insertion.report.identify_text import label_of
 import numpy as np
 

@@ -19,7 +19,7 @@ from needle_identification import (
 )
 from needle_identification.estimation.formatting import between, measured, rounded, spread
 from needle_identification.result import model_parameters
-from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import identify_figures as figures
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_text import (

@@ -10,10 +10,10 @@ from needle_controller import (
     Setpoint,
 )
 from needle_dynamics import NeedleParameters
-from needle_insertion.paper.mismatch import sampled_laws
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from reproduction.mismatch import sampled_laws
 
 PHANTOM = NeedleParameters.preset('phantom')
 

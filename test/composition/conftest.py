@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
-from needle_insertion.paper import runs
 import pytest
+from reproduction import runs
 
 
 @pytest.fixture(scope='session', autouse=True)

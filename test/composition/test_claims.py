@@ -11,11 +11,11 @@ from pathlib import Path
 import re
 
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate
-from needle_insertion.paper import claims, mismatch
-from needle_insertion.paper.claims import Claim, FAILS, HOLDS, judge, ONLY_IF, Tables
-from needle_insertion.paper.claims import identified as judges
 import numpy as np
 import pytest
+from reproduction import claims, mismatch
+from reproduction.claims import Claim, FAILS, HOLDS, judge, ONLY_IF, Tables
+from reproduction.claims import identified as judges
 from scipy.integrate import quad, solve_ivp
 from scipy.linalg import eigh
 from scipy.optimize import brentq, minimize_scalar

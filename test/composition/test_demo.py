@@ -12,9 +12,9 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.experiment import demo
-from needle_insertion.experiment.demo import DemoError, run
-from needle_insertion.experiment.insertion import (
+from needle_insertion.demo import demo
+from needle_insertion.demo.demo import DemoError, run
+from needle_insertion.demo.insertion import (
     COUNTED,
     insertion_checks,
     RecordedInsertion,

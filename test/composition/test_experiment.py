@@ -37,7 +37,7 @@ from needle_insertion.experiment.protocol import (
     START_DEPTH,
 )
 from needle_insertion.experiment.record import ExperimentError, record, Rig, rig
-from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
 

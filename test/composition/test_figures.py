@@ -5,8 +5,12 @@ from math import exp, sqrt
 from matplotlib.figure import Figure
 from needle_controller import ContinuousPid, run_continuous
 from needle_dynamics import Integrator, NeedleParameters
-from needle_insertion.paper.figures import FIGURES, section
-from needle_insertion.paper.runs import (
+from needle_insertion.report.content import png
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from reproduction.figures import FIGURES, section
+from reproduction.runs import (
     base_alone,
     CASES,
     closed_loop,
@@ -21,10 +25,6 @@ from needle_insertion.paper.runs import (
     READINGS,
     RunOutcome,
 )
-from needle_insertion.report.content import png
-import numpy as np
-from numpy.testing import assert_allclose
-import pytest
 
 BOUND = NeedleParameters().coulomb_friction / PID_KP
 

@@ -8,7 +8,8 @@ import gymnasium
 from gymnasium.utils.env_checker import check_env
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.errors import InsertionDepthError
-from needle_insertion.gym.insertion import (
+from needle_ros.errors import ParameterError
+from needle_study.gym.insertion import (
     DRAWN,
     InsertionEnv,
     InsertionVectorEnv,
@@ -16,9 +17,8 @@ from needle_insertion.gym.insertion import (
     START,
     TARGETS,
 )
-from needle_insertion.gym.pushed import FORCE, PERIOD, STEP
-from needle_insertion.gym.steering import SteeringEnv
-from needle_ros.errors import ParameterError
+from needle_study.gym.pushed import FORCE, PERIOD, STEP
+from needle_study.gym.steering import SteeringEnv
 import numpy as np
 import pytest
 
@@ -27,7 +27,7 @@ import pytest
 @pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
 def test_environments_pass_the_gymnasium_checker(name: str) -> None:
     """Environments are registered by module and name; the same seed gives the same episode."""
-    with gymnasium.make(f'needle_insertion.gym:{name}') as environment:
+    with gymnasium.make(f'needle_study.gym:{name}') as environment:
         check_env(environment.unwrapped, skip_render_check=True)
 
 

@@ -1,11 +1,11 @@
 """Mismatch study: sampling, convergence and reproducibility."""
 
-from needle_insertion.paper import mismatch
-from needle_insertion.paper.mismatch import Mismatch
-from needle_insertion.paper.runs import LAWS
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from reproduction import mismatch
+from reproduction.mismatch import Mismatch
+from reproduction.runs import LAWS
 
 
 @pytest.fixture(scope='module')

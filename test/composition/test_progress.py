@@ -3,8 +3,8 @@
 import io
 from threading import Event
 
-from needle_insertion.experiment import progress
-from needle_insertion.experiment.progress import ProgressLine
+from needle_insertion import progress
+from needle_insertion.progress import ProgressLine
 import pytest
 
 

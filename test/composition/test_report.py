@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
-from needle_insertion.experiment.aiming import animate_aiming
+from needle_insertion.demo.aiming import animate_aiming
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page

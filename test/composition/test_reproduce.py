@@ -8,21 +8,21 @@ from typing import Any
 
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
-from needle_insertion.commands.reproduce import RESULTS
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.experiment.truth import _stiffness, Coverage, TruthComparison
-from needle_insertion.paper import figures, identified, mismatch, results
-from needle_insertion.paper.claims import judge
-from needle_insertion.paper.identified import (
-    IdentifiedTable,
-    identify_table,
-    PublishedValue,
-)
-from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import controllability
 from needle_insertion.report.content import ReportSection
 import numpy as np
 import pytest
+from reproduction import figures, identified, mismatch, results
+from reproduction.claims import judge
+from reproduction.command import RESULTS
+from reproduction.identified import (
+    IdentifiedTable,
+    identify_table,
+    PublishedValue,
+)
 from support.pages import look_at
 
 

@@ -23,13 +23,13 @@ from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.cli import main
 from needle_insertion.commands import study as study_command
-from needle_insertion.study import page
-from needle_insertion.study.distribution import distribution
-from needle_insertion.study.engine import chunk, compute, dask, order, Results
-from needle_insertion.study.study import DESIGNS, made, Study
-from needle_insertion.study.summary import column, probability, quantile, share, worst
+from needle_insertion.report import study_page as page
 from needle_ros.errors import JobError
 from needle_ros.process_pool import processes
+from needle_study.distribution import distribution
+from needle_study.engine import chunk, compute, dask, order, Results
+from needle_study.study import DESIGNS, made, Study
+from needle_study.summary import column, probability, quantile, share, worst
 import numpy as np
 import pytest
 from support.pages import look_at
@@ -275,7 +275,7 @@ def test_pages_limit_the_number_of_samples(
 
     monkeypatch.setattr(page, '_MOST', 8)
     monkeypatch.setattr(page, 'column', limited)
-    page.write(results, tmp_path / 'study.html')
+    page.write_study(results, tmp_path / 'study.html')
     assert asked == {8}
     text = (tmp_path / 'study.html').read_text(encoding='utf-8')
     assert 'Of the first 8 samples.' in text

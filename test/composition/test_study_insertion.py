@@ -19,11 +19,11 @@ from needle_controller import (
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_identification import message_counts, read_topic
 from needle_insertion.cli import main
-from needle_insertion.study.engine import compute, Results
-from needle_insertion.study.insertion import CONTROLLERS, FIGURES
-from needle_insertion.study.study import made
-from needle_insertion.study.summary import column
 from needle_ros.process_pool import processes
+from needle_study.engine import compute, Results
+from needle_study.insertion import CONTROLLERS, FIGURES
+from needle_study.study import made
+from needle_study.summary import column
 import numpy as np
 import pytest
 from support.studies import check_refused

@@ -29,7 +29,7 @@ from needle_insertion.cli import main
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS, SHIPPED_BAGS
 from needle_insertion.experiment.record import record
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
+from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.replay.rerun import Rerun, verify
 from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np

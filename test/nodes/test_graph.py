@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from std_srvs.srv import Trigger
 
 

@@ -19,9 +19,8 @@ from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
-from needle_insertion.experiment.insertion import target_message
-from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.experiment.simulated_run import RunSample, SimulatedRun
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds

@@ -51,13 +51,14 @@ KEYS = {
 #: Extras of setup.py without a rosdep key; the code that needs them reports the installation.
 EXTRAS = {'distributed', 'gymnasium', 'pyarrow', 'pyigtl'}
 
-OWN = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
+OWN = {*(path.parent.name for path in ROOT.glob('needle_*/__init__.py')), 'reproduction'}
 
 
 def imported() -> set[str]:
     """Return the external top-level modules imported by the shipped code."""
     modules = set()
-    sources = [*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('launch/*.py')]
+    folders = (*OWN, 'launch')
+    sources = [path for folder in folders for path in ROOT.glob(f'{folder}/**/*.py')]
     for node in (n for path in sources for n in ast.walk(ast.parse(path.read_text()))):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
@@ -144,10 +145,9 @@ def test_rosdep_resolves_every_dependency() -> None:
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the tracked files of this tree, in a colcon workspace."""
     folder = tmp_path_factory.mktemp('workspace') / 'src/needle_insertion'
-    for pattern in ('needle_*', 'config', 'description', 'launch', 'resource', 'scripts', 'test'):
-        for item in ROOT.glob(pattern):
-            if not item.name.endswith('.egg-info'):
-                shutil.copytree(item, folder / item.name)
+    folders = ('config', 'description', 'launch', 'resource', 'scripts', 'test')
+    for name in (*OWN, *folders):
+        shutil.copytree(ROOT / name, folder / name)
     for name in (
         'README.md',
         'package.xml',

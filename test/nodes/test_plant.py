@@ -15,7 +15,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.experiment.node_process import GraphError
+from needle_insertion.graph.node_process import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import numpy as np
 import pytest

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import BaseNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter

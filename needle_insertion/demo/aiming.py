@@ -1,0 +1,236 @@
+"""Record, check and draw a steered insertion, and the same insertion with a guide at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Final
+
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from matplotlib.figure import Figure
+from needle_controller.steering.executive import Phase
+from needle_dynamics import FloatArray
+from needle_identification import read_topic
+from needle_insertion.demo.bending import read_needles
+from needle_insertion.demo.insertion import RATE, SETTLING
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.progress import Show
+from needle_insertion.replay.rerun import verify
+from needle_insertion.report.animation import Animation
+from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.text import Check
+from needle_insertion.watch.recorded import ShownRecording
+from needle_ros.base_node import COMMAND
+from needle_ros.timing import NANOSECONDS, nanoseconds
+import numpy as np
+
+#: Target of the tip, x, y, z [m], and insertion depth at the start [m].
+TARGET: Final = (4e-3, 0.1, -2e-3)
+START: Final = 5e-3
+
+#: Insertion speed [m/s].
+SPEED: Final = 0.02
+
+#: Nominal model of needle and tissue.
+PRESET: Final = {'model.preset': 'bending_35mm'}
+
+#: Plant: tissue softer than the nominal model, bevel, random path deviation, EM tracker.
+PLANT: Final[dict[str, object]] = {
+    **PRESET,
+    'steered': True,
+    'rate': RATE,
+    'depth': START,
+    'model.tissue_stiffness': 45e3,
+    'steering.bevel_load': [0.15],
+    'steering.cutting_force': [1.0],
+    'steering.path_noise': 1e-4,
+    'tip.rate': 40.0,
+    'tip.noise': 1.8e-4,
+    'tip.delay': 0.02,
+}
+
+#: Node `steering`: half the default measurement time of the tip, for a short demo.
+STEERING: Final[dict[str, object]] = {
+    **PRESET,
+    'speed': SPEED,
+    'guide_speed': 0.02,
+    'settle_time': 0.05,
+    'look_time': 0.25,
+    'belief.noise': 6e-5,
+}
+
+#: Node `controller`.
+CONTROLLER: Final[dict[str, object]] = {
+    **PRESET,
+    'rate': RATE,
+    'deflection_feedback': 'none',
+    'reference.speed': SPEED,
+    'reference.acceleration': 0.5,
+}
+
+#: Largest miss of the steered needle [m]; without steering the miss is larger.
+LARGEST_MISS: Final = 1e-3
+
+#: Largest squared Mahalanobis distance of the tip from its estimate: quantile 0.999 of the
+#: chi-squared distribution with two degrees of freedom.
+_LARGEST: Final = 13.8
+
+#: Number of needles in the picture, and of frames in the animation.
+_DRAWN: Final = 5
+_FRAMES: Final = 80
+
+#: Timeout of the insertion, and of the answer to a target, in simulated time [s].
+_LONGEST, _ANSWER = 180.0, 2.0
+
+#: Half-width of a 95 % interval over the standard deviation.
+_NORMAL: Final = 1.96
+
+
+def record_aimed(
+    bag: Path, logs: Path, show: Show, *, steered: bool, lockstep: bool = True
+) -> None:
+    """
+    Insert a needle to the target with real nodes and record everything.
+
+    `logs` is the folder of the node output. If not `steered`, the guide rests. Raises `GraphError`
+    if a node fails or stops, or the target depth is not reached in time.
+    """
+    with Graph(logs) as graph:
+        run = SimulatedRun(graph, show, lockstep=lockstep)
+        aim = run.publisher(PointStamped, 'target')
+        expected = graph.latest(run.node, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
+        waiting = True
+        end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
+
+        def act(sample: RunSample) -> bool:
+            nonlocal waiting, end
+            if waiting and sample.time >= WARM_UP:
+                waiting = False
+                aim(target_message(sample.stamp, TARGET))
+            if steered and end == inf and _is_done(run.values.get('steering', {}), sample.time):
+                # Stamp of the last tip measurement; time since the first sample.
+                last = nanoseconds(expected.message.header.stamp)
+                end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
+            done = (sample.depth - START) / (TARGET[1] - START)
+            show('inserting', min(max(done, 0.0), 1.0))
+            return sample.time < end
+
+        nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
+        nodes['controller'] = {**CONTROLLER, 'steered': steered}
+        nodes['plant'] = PLANT
+        run.record(bag, nodes, act)
+
+
+def _is_done(values: Mapping[str, str], time: float) -> bool:
+    """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
+    phase = values.get('phase')
+    if phase == Phase.STOPPED.value:
+        raise GraphError(f'steering {values[""]}')
+    if time > _LONGEST:
+        raise GraphError(f'steering is not at the target depth after {_LONGEST:g} s: {phase}')
+    if phase == Phase.IDLE.value and time > WARM_UP + _ANSWER:
+        raise GraphError(f'steering: {values["last complaint"]}')
+    return phase == Phase.DONE.value
+
+
+@dataclass(frozen=True, eq=False)
+class Aimed:
+    """Final tip position of an insertion, and its estimate."""
+
+    #: True and expected tip position, x and z, shape (2,) [m].
+    tip: FloatArray
+    expected: FloatArray
+    #: Covariance of the expected position, shape (2, 2) [m^2].
+    covariance: FloatArray
+
+    @property
+    def miss(self) -> float:
+        """Distance of the tip from the target [m]."""
+        return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
+
+    @property
+    def said(self) -> str:
+        """Text of the expected tip position with its 95 % interval."""
+        half = _NORMAL * np.sqrt(np.diag(self.covariance))
+        return ', '.join(
+            f'{name} = {1e3 * at:.2f} ± {1e3 * wide:.2f} mm'
+            for name, at, wide in zip('xz', self.expected, half, strict=True)
+        )
+
+
+def _tip(bag: Path) -> FloatArray:
+    """Return the final tip position, x and z [m]."""
+    *_, (_, last) = read_topic(bag, '/ground_truth')
+    at = dict(zip(last.name, last.position, strict=True))
+    return np.array([at['tip_x'], at['tip_z']])
+
+
+def read_aimed(bag: Path) -> Aimed:
+    """Read the final tip position and its estimate from the bag of a steered insertion."""
+    *_, (_, last) = read_topic(bag, '/tip_expected')
+    pose = last.pose
+    at = np.array([pose.pose.position.x, pose.pose.position.z])
+    whole = np.array(pose.covariance).reshape(6, 6)
+    return Aimed(_tip(bag), at, whole[np.ix_((0, 2), (0, 2))])
+
+
+def aiming_checks(bag: Path, other: Path) -> list[Check]:
+    """
+    Check the miss, the calibration of the expected tip, and the replay of the steered run.
+
+    `other` is the bag of the insertion with a guide at rest.
+    """
+    found = read_aimed(bag)
+    off = found.tip - found.expected
+    held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
+    alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
+    (run,) = verify(bag)
+    x, z = 1e3 * found.tip
+    return [
+        Check(
+            'distance of the tip from its target, steered',
+            f'< {1e3 * LARGEST_MISS:g} mm',
+            f'{1e3 * found.miss:.2f} mm',
+            found.miss < LARGEST_MISS,
+        ),
+        Check(
+            'distance of the tip from its target, guide at rest',
+            f'> {1e3 * LARGEST_MISS:g} mm',
+            f'{1e3 * alone:.2f} mm',
+            alone > LARGEST_MISS,
+        ),
+        Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
+        Check(
+            'computed again from its bag, steered',
+            'identical or within tolerance',
+            run.verdict,
+            run.verdict != 'differs',
+        ),
+    ]
+
+
+def draw_aiming(bag: Path, other: Path) -> Figure:
+    """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
+    needles, path = read_needles(bag)
+    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
+    return draw_needle(
+        [needles[k] for k in at], path, np.array(TARGET), read_needles(other)[0][-1]
+    )
+
+
+def animate_aiming(bag: Path) -> Animation:
+    """Return an animation of the steered needle with some 80 frames."""
+    recording = ShownRecording(bag)
+    times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
+    frames = [recording.view(time).frame(time) for time in times]
+    return Animation(
+        'The steered needle during the insertion, to scale: the needle rests at each measurement '
+        'of its tip (ring), then the guide moves and the insertion continues. The bar at the '
+        'target (cross) is the expected tip position at the target depth, with a 95 % interval.',
+        recording.view(recording.duration).scene,
+        [frame for frame in frames if frame['needle']],
+    )

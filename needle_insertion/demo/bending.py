@@ -1,0 +1,133 @@
+"""Record, check and draw an insertion of a bending needle whose guide and roll move."""
+
+from __future__ import annotations
+
+from math import pi
+from pathlib import Path
+from typing import Any, Final
+
+from builtin_interfaces.msg import Duration
+from matplotlib.figure import Figure
+from needle_dynamics import bending_length, FloatArray
+from needle_dynamics.steering.parameters import NEEDLES
+from needle_identification import (
+    identify_steering,
+    read_steering_recording,
+    read_topic,
+    SteeringSettings,
+)
+from needle_insertion.demo.insertion import record_insertion
+from needle_insertion.progress import Show
+from needle_insertion.replay.rerun import verify
+from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.text import Check
+from needle_ros.errors import NeedleError
+import numpy as np
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+#: Preset of needle and tissue, and plant with a bevel load and a tracker in the tip.
+PRESET: Final = 'bending_35mm'
+PLANT: Final[dict[str, object]] = {
+    'model.preset': PRESET,
+    'steered': True,
+    'steering.bevel_load': [0.6],
+    'steering.cutting_force': [1.0],
+    'tip.rate': 40.0,
+    'tip.noise': 1.8e-4,
+    'tip.delay': 0.02,
+}
+
+#: Moving joints, and their trajectory: times [s] and positions [m, rad]. The guide is displaced
+#: early, and the needle is rotated by half a turn in the middle of the insertion.
+JOINTS: Final = ('guide_x', 'roll')
+COURSE: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
+
+#: Least distance of the tip of a bending needle from the axis [m].
+LEAST_DEFLECTION: Final = 2e-3
+
+#: Largest error of the bending length, in half-widths of the 95 % interval.
+LARGEST_DISTANCE: Final = 2.0
+
+#: Number of needles in the picture.
+_DRAWN: Final = 5
+
+
+def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
+    """
+    Insert a bending needle with a moving guide and record everything.
+
+    `logs` is the folder of the node output. Raises `GraphError` if a node fails.
+    """
+    course = JointTrajectory(
+        joint_names=list(JOINTS),
+        points=[
+            JointTrajectoryPoint(positions=list(at), time_from_start=Duration(sec=time))
+            for time, at in COURSE
+        ],
+    )
+    record_insertion('adaptive', bag, logs, show, PLANT, course, lockstep=lockstep)
+
+
+def bending_checks(bag: Path) -> list[Check]:
+    """Check the deflection, the replay of the run, and the identified bending length."""
+    needle = NEEDLES[PRESET]
+    truth = bending_length(needle.bending_stiffness, needle.tissue_stiffness)
+    (tip, _) = read_needles(bag)
+    aside = float(np.hypot(tip[-1][-1, 0], tip[-1][-1, 2]))
+    (run,) = verify(bag)
+    found = identify_steering(
+        [read_steering_recording(bag)], SteeringSettings(terms=('bevel',), order='together')
+    )
+    length = found.media[0]['bending_length']
+    low, high = length.interval
+    half = 0.5 * (high - low)
+    return [
+        Check(
+            'tip off the axis, bent needle',
+            f'> {1e3 * LEAST_DEFLECTION:g} mm',
+            f'{1e3 * aside:.2f} mm',
+            aside > LEAST_DEFLECTION,
+        ),
+        Check(
+            'computed again from its bag, bent needle',
+            'identical or within tolerance',
+            run.verdict,
+            run.verdict != 'differs',
+        ),
+        Check(
+            'lambda, bent needle',
+            f'{1e3 * truth:.4g} mm within {LARGEST_DISTANCE:g} x 95 %',
+            f'{1e3 * length.value:.4g} ± {1e3 * half:.2g} mm (95 %)',
+            length.determined and abs(length.value - truth) <= LARGEST_DISTANCE * half,
+        ),
+    ]
+
+
+def draw_bending(bag: Path) -> Figure:
+    """Draw the needle during the insertion in both planes, to scale."""
+    needles, path = read_needles(bag)
+    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
+    return draw_needle([needles[k] for k in at], path)
+
+
+def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
+    """
+    Read the published shapes of the needle and the path that it cut.
+
+    Returns the needle at successive times, without its straight part outside, each of shape (k, 3)
+    [m], and the path, shape (m, 3) [m]. Raises `NeedleError` if the bag has no needle with a path.
+    """
+    needles, path = [], None
+    for _, message in read_topic(bag, '/needle_shape'):
+        points = _points(message)
+        if message.ns == 'path':
+            path = points
+        else:
+            needles.append(points[1:])
+    if path is None or not needles:
+        raise NeedleError(f'{bag} holds no needle with a path')
+    return needles, path
+
+
+def _points(message: Any) -> FloatArray:
+    return np.array([(point.x, point.y, point.z) for point in message.points])

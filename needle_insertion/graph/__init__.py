@@ -1,0 +1,1 @@
+"""Start the nodes as processes, and wait for their states and messages."""

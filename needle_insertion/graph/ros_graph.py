@@ -1,0 +1,235 @@
+"""Run a private ROS graph: nodes as processes on their own domain, and nodes of this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
+from functools import partial
+import gc
+import os
+from pathlib import Path
+import subprocess
+import time
+from types import SimpleNamespace
+from typing import Any, Final, IO
+
+from domain_coordinator import domain_id
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from needle_insertion.graph.node_process import GraphError, NodeProcess
+from needle_ros.network import domain_of, LOCAL, stay_local
+from needle_ros.run_node import END_WITH_PARENT
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.task import Future
+
+CONFIGURE = Transition.TRANSITION_CONFIGURE
+ACTIVATE = Transition.TRANSITION_ACTIVATE
+DEACTIVATE = Transition.TRANSITION_DEACTIVATE
+CLEANUP = Transition.TRANSITION_CLEANUP
+
+#: Timeout of the start of a node, with compilation on a busy machine [s].
+_START: Final = 180.0
+
+#: Period of the requests for the state of a node [s].
+_ASK: Final = 0.2
+
+#: Timeout of the clean end of the nodes, before they are killed [s].
+_PATIENCE: Final = 3.0
+
+
+class Graph:
+    """
+    A ROS graph on a free domain of this machine; leaving the context ends all its processes.
+
+    `logs` is the folder of the node output. The executor runs the nodes of this process in the
+    thread of the caller, so that an error in a callback is an error of the caller. If `shared`,
+    the graph is on the domain of the user, open to other machines as set in the environment.
+    """
+
+    def __init__(
+        self,
+        logs: Path,
+        executor: Callable[..., Executor] = EventsExecutor,
+        *,
+        shared: bool = False,
+    ) -> None:
+        self._logs = logs
+        self._executor_kind = executor
+        self._shared = shared
+        self._processes: list[NodeProcess] = []
+        self._files: list[IO[str]] = []
+        self._nodes: list[Node] = []
+        self._life_cycles: dict[str, Client] = {}
+
+    def __enter__(self) -> Graph:
+        # The context of this process also reads the environment.
+        if self._shared:
+            stay_local(os.environ)
+            self._domain: AbstractContextManager[int] = nullcontext(domain_of(os.environ))
+        else:
+            os.environ.update(LOCAL)
+            self._domain = domain_id()
+        self.domain = self._domain.__enter__()
+        self.environment = {
+            **os.environ,
+            'ROS_DOMAIN_ID': str(self.domain),
+            END_WITH_PARENT: '1',
+        }
+        self.context = Context()
+        self.context.init(domain_id=self.domain)
+        self.executor = self._executor_kind(context=self.context)
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        try:
+            for node in self._nodes:
+                self.executor.remove_node(node)
+                node.destroy_node()
+            self.executor.shutdown()
+            self.context.try_shutdown()
+            self._nodes.clear()
+            self._life_cycles.clear()
+            del self.executor
+            # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the
+            # nodes in the domain, where the next graph would discover them.
+            gc.collect()
+            # SIGTERM first: a recorder closes its bag.
+            for started in self._processes:
+                if started.process.poll() is None:
+                    started.process.terminate()
+            deadline = time.monotonic() + _PATIENCE
+            for started in self._processes:
+                with suppress(subprocess.TimeoutExpired):
+                    started.process.wait(max(0.0, deadline - time.monotonic()))
+        finally:
+            # Kill all before waiting: a second interrupt may arrive during the wait.
+            for started in self._processes:
+                if started.process.poll() is None:
+                    started.process.kill()
+            for started in self._processes:
+                started.process.wait()
+            for file in self._files:
+                file.close()
+            self._domain.__exit__(*raised)
+
+    def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Create a node of a class in this process, spun by `spin_until`."""
+        node = kind(*arguments, context=self.context, **options)
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def node(self, name: str) -> Node:
+        """Create a plain node in this process, spun by `spin_until`."""
+        node: Node = self.add(Node, name)
+        return node
+
+    def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> SimpleNamespace:
+        """Subscribe to a topic; the result has the newest message, or None, as ``message``."""
+        latest = SimpleNamespace(message=None)
+        node.create_subscription(kind, topic, partial(setattr, latest, 'message'), qos)
+        return latest
+
+    def start(
+        self,
+        name: str,
+        parameters: Mapping[str, object] | None = None,
+        file: Path | None = None,
+    ) -> NodeProcess:
+        """Start a node of `NODES` as a process; `parameters` override the ROS parameter file."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        # The process writes to it until the graph closes it.
+        log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
+        self._files.append(log)
+        process = NodeProcess(name, parameters or {}, self.environment, log, file)
+        self._processes.append(process)
+        return process
+
+    def wait_for(self, node: Node, name: str) -> None:
+        """Wait until a node of the suite answers a node of this process with all its clients."""
+        if name in self._life_cycles:
+            return
+        self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
+        probe = node.create_client(GetState, f'{name}/get_state')
+        self.spin_until(probe.service_is_ready, f'the node {name}', _START)
+        # A response to a client that the server has not discovered is lost. Clients are discovered
+        # in the order of their creation: once the last has a response, all will.
+        answers: list[Future] = []
+        start = time.monotonic()
+
+        def answered() -> bool:
+            if time.monotonic() - start >= len(answers):
+                answers.append(probe.call_async(GetState.Request()))
+            return any(answer.done() for answer in answers)
+
+        self.spin_until(answered, f'the answer of {name}', _START)
+        node.destroy_client(probe)
+
+    def wait_active(
+        self, node: Node, name: str, show: Callable[[str], object] = lambda _name: None
+    ) -> None:
+        """Wait until a node with automatic start is active; call `show` with its name."""
+        show(name)
+        self.wait_for(node, name)
+        client = node.create_client(GetState, f'{name}/get_state')
+        self.spin_until(client.service_is_ready, f'the node {name}', _START)
+        answer = client.call_async(GetState.Request())
+        sent = time.monotonic()
+
+        def active() -> bool:
+            nonlocal answer, sent
+            show(name)
+            if answer.done() and answer.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                return True
+            if time.monotonic() - sent > _ASK:
+                answer, sent = client.call_async(GetState.Request()), time.monotonic()
+            return False
+
+        self.spin_until(active, f'the activation of {name}', _START)
+        node.destroy_client(client)
+
+    def change(self, node: Node, name: str, *transitions: int) -> None:
+        """Execute lifecycle transitions of a node that was started without ``autostart``."""
+        self.wait_for(node, name)
+        client = self._life_cycles[name]
+        for transition in transitions:
+            answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+            self.spin_until(answer.done, f'the answer of {name}', _START)
+            if not answer.result().success:
+                said = [p.last_line for p in self._processes if p.name == name]
+                raise GraphError(f'{name} failed to start: {"".join(said[-1:])}')
+
+    def spin_until(
+        self,
+        condition: Callable[[], Any],
+        what: str,
+        timeout: float = 60.0,
+        sign: Callable[[], object] = lambda: None,
+        period: float = 0.0,
+    ) -> None:
+        """
+        Spin the nodes of this process until a condition holds.
+
+        The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
+        condition is checked after each event, which costs more CPU time. Raises `GraphError` with
+        the name `what` on a timeout, and if a process of the graph has ended.
+        """
+        deadline, seen = time.monotonic() + timeout, sign()
+        while not condition():
+            if (now := sign()) != seen:
+                deadline, seen = time.monotonic() + timeout, now
+            for started in self._processes:
+                # A process that was interrupted on purpose ends with status 0.
+                if started.process.poll() not in (None, 0) and not started.killed:
+                    started.check()
+            if time.monotonic() > deadline:
+                raise GraphError(f'timeout after {timeout:g} s: waiting for {what}')
+            if period:
+                self.executor.spin_until_future_complete(Future(), timeout_sec=period)
+            else:
+                self.executor.spin_once(timeout_sec=0.05)

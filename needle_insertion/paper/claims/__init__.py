@@ -1,6 +1,0 @@
-"""Claims of the paper with computed verdict and evidence."""
-
-from needle_insertion.paper.claims.claim import Claim, FAILS, HOLDS, ONLY_IF, Tables
-from needle_insertion.paper.claims.judge import judge_claims, section
-
-__all__ = ['FAILS', 'HOLDS', 'ONLY_IF', 'Claim', 'Tables', 'judge_claims', 'section']

@@ -1,0 +1,46 @@
+"""Compute one sample of a study again and record it to a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from needle_identification import BagWriter
+from needle_ros.errors import JobError, ParameterError
+from needle_ros.wire import Template
+from needle_study.engine import Results
+from needle_study.summary import picked
+import numpy as np
+
+
+def replay_sample(results: Results, number: int, bag: Path) -> bool:
+    """
+    Record a sample to a bag; return whether there was a table to compare with.
+
+    Raises `ParameterError` if there is no such sample, and `JobError` if the table differs.
+    """
+    study = results.study
+    if not 0 <= number < study.samples:
+        raise ParameterError(
+            f'--replay must be from 0 to {study.samples - 1}, the samples of the study, got '
+            f'{number}'
+        )
+    row = study.rows(number, 1)
+    if compared := results.table.exists():
+        for name, values in row.items():
+            (recorded,) = picked(results.table, name, [number])
+            if not np.array_equal(values, [recorded], equal_nan=True):
+                raise JobError(
+                    f'sample {number} differs from {results.table}: {name} was {recorded!r}, '
+                    f'and is {values[0]!r}'
+                )
+    drawn = {name: float(row[name][0]) for name in study.population}
+    templates: dict[str, Template] = {}
+    with BagWriter(bag) as writer:
+        for seen in study.protocol.replay(drawn, study.rng(number, 1)):
+            name = f'/{seen.topic.name}'
+            if name not in templates:
+                templates[name] = seen.topic.template()
+                writer.add_topic(name, seen.topic.type_name)
+            data = templates[name].serialize(seen.stamp, *seen.values)
+            writer.write(name, data, seen.stamp)
+    return compared

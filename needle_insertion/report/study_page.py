@@ -1,0 +1,262 @@
+"""Write the page of a study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import ceil, floor, isfinite, log10, nan, sqrt
+from pathlib import Path
+from typing import Final
+
+from matplotlib.figure import Figure as Drawing
+from needle_dynamics import FloatArray
+from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.page import write_page
+from needle_study.engine import Results
+from needle_study.scenario import Metric
+from needle_study.study import Study
+from needle_study.summary import (
+    batches,
+    column,
+    Estimate,
+    picked,
+    probability,
+    quantile,
+    share,
+    worst,
+)
+import numpy as np
+import yaml
+
+#: Quantiles of each metric.
+_PARTS: Final = (0.5, 0.95, 0.99)
+
+#: Most bars of a histogram, and the number of samples from which its tail is cut off.
+_BARS, _TAILED = 80, 1000
+
+#: Most cells of a map along each axis; mean and least number of samples of a cell.
+_CELLS, _MEAN, _FEWEST = 24, 25, 5
+
+#: Display unit and factor of SI units.
+_SHOWN: Final[Mapping[str, tuple[str, float]]] = {
+    'm': ('mm', 1e3), 'rad': ('mrad', 1e3), '1': ('', 1.0), '%': ('%', 100.0),
+}  # fmt: skip
+
+#: Most samples in quantiles, shares and pictures: bounds the memory of the page.
+_MOST: Final = 2**17
+
+_MISSING: Final = 'Samples without a value of a metric are excluded from it.'
+
+#: Number of worst samples in the list.
+_WORST: Final = 10
+
+
+def write_study(results: Results, path: Path) -> None:
+    """Write the page of a study whose table is complete."""
+    study, table = results.study, results.table
+    figures, drawn = study.protocol.figures, list(study.population)
+    main = next(iter(figures))
+    values = column(table, main, _MOST)
+    chances, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
+    for name, one in figures.items():
+        if not one.unit:
+            chances[name] = probability(batches(table, name))
+            continue
+        seen = values if name == main else column(table, name, _MOST)
+        parts = [quantile(seen, part) for part in _PARTS]
+        if there := parts[0].samples:
+            words = (f'{value} ({ends})' for value, ends in (_rounded(p, one.unit) for p in parts))
+            quantiles.append((_head(name, one.unit), *words, str(there), one.meaning))
+    shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
+    order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
+    # The two most influential variables are drawn.
+    most = {name: column(table, name, _MOST) for name in order[:2]}
+    bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
+    of_bad = {name: picked(table, name, bad) for name in listed}
+    units = {name: study.protocol.quantities[name].unit for name in drawn}
+    units[main] = figures[main].unit
+    limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
+    sections = [
+        ReportSection(
+            title='Probabilities',
+            paragraphs=('95 % intervals by the method of Wilson.', _MISSING),
+            tables=(
+                Grid(
+                    caption='Probabilities',
+                    heads=('metric', 'probability', '95 % interval', 'samples', 'meaning'),
+                    rows=tuple(
+                        (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
+                        for name, one in chances.items()
+                        if np.isfinite(one.value)
+                    ),
+                ),
+            ),
+            pictures=(),
+        ),
+        ReportSection(
+            title='Quantiles',
+            paragraphs=('With distribution-free 95 % intervals.', _MISSING, *limited),
+            tables=(
+                Grid(
+                    caption='Quantiles',
+                    heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
+                    rows=tuple(quantiles),
+                ),
+            ),
+            pictures=(_distribution(main, figures[main], values),),
+        ),
+    ]  # fmt: skip
+    if drawn:
+        sections.append(
+            ReportSection(
+                title='Sensitivity',
+                paragraphs=(
+                    f'Fraction of the variance of {main} explained by each variable alone.',
+                    'The remainder to 100 % is noise, and interactions of variables.',
+                    'Correlated variables share a part of their fractions.',
+                    *limited,
+                ),
+                tables=(
+                    Grid(
+                        caption='Shares of the variance',
+                        heads=('variable', main, 'meaning'),
+                        rows=tuple(
+                            (name, _share(shares[name]), study.protocol.quantities[name].meaning)
+                            for name in order
+                        ),
+                    ),
+                ),
+                pictures=_map(
+                    main, figures[main], values, most, study
+                ),
+            )
+        )  # fmt: skip
+    sections.append(
+        ReportSection(
+            title='Worst samples',
+            paragraphs=('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
+            tables=(
+                Grid(
+                    caption=f'Samples with the largest {main}',
+                    heads=('sample', *(_head(name, units[name]) for name in listed)),
+                    rows=tuple(
+                        (str(number),
+                         *(_number(of_bad[name][place], units[name]) for name in listed))
+                        for place, number in enumerate(bad)
+                    ),
+                ),
+            ),
+            pictures=(),
+        )
+    )  # fmt: skip
+    pictures = [one for section in sections for one in section.pictures]
+    hit = chances.get('hit')
+    cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
+    if hit is not None:
+        value, ends = _rounded(hit, '%')
+        cards.append(('Hit', value, f'95 %: {ends}'))
+    value, ends = _rounded(quantile(values, 0.5), units[main])
+    unit, _ = _shown(units[main])
+    cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
+    write_page(
+        path,
+        'study.html',
+        pictures,
+        title='Study',
+        introduction='Simulated insertions of a population of needles with uncertain parameters.',
+        cards=cards,
+        sections=sections,
+        study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
+    )
+
+
+def _shown(unit: str) -> tuple[str, float]:
+    """Return the display unit of an SI unit, and the factor to it."""
+    return _SHOWN.get(unit, (unit, 1.0))
+
+
+def _head(name: str, unit: str) -> str:
+    shown, _ = _shown(unit)
+    return f'{name} [{shown}]' if shown else name
+
+
+def _number(value: float, unit: str) -> str:
+    return f'{_shown(unit)[1] * value:.4g}'
+
+
+def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
+    """Format a value and its interval, with digits according to the width of the interval."""
+    value, low, high = (_shown(unit)[1] * number for number in one[:3])
+    wide = sum(end for end in (value - low, high - value) if isfinite(end))
+    form = f'.{min(9, max(1, 1 - floor(log10(wide))))}f' if wide > 0.0 else '.4g'
+    sign = unit if unit == '%' else ''
+    ends = [f'{end:{form}}{sign}' for end in (low, high) if isfinite(end)]
+    match isfinite(low), isfinite(high):
+        case True, True:
+            return f'{value:{form}}{sign}', ' to '.join(ends)
+        case True, False:
+            return f'{value:{form}}{sign}', f'≥ {ends[0]}'
+        case False, True:
+            return f'{value:{form}}{sign}', f'≤ {ends[0]}'
+    return f'{value:{form}}{sign}', 'too few samples'
+
+
+def _share(part: float) -> str:
+    return f'{part:.1%}' if isfinite(part) else 'too few samples'
+
+
+def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
+    drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
+    axes = drawing.subplots()
+    seen = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
+    words = f'Distribution of {name}; dashed: {_dashed()}.'
+    if len(seen):
+        end = float(seen[-1])
+        if len(seen) >= _TAILED:
+            # Outliers would compress the rest of the histogram.
+            end = float(np.quantile(seen, 0.999))
+            words += ' The largest thousandth is not shown.'
+        bars = min(_BARS, ceil(2.0 * len(seen) ** (1.0 / 3.0)))
+        axes.hist(seen[seen <= end], bins=bars, color='tab:blue')
+        for part in _PARTS:
+            axes.axvline(float(np.quantile(seen, part)), color='k', lw=0.8, ls='--')
+    axes.set(xlabel=_head(name, figure.unit), ylabel='samples')
+    return Picture('distribution', words, drawing)
+
+
+def _dashed() -> str:
+    return ', '.join(f'{part:.0%}' for part in _PARTS)
+
+
+def _map(
+    name: str, figure: Metric, values: FloatArray, over: dict[str, FloatArray], study: Study
+) -> tuple[Picture, ...]:
+    """Draw the median of a metric over two variables, if both vary."""
+    if len(over) < 2:
+        return ()
+    inside = np.isfinite(values)
+    count = max(1, min(_CELLS, floor(sqrt(inside.sum() / _MEAN))))
+    heads, edges, cells = list[str](), list[FloatArray](), np.zeros(len(values), dtype=np.int16)
+    for one, of in over.items():
+        low, high = np.quantile(of, [0.005, 0.995])
+        if low == high or not inside.any():
+            return ()
+        at = np.linspace(low, high, count + 1)
+        # The last edge belongs to the last cell.
+        place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
+        inside &= (of >= low) & (of <= high)
+        cells = count * cells + place
+        unit = study.protocol.quantities[one].unit
+        heads.append(_head(one, unit))
+        edges.append(_shown(unit)[1] * at)
+    cells[~inside] = last = count * count
+    ends = np.cumsum(np.bincount(cells, minlength=last))[:last]
+    groups = np.split(values[np.argsort(cells, kind='stable')], ends)[:last]
+    shown = np.array([np.median(one) if len(one) >= _FEWEST else nan for one in groups])
+    shown *= _shown(figure.unit)[1]
+    drawing = Drawing(figsize=(8.0, 4.5), layout='constrained')
+    axes = drawing.subplots()
+    mesh = axes.pcolormesh(*edges, shown.reshape(count, count).T, cmap='viridis')
+    drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
+    axes.set(xlabel=heads[0], ylabel=heads[1])
+    words = f'Median {name} over the two most influential variables. White: too few samples.'
+    return (Picture('map', words, drawing),)

@@ -1,0 +1,304 @@
+"""
+Compute a study on any executor; it is resumed after an interruption.
+
+Chunks of samples are written as they arrive, each atomically, in a folder of parts. Existing parts
+are not computed again. When all are complete they become one table, in the order of the samples,
+whose bytes depend neither on the chunks nor on the number of workers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError, Executor, FIRST_COMPLETED, Future, wait
+from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
+import fcntl
+from functools import lru_cache
+from importlib.metadata import version
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+from time import monotonic
+from typing import Any, Final
+
+from needle_dynamics import FloatArray
+from needle_ros.errors import JobError, ParameterError
+from needle_ros.files import write_whole
+from needle_study.study import made, Study
+import pyarrow as pa
+from pyarrow import parquet
+
+#: Samples of the first chunk, and the target duration of the others [s].
+_FIRST, _WANTED = 16, 1.0
+_LARGEST: Final = 2**13
+
+#: Rows per group of the table; the bytes of the table depend on it.
+_GROUP: Final = 2**13
+
+# The other memory pools do not release freed memory.
+pa.set_memory_pool(pa.system_memory_pool())
+
+_PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
+
+#: Packages whose versions affect the bits of a sample.
+_PACKAGES: Final = ('needle_insertion', 'numba', 'numpy', 'scipy')
+
+TABLE: Final = 'samples.parquet'
+STUDY: Final = 'study.json'
+
+
+def order(study: Study) -> str:
+    """Return the input of a worker as JSON: the study, and the versions of the packages."""
+    return json.dumps(
+        {'study': study.document, 'versions': _versions()}, sort_keys=True, default=str
+    )
+
+
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in _PACKAGES}
+
+
+def _check_versions(wanted: Mapping[str, str], what: str) -> None:
+    here = _versions()
+    if here != wanted:
+        words = ' and '.join(
+            ', '.join(f'{name} {given[name]}' for name in _PACKAGES if here[name] != wanted[name])
+            for given in (here, wanted)
+        )
+        raise JobError(f'{what} has another version: {words}; the bits of a sample depend on it')
+
+
+@lru_cache(maxsize=1)
+def _study(text: str) -> Study:
+    given = json.loads(text)
+    _check_versions(given['versions'], 'a worker')
+    return made(given['study'])
+
+
+def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:
+    """
+    Compute `count` samples of the study `text` of `order`, from `first` on, in any process.
+
+    Returns the duration [s] and the columns. Raises `JobError` if the package versions of this
+    process differ.
+    """
+    study = _study(text)
+    begin = monotonic()
+    columns = study.rows(first, count)
+    return monotonic() - begin, columns
+
+
+class Results:
+    """
+    The folder of a study; a folder of the same study is resumed.
+
+    Raises `ParameterError` if it has another study or other files, and `JobError` if its table is
+    damaged.
+    """
+
+    def __init__(self, folder: Path, study: Study) -> None:
+        self.folder, self.study = folder, study
+        self._parts = folder / 'parts'
+        self._file = folder / STUDY
+        if self._file.is_file():
+            if self._begun()['study'] != json.loads(order(study))['study']:
+                raise ParameterError(f'{folder} belongs to another study; name another folder')
+        # A process that was killed at the start leaves a draft, or nothing.
+        elif folder.exists() and any(path.suffix != '.tmp' for path in folder.iterdir()):
+            raise ParameterError(f'{folder} exists and is not a study; name another folder')
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self._file, order(study).encode())
+        if self.table.exists():
+            if _rows(self.table) != study.samples:
+                raise JobError(f'{self.table} is damaged; remove it to compute it again')
+            self._clear()
+        else:
+            self._parts.mkdir(exist_ok=True)
+
+    def _begun(self) -> dict[str, Any]:
+        """Return the study in the folder, and the package versions of its start."""
+        try:
+            given = json.loads(self._file.read_bytes())
+            return {name: given[name] for name in ('study', 'versions')}
+        except (ValueError, TypeError, KeyError) as error:
+            raise ParameterError(f'{self._file} is not a study; name another folder') from error
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """
+        Lock the folder against other processes, and remove damaged parts.
+
+        Raises `JobError` if another process computes here, or the package versions differ.
+        """
+        _check_versions(self._begun()['versions'], f'the study in {self.folder}')
+        self._parts.mkdir(exist_ok=True)
+        with (self._parts / 'lock').open('w') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise JobError(f'another process computes {self.folder}') from error
+            end = 0
+            for first, after in [] if self.table.exists() else self._done():
+                if first < end or _rows(self._part(first, after)) != after - first:
+                    self._part(first, after).unlink()
+                else:
+                    end = after
+            yield
+
+    @property
+    def table(self) -> Path:
+        """File of all samples."""
+        return self.folder / TABLE
+
+    def missing(self) -> list[tuple[int, int]]:
+        """Return the samples to compute, as ranges of first and last + 1."""
+        begin, gaps = 0, list[tuple[int, int]]()
+        if self.table.exists():
+            return gaps
+        for first, end in self._done():
+            if first > begin:
+                gaps.append((begin, first))
+            begin = max(begin, end)
+        if begin < self.study.samples:
+            gaps.append((begin, self.study.samples))
+        return gaps
+
+    def _done(self) -> list[tuple[int, int]]:
+        found = (_PART.fullmatch(path.name) for path in self._parts.iterdir())
+        return sorted((int(one[1]), int(one[2])) for one in found if one)
+
+    def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
+        """Write a chunk that starts at the sample `first`; return its number of samples."""
+        count = len(columns['sample'])
+        self._write(self._part(first, first + count), [pa.table(dict(columns))])
+        return count
+
+    def complete(self) -> None:
+        """Merge all parts into one table, and remove the parts."""
+        if not self.table.exists():
+            self._write(self.table, self._groups())
+        self._clear()
+
+    def _clear(self) -> None:
+        """Remove the parts after they are merged."""
+        shutil.rmtree(self._parts, ignore_errors=True)
+        self.table.with_suffix('.tmp').unlink(missing_ok=True)
+
+    def _groups(self) -> Iterator[Any]:
+        """Yield all samples in tables of equal size."""
+        waiting: list[Any] = []
+        for first, end in self._done():
+            waiting.append(parquet.read_table(self._part(first, end), use_threads=False))
+            while sum(map(len, waiting)) >= _GROUP:
+                whole = pa.concat_tables(waiting)
+                yield whole.slice(0, _GROUP)
+                waiting = [whole.slice(_GROUP)]
+        if sum(map(len, waiting)):
+            yield pa.concat_tables(waiting)
+
+    def _part(self, first: int, end: int) -> Path:
+        return self._parts / f'{first:010d}-{end:010d}.parquet'
+
+    @staticmethod
+    def _write(path: Path, tables: Iterable[Any]) -> None:
+        """Write a file atomically."""
+        draft = path.with_suffix('.tmp')
+        try:
+            with ExitStack() as stack:
+                writer = None
+                for one in tables:
+                    if writer is None:
+                        writer = stack.enter_context(
+                            parquet.ParquetWriter(
+                                draft, one.schema, compression='zstd', use_dictionary=False
+                            )
+                        )
+                    writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
+            if path.name == TABLE:
+                # The parts are removed afterwards. A lost part is computed again.
+                with draft.open('rb') as file:
+                    os.fsync(file.fileno())
+            draft.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                draft.unlink()
+            raise JobError(f'{path} cannot be written: {error.strerror or error}') from error
+
+
+def compute(
+    results: Results,
+    executor: Callable[[], AbstractContextManager[Executor]],
+    workers: int,
+    progress: Callable[[int], object],
+) -> None:
+    """
+    Compute the missing samples; raise `JobError` if a sample cannot be computed or written.
+
+    `executor` returns a context with an executor that replaces lost workers. `progress` receives
+    the number of samples of each chunk that is written.
+    """
+    with results.alone():
+        if todo := results.missing():
+            with executor() as running:
+                _compute(results, running, workers, todo, progress)
+        results.complete()
+
+
+def _compute(
+    results: Results,
+    executor: Executor,
+    workers: int,
+    todo: list[tuple[int, int]],
+    written: Callable[[int], object],
+) -> None:
+    text, size = order(results.study), _FIRST
+    running: dict[Future[tuple[float, dict[str, FloatArray]]], int] = {}
+    try:
+        while todo or running:
+            while todo and len(running) < 2 * workers:
+                # Small chunks at the end, so that all workers end at the same time.
+                left = sum(end - first for first, end in todo)
+                first, end = todo.pop(0)
+                count = min(size, end - first, max(_FIRST, left // (2 * workers)))
+                running[executor.submit(chunk, text, first, count)] = first
+                if first + count < end:
+                    todo.insert(0, (first + count, end))
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                first = running.pop(future)
+                taken, columns = future.result()
+                count = results.add(first, columns)
+                written(count)
+                # The first chunk compiles the kernels, or loads them.
+                size = min(max(1, round(count * _WANTED / max(taken, 1e-6))), 4 * size, _LARGEST)
+    finally:
+        for future in running:
+            future.cancel()
+
+
+@contextmanager
+def dask(client: Any) -> Iterator[Executor]:
+    """Yield an executor on a Dask cluster, which remains; raise `JobError` if a chunk is lost."""
+    # A sample is a pure function of its number, but the results need not be kept.
+    pool = client.get_executor(pure=False)
+    try:
+        yield pool
+    except (CancelledError, ImportError) as error:
+        reason = str(error) or 'the scheduler is not available'
+        raise JobError(f'the cluster has lost a chunk of the study: {reason}') from error
+    except Exception as error:
+        if not type(error).__module__.startswith('distributed'):
+            raise
+        raise JobError(f'the cluster has lost a chunk of the study: {error}') from error
+    finally:
+        if client.status == 'running':
+            pool.shutdown(wait=False)
+
+
+def _rows(path: Path) -> int:
+    """Return the number of rows of a table; -1 if it is damaged."""
+    try:
+        return int(parquet.read_metadata(path).num_rows)
+    except (OSError, pa.ArrowException):
+        return -1

@@ -1,0 +1,177 @@
+"""Gymnasium environment of a needle that is pushed to a depth, single or vectorized."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Final
+
+import gymnasium
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics.compiled.boxed import Boxed
+from needle_ros.errors import ParameterError
+from needle_study.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
+import numpy as np
+
+#: Depth at the start, and range of target depths [m].
+START: Final = 0.02
+TARGETS: Final = (0.03, 0.12)
+
+#: Largest relative deviation from the preset, and the constants that deviate.
+SPREAD: Final = 0.3
+DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
+
+#: Mask of a single environment.
+_ONE: Final = np.ones(1, dtype=bool)
+
+
+class _Needles:
+    """The needles of several episodes, each with its target."""
+
+    def __init__(self, preset: str, number: int) -> None:
+        self._preset = NeedleParameters.preset(preset)
+        model = NeedleModel(self._preset)
+        self._start, common = model.state_at(START), model.compiled
+        self._needles = Pushed(
+            common,
+            np.zeros((number, 2)),
+            Tissues(*(np.array([one] * number) for one in common.layers)),
+            np.zeros(number),
+            np.array([self._start] * number),
+            np.zeros(number),
+        )
+        self._held = Boxed(self._needles)
+
+    def begin(self, k: int, rng: np.random.Generator) -> None:
+        """Sample a new needle and target for episode k."""
+        factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
+        changed: dict[str, Any] = {
+            name: float(factor * getattr(self._preset, name))
+            for name, factor in zip(DRAWN, factors, strict=True)
+        }
+        drawn, all_of = NeedleModel(replace(self._preset, **changed)).compiled, self._needles
+        all_of.friction[k] = drawn.friction.coulomb, drawn.friction.viscous
+        for layers, one in zip(all_of.layers, drawn.layers, strict=True):
+            layers[k] = one
+        all_of.times[k], all_of.states[k] = 0.0, self._start
+        all_of.targets[k] = rng.uniform(*TARGETS)
+
+    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+        """Push the selected needles for a period; return rewards and which episodes ended."""
+        if not np.isfinite(actions).all():
+            raise ParameterError(f'an action must be finite, got {actions!r}')
+        return push(self._held, np.array(actions, dtype=np.float64), which)
+
+    def observe(self) -> FloatArray:
+        """Return the observations, shape (n, 4)."""
+        return np.asarray(observe(self._held))
+
+
+class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
+    """
+    Push a needle to a depth; friction and tissue are sampled around a preset in each episode.
+
+    The action is the force over 10 ms, as a fraction of 15 N. The observation is the error of
+    depth, velocity and depth in dm and dm/s, and the tip deflection in mm. The reward is the
+    negative error [m] minus a small price of force. The episode ends when the needle rests at its
+    target, or leaves its range, with a reward of -1.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
+
+    def __init__(self, preset: str = 'phantom') -> None:
+        self._needles, self._begun = _Needles(preset, 1), False
+        self.action_space = spaces.Box(-1.0, 1.0, (1,))
+        self.observation_space = spaces.Box(-BOUND, BOUND, (len(UNITS),))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start an episode with a new needle; return the observation and an empty dict."""
+        super().reset(seed=seed, options=options)
+        self._needles.begin(0, self.np_random)
+        self._begun = True
+        return self._needles.observe()[0], {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Push for 10 ms; the action is clipped to [-1, 1]."""
+        if not self._begun:
+            raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
+        [reward], [over] = self._needles.step(action, _ONE)
+        return self._needles.observe()[0], float(reward), bool(over), False, {}
+
+
+class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
+    """
+    Many needles at once, each as in `InsertionEnv` with its own seed.
+
+    An episode is truncated after `max_episode_steps`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        'render_modes': [], 'autoreset_mode': AutoresetMode.NEXT_STEP,
+    }  # fmt: skip
+
+    def __init__(
+        self, num_envs: int = 1, preset: str = 'phantom', max_episode_steps: int = 500
+    ) -> None:
+        single = InsertionEnv(preset)
+        self.num_envs = num_envs
+        self.single_action_space = single.action_space
+        self.single_observation_space = single.observation_space
+        self.action_space = batch_space(single.action_space, num_envs)
+        self.observation_space = batch_space(single.observation_space, num_envs)
+        self._needles, self._longest = _Needles(preset, num_envs), max_episode_steps
+        self._rngs = [gymnasium.utils.seeding.np_random()[0] for _ in range(num_envs)]
+        self._begun, self._over = np.zeros((2, num_envs), dtype=bool)
+        self._steps = np.zeros(num_envs, dtype=int)
+
+    def _begin(self, k: int) -> None:
+        self._needles.begin(k, self._rngs[k])
+        self._begun[k], self._over[k], self._steps[k] = True, False, 0
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """
+        Start an episode in each environment, or in those of the option ``reset_mask``.
+
+        An integer seed is the seed of the first environment, the next integer of the second, and
+        so on. In a sequence, None continues the random numbers of its environment.
+        """
+        super().reset(options=options)
+        seeds: list[int | None] = [None] * self.num_envs
+        if isinstance(seed, Sequence):
+            seeds = list(seed)
+        elif seed is not None:
+            seeds = [int(seed) + k for k in range(self.num_envs)]
+        which = np.array((options or {}).get('reset_mask', [True] * self.num_envs), dtype=bool)
+        if len(seeds) != self.num_envs or which.shape != (self.num_envs,):
+            raise ParameterError(
+                f'seed and reset_mask must be of {self.num_envs} environments, got {len(seeds)} '
+                f'and {which.shape}'
+            )
+        for k in np.flatnonzero(which).tolist():
+            if seeds[k] is not None:
+                self._rngs[k] = gymnasium.utils.seeding.np_random(seeds[k])[0]
+            self._begin(k)
+        return self._needles.observe(), {}
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, dict[str, Any]]:
+        """Push all needles for 10 ms; where an episode has ended, start the next one instead."""
+        if not self._begun.all():
+            raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
+        again = self._over
+        rewards, ended = self._needles.step(actions[:, 0], ~again)
+        self._steps += 1
+        for k in np.flatnonzero(again).tolist():
+            self._begin(k)
+        broken = self._steps >= self._longest
+        self._over = ended | broken
+        return self._needles.observe(), rewards, ended, broken, {}

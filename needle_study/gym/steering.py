@@ -1,0 +1,111 @@
+"""Gymnasium environment of a needle whose guide steers its tip."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final
+
+import gymnasium
+from gymnasium import spaces
+from needle_controller import SteeringPrior
+from needle_controller.steering.simulation import drawn, GroundTruth
+from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
+from needle_ros.errors import ParameterError
+from needle_study.gym.pushed import BOUND
+import numpy as np
+
+#: Default distribution of the unknown disturbances of a needle.
+BELIEF: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
+
+#: Upper bound of the seeds of paths.
+_SEEDS: Final = 2**63
+
+
+class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
+    """
+    Steer the tip to a target: one step of the needle for each action.
+
+    Needle, tissue and target are sampled in each episode. The action is the position of the guide
+    for the next step, as a fraction of its limit. The observation is the depth over the target
+    depth, and as fractions of the guide limit the measured tip, the target and the guide, each x
+    and z. The reward at the end is the negative distance of the tip from the target [mm], before
+    it is 0. Then the info has ``miss``, the distance [m].
+
+    Parameters
+    ----------
+    needle : str
+        A key of `STEERING_PRESETS`.
+    depth, step : float
+        Depth of the target, and depth per step [m].
+    guide_limit : float
+        Largest displacement of the guide along x and z [m].
+    aside : float
+        Largest distance of the target from the axis, along x and z [m].
+    belief : SteeringPrior
+        Distribution of the needles.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
+
+    def __init__(
+        self,
+        needle: str = 'bending_35mm',
+        *,
+        depth: float = 0.1,
+        step: float = 5e-3,
+        guide_limit: float = 6e-3,
+        aside: float = 4e-3,
+        belief: SteeringPrior = BELIEF,
+    ) -> None:
+        if needle not in STEERING_PRESETS:
+            raise ParameterError(
+                f'needle must be one of {", ".join(STEERING_PRESETS)}, got {needle!r}'
+            )
+        for name, value in (
+            ('depth', depth), ('step', step), ('guide_limit', guide_limit), ('aside', aside),
+        ):  # fmt: skip
+            if not 0.0 < value < np.inf:
+                raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
+        self._needle, self._steering, _ = STEERING_PRESETS[needle]
+        reach = self._needle.length - self._steering.free_length
+        if depth > reach:
+            raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
+        self._depths = np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
+        self._limit, self._aside, self._belief = guide_limit, aside, belief
+        self.action_space = spaces.Box(-1.0, 1.0, (2,))
+        self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
+        self._truth: GroundTruth | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        """Start an episode with a new needle; return the observation and an empty dict."""
+        super().reset(seed=seed, options=options)
+        rng = self.np_random
+        self._truth = drawn(
+            self._needle, self._steering, self._belief, rng, int(rng.integers(_SEEDS))
+        )
+        self._one, self._at = self._truth.start(), 0
+        self._target = rng.uniform(-self._aside, self._aside, 2)
+        return self._observe(self._truth, self._one), {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """Move the guide, then the needle; the action is clipped to [-1, 1]."""
+        truth = self._truth
+        if truth is None or self._at == len(self._depths) - 1:
+            raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')
+        x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
+        self._one.move(guide=(x, z))
+        self._at += 1
+        self._one.move(depth=float(self._depths[self._at]))
+        seen = self._observe(truth, self._one)
+        if self._at < len(self._depths) - 1:
+            return seen, 0.0, False, False, {}
+        miss = float(np.hypot(*(truth.tip(self._one) - self._target)))
+        return seen, -1e3 * miss, True, False, {'miss': miss}
+
+    def _observe(self, truth: GroundTruth, one: SteeredNeedle) -> FloatArray:
+        seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)
+        depth = one.depth / self._depths[-1]
+        lengths = np.concatenate([seen, self._target, one.guide]) / self._limit
+        numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)
+        return np.asarray(numbers, dtype=np.float32)

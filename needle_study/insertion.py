@@ -1,0 +1,470 @@
+"""Insert sampled flexible needles to a depth, under a control law or in open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import copysign, nan
+from typing import Any, Final, NamedTuple
+
+from needle_controller import (
+    Axis,
+    check_stability,
+    DEFAULT_GAINS,
+    LAWS,
+    Reference,
+    ReferenceLimits,
+    REFERENCES,
+    run_batch,
+    SafetyLimits,
+    Setpoint,
+)
+from needle_controller.controller import LAW_OF
+from needle_controller.laws.axis import require_complete
+from needle_controller.laws.law import Law
+from needle_controller.uncertainty import Uncertainty
+from needle_dynamics import (
+    DEFAULT_PRESET,
+    FloatArray,
+    NeedleModel,
+    NeedleParameters,
+    PRESETS,
+    simulate_batch,
+)
+from needle_ros import contract
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.timing import NANOSECONDS
+from needle_study.reading import check_names, mapping, one_of
+from needle_study.scenario import MeasuredRun, Metric, Variable
+import numpy as np
+from scipy.optimize import brentq
+
+OPEN_LOOP: Final = 'open loop'
+
+#: Control laws, and the open loop.
+CONTROLLERS: Final = (*LAWS, OPEN_LOOP)
+
+#: Largest speed of a needle at rest [m/s].
+_REST: Final = 1e-5
+
+#: Limits of the guard of the node.
+_LIMITS: Final = SafetyLimits()
+
+#: Most samples of an insertion.
+_MOST: Final = 1_000_000
+
+#: Open-loop insertions per batch, whose samples are all in memory.
+_AT_ONCE: Final = 16
+
+#: Settings that are mappings or words.
+_PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
+
+FIGURES: Final[Mapping[str, Metric]] = {
+    'error': Metric('m', 'distance of the needle from the target depth at the end'),
+    'hit': Metric('', 'the needle ends within the tolerance of the target depth'),
+    'overshoot': Metric('m', 'largest overshoot of the target depth'),
+    'following': Metric('m', 'root mean square of the tracking error'),
+    'force': Metric('N', 'largest force'),
+    'deflection': Metric('m', 'largest tip deflection'),
+    'rest': Metric('s', 'time until the needle remains at rest'),
+    'reversals': Metric('1', 'reversals of the velocity after the end of the reference'),
+    'stopped': Metric('', 'the guard stopped the needle'),
+    'left': Metric('', 'the needle left its range of depths'),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InsertionStudy:
+    """Settings of the scenario that are the same for all samples."""
+
+    rate: float = constant(1000.0, 'Hz', 'samples of the loop', low=1.0, high=10_000.0)
+    delay: float = constant(
+        1.0, 'periods', 'whole periods from a measurement to the effect of its command, in the '
+        'model of the law', high=20.0,
+    )  # fmt: skip
+    force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
+    speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
+    acceleration: float = constant(
+        0.1, 'm/s^2', 'highest acceleration of the reference', open_low=True
+    )
+    wait: float = constant(1.0, 's', 'time after the end of the reference', open_low=True)
+    push: float = constant(3.0, 'N', 'force of the open loop', open_low=True)
+    tolerance: float = constant(1e-4, 'm', 'largest error of a hit', open_low=True)
+    step: float = constant(2e-4, 's', 'longest step of the simulated needle', low=1e-7)
+    speed_limit: float = constant(
+        _LIMITS.speed, 'm/s', 'speed at which the guard stops', open_low=True
+    )
+    error_limit: float = constant(
+        _LIMITS.tracking_error, 'm', 'distance from the reference at which the guard stops',
+        open_low=True,
+    )  # fmt: skip
+    deflection_limit: float = constant(
+        _LIMITS.tip_deflection, 'm', 'tip deflection at which the guard stops',
+        open_low=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if self.delay != int(self.delay):
+            raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
+
+
+class _Course(NamedTuple):
+    """
+    Trajectory of one insertion up to its end or stop.
+
+    Attributes
+    ----------
+    model : NeedleModel
+        The true needle.
+    states : ndarray, shape (k + 1, 2 (2 + n))
+        States at the samples.
+    commands, forces : ndarray, shape (k,)
+        Command of each sample, and the force that acts from that sample on [N].
+    noise : ndarray, shape (k + 1, 2)
+        Encoder errors of depth [m] and velocity [m/s].
+    goal : ndarray, shape (k + 1,)
+        Reference [m]; NaN without a reference.
+    stopped, left : float
+        As in `FIGURES`.
+    """
+
+    model: NeedleModel
+    states: FloatArray
+    commands: FloatArray
+    forces: FloatArray
+    noise: FloatArray
+    goal: FloatArray
+    stopped: float
+    left: float
+
+    @property
+    def depth(self) -> FloatArray:
+        """Insertion depth [m], shape (k + 1,)."""
+        return np.asarray(self.model.parameters.length - self.states[:, 0])
+
+    @property
+    def speed(self) -> FloatArray:
+        """Insertion velocity [m/s], shape (k + 1,)."""
+        return np.asarray(-self.states[:, self.model.coordinates])
+
+    @property
+    def tip(self) -> FloatArray:
+        """Tip deflection [m], shape (k + 1,)."""
+        return self.model.tip_deflections(self.states)
+
+
+class InsertionProtocol:
+    """
+    Insert needles that differ from the nominal model to a depth.
+
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``controller``, one of
+    `CONTROLLERS`, with its ``gains`` of insertion, which must be stable for the ``uncertainty``;
+    ``reference``, a key of `REFERENCES`; and the fields of `InsertionStudy`. Raises
+    `ParameterError` if a setting is not valid, or the gains are unstable.
+    """
+
+    figures = FIGURES
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
+        numbers = {name: value for name, value in settings.items() if name not in _PARTS}
+        self._numbers = from_values(InsertionStudy, numbers, 'settings.')
+        words = {
+            'needle': (DEFAULT_PRESET, tuple(PRESETS)),
+            'controller': (LAWS[0], CONTROLLERS),
+            'reference': (next(iter(REFERENCES)), tuple(REFERENCES)),
+        }
+        chosen = {
+            name: one_of(f'settings: {name}', settings.get(name, default), valid)
+            for name, (default, valid) in words.items()
+        }
+        constants, gains, uncertainty = (
+            mapping(f'settings: {name}', settings.get(name))
+            for name in ('constants', 'gains', 'uncertainty')
+        )
+        self._needle = from_values(
+            NeedleParameters,
+            {**asdict(PRESETS[chosen['needle']]), **constants},
+            'settings.constants.',
+        )
+        self._kind = REFERENCES[chosen['reference']]
+        self._period = 1.0 / self._numbers.rate
+        self._law = self._made(
+            chosen['controller'],
+            gains,
+            from_values(Uncertainty, uncertainty, 'settings.uncertainty.'),
+        )
+        p, samples = self._needle, self._longest * self._numbers.rate
+        if samples > _MOST:
+            raise ParameterError(
+                f'settings: an insertion must have <= {_MOST} samples, and would have up to '
+                f'{samples:.3g}: see rate, wait, speed and push'
+            )
+        deepest, most = p.length, NeedleModel(p).modes.reach * p.length
+        self.quantities: Mapping[str, Variable] = {
+            'target': Variable(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
+            'depth': Variable(
+                max(0.1 * p.length, p.minimum_depth), 'm', 'insertion depth at the start',
+                p.minimum_depth, deepest,
+            ),
+            'tip': Variable(0.0, 'm', 'tip deflection at the start', -most, most),
+            'coulomb_friction': Variable(1.0, '1', 'mu_s over its nominal value', 0.0, 1e3),
+            'viscous_friction': Variable(1.0, '1', 'mu_v over its nominal value', 0.0, 1e3),
+            'carriage_mass': Variable(
+                p.carriage_mass, 'kg', 'mass moved along with the needle', 0.0, 1e3
+            ),
+            'tissue_stiffness': Variable(1.0, '1', 'k_a over its nominal value', 0.0, 1e3),
+            'tissue_damping': Variable(1.0, '1', 'c_a over its nominal value', 0.0, 1e3),
+            'depth_noise': Variable(0.0, 'm', 'standard deviation of a measured depth', 0.0),
+            'speed_noise': Variable(0.0, 'm/s', 'standard deviation of a measured velocity', 0.0),
+            'force_noise': Variable(
+                0.0, 'N', 'standard deviation of the additional force on the needle', 0.0
+            ),
+            'late': Variable(
+                0.0, 'periods', 'delay that is not in the model of the law, to whole periods',
+                0.0, 100.0,
+            ),
+        }  # fmt: skip
+
+    @property
+    def _longest(self) -> float:
+        """Upper bound of the duration of an insertion [s]."""
+        p, numbers = self._needle, self._numbers
+        if self._law is None:
+            axis = Axis.insertion(p)
+            return _time(axis, numbers.push, p.length - p.minimum_depth) + numbers.wait
+        limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
+        reference: Reference = self._kind(Setpoint(p.minimum_depth), p.length, limits)
+        return reference.duration + numbers.wait
+
+    def _made(
+        self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty
+    ) -> Law | None:
+        """Return the law of a controller, or None in open loop."""
+        p = self._needle
+        if controller == OPEN_LOOP:
+            if gains:
+                raise ParameterError(f'settings: gains are for {", ".join(LAWS)}')
+            friction = p.coulomb_friction * max(1.0, p.withdrawal_friction)
+            if not self._numbers.push > friction:
+                raise ParameterError(
+                    f'settings.push must be > Coulomb friction, {friction:g} N, got '
+                    f'{self._numbers.push!r}'
+                )
+            return None
+        require_complete(p)
+        usual = DEFAULT_GAINS[controller]['insertion']
+        chosen = from_values(type(usual), {**asdict(usual), **gains}, 'settings.gains.')
+        axis = Axis.insertion(p)
+        law = LAW_OF[type(usual)](axis=axis, gains=chosen, period=self._period)
+        plants = uncertainty.axes(axis, carriage=True)
+        check_stability(law, int(self._numbers.delay), f'{controller} gains', plants=plants)
+        return law
+
+    def run(
+        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+    ) -> dict[str, FloatArray]:
+        """Compute the metrics of sampled needles, as `Scenario.run`."""
+        rows = [
+            self._row({name: float(values[k]) for name, values in drawn.items()})
+            for k in range(len(streams))
+        ]
+        found = [
+            self._judged(row, course)
+            for first in range(0, len(rows), _AT_ONCE)
+            for row, course in self._courses(
+                rows[first : first + _AT_ONCE], streams[first : first + _AT_ONCE]
+            )
+        ]
+        return {name: np.array([one[name] for one in found]) for name in FIGURES}
+
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
+        """Yield joints, tip and commands at each sample up to a stop, and the target."""
+        ((row, course),) = self._courses([self._row(drawn)], [rng])
+        yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
+        m = course.model.coordinates
+        depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
+        # The effort acted up to the sample.
+        acted = np.concatenate([[0.0], course.forces])
+        for k, (state, tip) in enumerate(zip(course.states, course.tip, strict=True)):
+            stamp = round(k * self._period * NANOSECONDS)
+            joints = (depths[k], state[1], speeds[k], state[m + 1], acted[k], 0.0)
+            yield MeasuredRun(contract.JOINT_STATES, stamp, [float(value) for value in joints])
+            at = (0.0, float(course.depth[k]), float(tip))
+            yield MeasuredRun(contract.TIP_DEFLECTION, stamp, at)
+            if k < len(course.commands):
+                force = (0.0, float(course.commands[k]), 0.0)
+                yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
+
+    def _row(self, drawn: Mapping[str, float]) -> dict[str, float]:
+        return {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+
+    def _truth(self, row: Mapping[str, float]) -> NeedleParameters:
+        p, stiffness = self._needle, row['tissue_stiffness']
+        factors = ('coulomb_friction', 'viscous_friction', 'tissue_damping', 'tissue_stiffness')
+        return replace(
+            p,
+            **{name: row[name] * getattr(p, name) for name in factors},
+            layer_stiffnesses=tuple(stiffness * one for one in p.layer_stiffnesses),
+            carriage_mass=row['carriage_mass'],
+        )
+
+    def _courses(
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> Iterator[tuple[Mapping[str, float], _Course]]:
+        """Simulate the insertions."""
+        if self._law is None:
+            courses = self._open(rows, streams)
+        else:
+            law = self._law
+            courses = (self._closed(law, row, rng) for row, rng in zip(rows, streams, strict=True))
+        return zip(rows, courses, strict=True)
+
+    def _noise(self, row: Mapping[str, float], rng: np.random.Generator, count: int) -> FloatArray:
+        """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
+        sizes = [row[name] for name in ('depth_noise', 'speed_noise', 'force_noise')]
+        return np.asarray(sizes * rng.standard_normal((count, 3)))
+
+    def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Course:
+        """Simulate an insertion under a control law."""
+        numbers, model = self._numbers, NeedleModel(self._truth(row))
+        # The reference starts at the measured depth.
+        begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
+        limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
+        reference: Reference = self._kind(Setpoint(begin), row['target'], limits)
+        count = max(1, round((reference.duration + numbers.wait) * numbers.rate))
+        noise, late = self._noise(row, rng, count), round(row['late'])
+        batch = run_batch(
+            law,
+            model.parameters,
+            model.state_at(row['depth'], row['tip']),
+            reference,
+            delay=int(numbers.delay),
+            late=late,
+            noise=noise,
+            limit=numbers.force_limit,
+            duration=count * self._period,
+            step=numbers.step,
+            record=True,
+            workers=1,
+        )
+        commands, delay = batch.commands[0], int(numbers.delay) + late
+        acting = np.concatenate([np.zeros(delay), commands])[:count] + noise[:, 2]
+        done = int(batch.completed[0])
+        course = _Course(
+            model, batch.courses[0], commands, acting, _said(noise), batch.goal, 0.0,
+            float(done < count),
+        )  # fmt: skip
+        course = _cut(course, done)
+        end = self._stop(course)
+        return course if end is None else _cut(course._replace(stopped=1.0, left=0.0), end)
+
+    def _stop(self, course: _Course) -> int | None:
+        """Return the sample of the stop by the guard, or None."""
+        p, n = course.model.parameters, self._numbers
+        depth, speed = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
+        above, below = p.minimum_depth - depth, depth - p.length
+        outside = np.maximum(above, below) > _LIMITS.depth_tolerance
+        beyond = [
+            (np.abs(speed) > n.speed_limit) | outside,
+            np.abs(course.goal - depth) > n.error_limit,
+            np.abs(course.tip) > n.deflection_limit,
+        ]
+        # A single sample may be a fault of the sensor.
+        twice = np.any([one[1:] & one[:-1] for one in beyond], axis=0)
+        return 1 + int(np.argmax(twice)) if twice.any() else None
+
+    def _open(
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> Iterator[_Course]:
+        """Simulate insertions under a constant force, for the duration of the nominal needle."""
+        numbers, believed = self._numbers, Axis.insertion(self._needle)
+        models = [NeedleModel(self._truth(row)) for row in rows]
+        commands, noise = [], []
+        for row, rng in zip(rows, streams, strict=True):
+            way = row['target'] - row['depth']
+            force = copysign(numbers.push, way)
+            pushed = round(_time(believed, force, way) * numbers.rate)
+            count = pushed + max(1, round(numbers.wait * numbers.rate))
+            commands.append(np.where(np.arange(count) < pushed, force, 0.0))
+            noise.append(self._noise(row, rng, count))
+        forces = np.zeros((len(rows), max(map(len, commands))))
+        for line, pushes, blur in zip(forces, commands, noise, strict=True):
+            line[: len(pushes)] = pushes + blur[:, 2]
+        batch = simulate_batch(
+            [model.parameters for model in models],
+            [
+                model.state_at(row['depth'], row['tip'])
+                for model, row in zip(models, rows, strict=True)
+            ],
+            forces,
+            duration=forces.shape[1] * self._period,
+            interval=self._period,
+            step=numbers.step,
+            workers=1,
+        )
+        for k, (model, pushes, blur) in enumerate(zip(models, commands, noise, strict=True)):
+            count = len(pushes)
+            done = min(round(batch.completed[k] * numbers.rate), count)
+            course = _Course(
+                model, batch.states[k], pushes, forces[k], _said(blur),
+                np.full(count + 1, nan), nan, float(done < count),
+            )  # fmt: skip
+            yield _cut(course, done)
+
+    def _judged(self, row: Mapping[str, float], course: _Course) -> dict[str, float]:
+        """Return the metrics of an insertion."""
+        depth, speed, target = course.depth, course.speed, row['target']
+        error = abs(target - float(depth[-1]))
+        beyond = copysign(1.0, target - row['depth']) * (depth - target)
+        moving = np.flatnonzero(np.abs(speed) > _REST)
+        still = 0 if not len(moving) else int(moving[-1]) + 1
+        after = speed[-(1 + round(self._numbers.wait * self._numbers.rate)) :]
+        ways = np.sign(after[np.abs(after) > _REST])
+        whole = not (course.left or course.stopped == 1.0)
+        return {
+            'error': error,
+            'hit': float(whole and error <= self._numbers.tolerance),
+            'overshoot': max(0.0, float(beyond.max())),
+            'following': float(np.sqrt(np.square(course.goal - depth).mean())),
+            'force': float(np.abs(course.forces).max(initial=0.0)),
+            'deflection': float(np.abs(course.tip).max()),
+            'rest': still * self._period if whole and still < len(speed) else nan,
+            'reversals': float(np.count_nonzero(np.diff(ways))) if whole else nan,
+            'stopped': course.stopped,
+            'left': course.left,
+        }
+
+
+def _said(noise: FloatArray) -> FloatArray:
+    """Append zeros for the last sample, which no command follows, to the encoder noise."""
+    return np.concatenate([noise[:, :2], np.zeros((1, 2))])
+
+
+def _cut(course: _Course, end: int) -> _Course:
+    """Truncate an insertion at a sample."""
+    return course._replace(
+        states=course.states[: end + 1],
+        commands=course.commands[:end],
+        forces=course.forces[:end],
+        noise=course.noise[: end + 1],
+        goal=course.goal[: end + 1],
+    )
+
+
+def _time(axis: Axis, force: float, way: float) -> float:
+    """Return the time in which a constant force moves an axis by a distance, from rest [s]."""
+    if way == 0.0:
+        return 0.0
+
+    def missing(time: float) -> float:
+        return abs(way) - abs(axis.propagate(0.0, 0.0, force, time)[0])
+
+    most = 1e-3
+    while missing(most) > 0.0:
+        most *= 2.0
+    return float(brentq(missing, 0.0, most, xtol=1e-9))

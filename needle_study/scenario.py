@@ -1,0 +1,88 @@
+"""Interface of a scenario: variables, metrics, and the simulation of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import inf
+from typing import Any, Final, NamedTuple
+from typing import Protocol as Interface
+
+from needle_dynamics import FloatArray
+from needle_ros.contract import Topic
+import numpy as np
+
+
+class Variable(NamedTuple):
+    """A variable that may differ from sample to sample."""
+
+    #: Value if it is not in the population.
+    default: float
+    #: SI unit.
+    unit: str
+    meaning: str
+    #: Valid range.
+    low: float = -inf
+    high: float = inf
+
+
+class Metric(NamedTuple):
+    """A metric of a sample."""
+
+    #: SI unit; '' for yes or no.
+    unit: str
+    meaning: str
+
+
+class MeasuredRun(NamedTuple):
+    """A message of a robot or a sensor in a replayed sample."""
+
+    topic: Topic
+    #: [ns].
+    stamp: int
+    #: Numbers of `Topic.quantities`.
+    values: Sequence[float]
+
+
+class Scenario(Interface):
+    """Interface of a scenario, which is simulated with each sample."""
+
+    #: Variables of a sample.
+    quantities: Mapping[str, Variable]
+    #: Metrics, the primary metric first.
+    figures: Mapping[str, Metric]
+
+    def run(
+        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+    ) -> dict[str, FloatArray]:
+        """
+        Simulate samples with the sampled values and the random generator of each.
+
+        Returns each metric, shape (n,): 1 for yes, NaN for a missing value.
+        """
+
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
+        """Simulate one sample again; yield measurements and commands in time order per topic."""
+
+
+# Imported on demand: a study needs a single scenario.
+
+
+def _steering(settings: Mapping[str, Any]) -> Scenario:
+    from needle_study.steering import SteeringProtocol
+
+    return SteeringProtocol(settings)
+
+
+def _insertion(settings: Mapping[str, Any]) -> Scenario:
+    from needle_study.insertion import InsertionProtocol
+
+    return InsertionProtocol(settings)
+
+
+#: Constructor of each scenario from the settings of a study.
+PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
+    'steering': _steering,
+    'insertion': _insertion,
+}

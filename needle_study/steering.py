@@ -1,0 +1,341 @@
+"""Insert sampled needles to a target, steered by a controller or in open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from math import nan
+from typing import Any, Final
+
+from needle_controller import (
+    OutOfReachError,
+    SteeringController,
+    SteeringModel,
+    SteeringPrior,
+)
+from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
+from needle_controller.steering.controller import GuideSetpoint, SteeringFaultError
+from needle_controller.steering.simulation import GroundTruth, insert
+from needle_dynamics import (
+    FloatArray,
+    insert_batch,
+    NeedleParameters,
+    SteeredNeedle,
+    STEERING_PRESETS,
+    SteeringParameters,
+)
+from needle_dynamics.steering.parameters import with_lengths
+from needle_ros import contract
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.timing import NANOSECONDS
+from needle_study.reading import check_names, mapping, one_of
+from needle_study.scenario import MeasuredRun, Metric, Variable
+import numpy as np
+
+OURS: Final = 'ours'
+BROYDEN: Final = 'Broyden'
+OPEN_LOOP: Final = 'open loop'
+
+#: Controllers of the guide.
+CONTROLLERS: Final = (OURS, 'springs', BROYDEN, 'roll towards the target', OPEN_LOOP)
+
+#: Largest miss of a hit [m].
+HIT: Final = 1e-3
+
+#: Quantile 0.95 of the chi-squared distribution with two degrees of freedom.
+_ELLIPSE: Final = 5.991
+
+#: Insertion speed of a replay [m/s].
+_SPEED: Final = 0.01
+
+#: Joint states of a guide without efforts.
+_STATES: Final = contract.steered_states()
+_JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one in _STATES.joints))
+
+#: Upper bound of the seeds of paths.
+_SEEDS: Final = 2**63
+
+#: Most steps of an insertion.
+_MOST: Final = 1000
+
+#: Needles per batch, which are in memory together.
+_TOGETHER: Final = 256
+
+#: Settings that are mappings or words.
+_PARTS: Final = ('needle', 'constants', 'belief', 'controller')
+
+FIGURES: Final[Mapping[str, Metric]] = {
+    'miss': Metric('m', 'distance of the tip from the target at the end'),
+    'hit': Metric('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
+    'tip_x': Metric('m', 'final tip position, in the frame of the sensor'),
+    'tip_z': Metric('m', 'final tip position, in the frame of the sensor'),
+    'way': Metric('m', 'distance traveled by the guide'),
+    'turns': Metric('1', 'number of needle rotations'),
+    'load': Metric('N', 'largest lateral force on the guide after its motions'),
+    'refused': Metric('', 'the target was rejected as outside the reachable set'),
+    'stopped': Metric('', 'the controller stopped before the target depth'),
+    'warned': Metric('', 'a warning before the target depth: target outside the reachable set'),
+    'said_x': Metric('m', 'expected final tip position of the controller'),
+    'said_z': Metric('m', 'expected final tip position of the controller'),
+    'held': Metric('', 'the tip is in the 95 % ellipse of the controller'),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringStudy:
+    """Settings of the scenario that are the same for all samples."""
+
+    depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
+    step: float = constant(5e-3, 'm', 'depth between two tip measurements', open_low=True)
+    guide_limit: float = constant(6e-3, 'm', 'largest displacement of the guide')
+    guide_step: float = constant(1.0, 'm', 'largest motion of the guide in a step', open_low=True)
+    load_limit: float = constant(
+        1e3, 'N', 'largest planned lateral force on the guide', open_low=True
+    )
+    turns: float = constant(0.0, '1', 'largest number of needle rotations')
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if self.turns != int(self.turns):
+            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
+
+
+class SteeringProtocol:
+    """
+    Steer needles that differ from the nominal model to a target.
+
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``belief``, the prior
+    uncertainty; ``controller``, one of `CONTROLLERS`; and the fields of `SteeringStudy`. Raises
+    `ParameterError` if a setting is not valid.
+    """
+
+    figures = FIGURES
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
+        given = {name: value for name, value in settings.items() if name not in _PARTS}
+        self._numbers = numbers = from_values(SteeringStudy, given, 'settings.')
+        preset = settings.get('needle', 'bending_35mm')
+        needle, steering, _ = STEERING_PRESETS[
+            one_of('settings: needle', preset, STEERING_PRESETS)
+        ]
+        self._controller = one_of(
+            'settings: controller', settings.get('controller', OURS), CONTROLLERS
+        )
+        given = dict(mapping('settings: constants', settings.get('constants')))
+        of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
+        self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
+        self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
+        belief = mapping('settings: belief', settings.get('belief'))
+        self._belief = from_values(SteeringPrior, belief, 'settings.belief.')
+        reach = self._needle.length - self._steering.free_length
+        if numbers.depth > reach:
+            raise ParameterError(
+                f'settings.depth must be <= {reach:g} m, the length of the needle without its '
+                f'free length, got {numbers.depth:g} m'
+            )
+        ways = numbers.depth / numbers.step
+        if ways > _MOST:
+            raise ParameterError(
+                f'settings: depth over step must be <= {_MOST} steps, got {ways:.3g}'
+            )
+        moves = {OURS: numbers.guide_limit or numbers.turns, BROYDEN: numbers.guide_limit}
+        if not moves.get(self._controller, True):
+            raise ParameterError(
+                f'settings: controller {self._controller} with guide_limit 0 has no actuation'
+            )
+        steps = max(1, round(ways))
+        self._depths = np.linspace(0.0, numbers.depth, steps + 1)
+        bevel = max(self._steering.bevel_load)
+        noise = self._belief.path_noise
+        self.quantities: Mapping[str, Variable] = {
+            'target_x': Variable(0.0, 'm', 'lateral position of the target'),
+            'target_z': Variable(0.0, 'm', 'lateral position of the target'),
+            'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
+            'skin': Variable(
+                1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
+            ),
+            'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'bevel_x': Variable(0.0, 'N', 'load of the bevel', -1e3, 1e3),
+            'bevel_z': Variable(bevel, 'N', 'load of the bevel', -1e3, 1e3),
+            'frame_x': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
+            'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
+            'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
+            'look_noise': Variable(
+                self._belief.noise, 'm', 'standard deviation of a tip measurement', 0.0
+            ),
+            'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
+        }
+
+    @cached_property
+    def _model(self) -> SteeringModel:
+        """Model of all hypotheses, the same for all samples."""
+        return SteeringModel(self._needle, self._steering, self._depths, self._belief)
+
+    def run(
+        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+    ) -> dict[str, FloatArray]:
+        """Compute the metrics of sampled needles, as `Scenario.run`."""
+        count = len(streams)
+        each = {
+            name: drawn.get(name, np.full(count, one.default))
+            for name, one in self.quantities.items()
+        }
+        found = {name: np.full(count, nan) for name in FIGURES}
+        for first in range(0, count, _TOGETHER):
+            some = slice(first, first + _TOGETHER)
+            self._insert(
+                {name: values[some] for name, values in each.items()},
+                streams[some],
+                {name: values[some] for name, values in found.items()},
+            )
+        targets = np.stack([each['target_x'], each['target_z']], axis=1)
+        tips = np.stack([found['tip_x'], found['tip_z']], axis=1)
+        found['miss'] = np.hypot(*(tips - targets).T)
+        found['hit'] = (found['miss'] <= HIT).astype(float)
+        return found
+
+    def _insert(
+        self,
+        each: Mapping[str, FloatArray],
+        streams: Sequence[np.random.Generator],
+        found: Mapping[str, FloatArray],
+    ) -> None:
+        """Simulate insertions; variables and metrics have one value per insertion."""
+        rows = [
+            dict(zip(each, values, strict=True))
+            for values in zip(*(values.tolist() for values in each.values()), strict=True)
+        ]
+        truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
+        if self._controller == OPEN_LOOP:
+            self._open(truths, found)
+            return
+        for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
+            for name, value in self._steered(truth, row, rng).items():
+                found[name][k] = value
+
+    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
+        needle, steering = with_lengths(
+            self._needle, self._steering, row['bending_length'], row['skin']
+        )
+        bevel = np.array([row['bevel_x'], row['bevel_z']])
+        steering = replace(
+            steering,
+            bevel_load=(float(np.hypot(*bevel)),),
+            path_noise=row['path_noise'],
+            path_noise_length=self._belief.path_noise_length,
+        )
+        return GroundTruth(
+            needle=needle,
+            steering=steering,
+            tilt=(row['tilt_x'], row['tilt_z']),
+            bevel=bevel,
+            frame=np.array([row['frame_x'], row['frame_z']]),
+            seed=int(rng.integers(_SEEDS)),
+        )
+
+    def _open(self, truths: Sequence[GroundTruth], found: Mapping[str, FloatArray]) -> None:
+        """Simulate all insertions with a guide at rest in one batch."""
+        depth = self._depths[-1]
+        tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
+        rolls = np.array([np.arctan2(*truth.bevel) for truth in truths])[:, np.newaxis]
+        tips = insert_batch(
+            [truth.needle for truth in truths],
+            [truth.steering for truth in truths],
+            self._depths,
+            tilts=np.broadcast_to(tilts, (len(truths), len(self._depths), 2)),
+            rolls=np.broadcast_to(rolls, (len(truths), len(self._depths))),
+            seeds=[truth.seed for truth in truths],
+            workers=1,
+        )
+        frames = np.array([truth.frame for truth in truths])
+        found['tip_x'][:], found['tip_z'][:] = (tips[:, -1, [0, 2]] + frames * depth).T
+        for name in ('way', 'turns'):
+            found[name][:] = 0.0
+
+    def replay(
+        self, drawn: Mapping[str, float], rng: np.random.Generator
+    ) -> Iterator[MeasuredRun]:
+        """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
+        row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+        tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
+        still, seen = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
+
+        def watch(one: SteeredNeedle) -> None:
+            stamp = round(one.depth / _SPEED * NANOSECONDS)
+            seen.append(
+                MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
+            )
+            x, z = (one.tip[[0, 2]] + np.array(frame) * one.depth).tolist()
+            seen.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
+
+        self._steered(self._truth(row, rng), row, rng, watch)
+        yield MeasuredRun(
+            contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z'])
+        )
+        yield from seen
+
+    def _steered(
+        self,
+        truth: GroundTruth,
+        row: Mapping[str, float],
+        rng: np.random.Generator,
+        watch: Callable[[SteeredNeedle], object] | None = None,
+    ) -> dict[str, float]:
+        """Simulate one insertion under a controller."""
+        target, said = (row['target_x'], row['target_z']), list[str]()
+        try:
+            controller = self._made(target)
+        except OutOfReachError:
+            return {'refused': 1.0}
+
+        def look(tip: FloatArray) -> FloatArray | None:
+            noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
+            return None if lost else np.asarray(tip + row['look_noise'] * noise)
+
+        def follow(tip: FloatArray | None) -> GuideSetpoint:
+            to = controller.next(tip)
+            if isinstance(controller, SteeringController) and controller.step < len(self._depths):
+                said.append(controller.warning)
+            return to
+
+        figures = {'refused': 0.0, 'stopped': 0.0}
+        try:
+            done = insert(truth, self._depths, look, follow, watch)
+        except SteeringFaultError:
+            return {**figures, 'stopped': 1.0}
+        tip = truth.tip(done.needle)
+        figures |= {
+            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.way,
+            'turns': float(done.turns), 'load': done.load,
+        }  # fmt: skip
+        if isinstance(controller, SteeringController):
+            there = controller.expected()
+            off = tip - there.mean
+            figures |= {
+                'said_x': float(there.mean[0]),
+                'said_z': float(there.mean[1]),
+                'held': float(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE),
+                'warned': float(any(said)),
+            }
+        return figures
+
+    def _made(self, target: tuple[float, float]) -> SteeringController | OpenLoop:
+        """Return the controller of a target."""
+        numbers, believed = self._numbers, (self._needle, self._steering, self._depths)
+        match self._controller:
+            case 'springs':
+                return Springs(*believed, target, numbers.guide_limit)
+            case 'Broyden':
+                return Broyden(*believed, target, numbers.guide_limit)
+            case 'roll towards the target':
+                return RollTowards(self._depths, target, numbers.guide_limit)
+            case 'open loop':
+                return OpenLoop(self._depths, target)
+        return SteeringController(
+            self._model, target, numbers.guide_limit, int(numbers.turns), numbers.load_limit,
+            step_limit=numbers.guide_step,
+        )  # fmt: skip

@@ -1,0 +1,194 @@
+"""Define a study: a population, a scenario, and the columns of each sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import isfinite
+from pathlib import Path
+from typing import Any, Final
+
+from needle_dynamics import FloatArray
+from needle_ros.documents import DocumentError, read_document
+from needle_ros.errors import ParameterError
+from needle_study.distribution import Distribution, distribution
+from needle_study.reading import check_names, mapping, one_of
+from needle_study.scenario import PROTOCOLS, Scenario
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+#: Keys of a study file.
+_KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
+
+#: Sampling designs.
+DESIGNS: Final = ('sobol', 'random', 'latin')
+
+#: Largest number of samples and of dimensions, as limited by the Sobol sequence.
+_MOST: Final = 2**30
+_DIMENSIONS: Final = 21201
+
+#: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
+_MOST_LATIN: Final = 2**24
+
+#: Smallest and largest probability at which a quantile is evaluated.
+_INSIDE: Final = 2.0**-54
+_BELOW: Final = 1.0 - 2.0**-53
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A study, as read from a file."""
+
+    protocol: Scenario
+    samples: int
+    seed: int
+    #: One of `DESIGNS`.
+    design: str
+    #: Distributions by variable; the other variables have their defaults.
+    population: Mapping[str, Distribution]
+    #: Cholesky factor of the correlations of the normal scores, shape (d, d).
+    factor: FloatArray
+    #: Content of the study file.
+    document: Mapping[str, Any]
+
+    def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
+        """Return the sampled values of consecutive sample numbers by variable."""
+        parts = np.clip(self._parts(int(numbers[0]), len(numbers)), _INSIDE, _BELOW)
+        if not np.array_equal(self.factor, np.eye(len(self.factor))):
+            scores = ndtri(parts)
+            # No matrix product: its bits may depend on the number of rows.
+            parts = np.array(
+                [
+                    ndtr(sum(f * one for f, one in zip(row, scores.T, strict=True)))
+                    for row in self.factor
+                ]
+            ).T
+            parts = np.clip(parts, _INSIDE, _BELOW)
+        return {
+            name: one.quantiles(part)
+            for (name, one), part in zip(self.population.items(), parts.T, strict=True)
+        }
+
+    def _parts(self, first: int, count: int) -> FloatArray:
+        """Return uniform numbers in (0, 1), shape (count, d)."""
+        dimensions = len(self.population)
+        if self.design == 'sobol' and dimensions:
+            sequence = qmc.Sobol(dimensions, seed=np.random.default_rng(self.seed))
+            if first:
+                sequence.fast_forward(first)
+            # A single sample first: scipy warns of a first draw that is not a power of 2.
+            return np.concatenate([sequence.random(1), sequence.random(count - 1)])
+        chance = np.array(
+            [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
+        ).reshape(count, dimensions)
+        if self.design != 'latin':
+            return chance
+        strata = [
+            _permutation(self.samples, self.seed, dimension)[first : first + count]
+            for dimension in range(dimensions)
+        ]
+        return np.asarray((np.transpose(strata) + chance) / self.samples).reshape(chance.shape)
+
+    def rng(self, number: int, stream: int) -> np.random.Generator:
+        """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
+
+    def rows(self, first: int, count: int) -> dict[str, FloatArray]:
+        """Compute `count` samples from number `first` on: number, sampled values and metrics."""
+        numbers = range(first, first + count)
+        drawn = self.draw(numbers)
+        streams = [self.rng(number, 1) for number in numbers]
+        return {
+            'sample': np.arange(first, first + count, dtype=np.float64),
+            **drawn,
+            **self.protocol.run(drawn, streams),
+        }
+
+
+@lru_cache(maxsize=64)
+def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.int64]:
+    """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
+    # The generators of samples have two numbers in their key, this generator has three.
+    key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
+    return np.random.default_rng(key).permutation(count)
+
+
+def read_study(path: Path) -> Study:
+    """Read a YAML study file; raise `ParameterError` with its name if it is not valid."""
+    try:
+        return made(read_document(path.read_text(encoding='utf-8')))
+    except (DocumentError, ParameterError) as error:
+        raise ParameterError(f'{path}: {error}') from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
+        raise ParameterError(f'{path}: {reason}') from error
+
+
+def made(document: Any) -> Study:
+    """Build a study from the content of a file; raise `ParameterError` if it is not valid."""
+    if not isinstance(document, Mapping):
+        raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
+    check_names('', document, _KEYS)
+    kind = one_of('protocol', document.get('protocol'), PROTOCOLS)
+    samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
+    design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
+    if design == 'latin' and samples > _MOST_LATIN:
+        raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
+    settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
+    protocol = PROTOCOLS[kind](settings)
+    known = protocol.quantities
+    check_names('population: ', given, known)
+    # The dimension of a variable must not depend on its order in the file: workers sort it.
+    population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
+    for name, one in population.items():
+        least, most = one.ends(_INSIDE, _BELOW)
+        low, high, unit = known[name].low, known[name].high, known[name].unit
+        if not low <= least <= most <= high or not isfinite(least) or not isfinite(most):
+            raise ParameterError(
+                f'population: {name} must be finite and in [{low:g}, {high:g}] {unit}, and would '
+                f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
+            )
+    return Study(
+        protocol=protocol,
+        samples=samples,
+        seed=seed,
+        design=design,
+        population=population,
+        factor=_factor(document.get('correlations', []), list(population)),
+        document=dict(document),
+    )
+
+
+def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
+    value = document.get(key, 1)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= _MOST:
+        raise ParameterError(f'{key} must be a whole number from {low} to {_MOST}, got {value!r}')
+    return value
+
+
+def _factor(given: Any, names: Sequence[str]) -> FloatArray:
+    """Return the Cholesky factor of correlations given as ``[[name, name, value], ...]``."""
+    matrix = np.eye(len(names))
+    form = 'correlations takes [[name, name, value between -1 and 1], ...] of the population'
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise ParameterError(f'{form}, got {given!r}')
+    for one in given:
+        valid = isinstance(one, Sequence) and not isinstance(one, str) and len(one) == 3
+        if not valid or one[0] not in names or one[1] not in names or one[0] == one[1]:
+            raise ParameterError(f'{form}, got {one!r}')
+        value = one[2]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1.0:
+            raise ParameterError(f'{form}, got {one!r}')
+        i, k = names.index(one[0]), names.index(one[1])
+        if matrix[i, k] != 0.0:
+            raise ParameterError(f'correlations has {one[0]} with {one[1]} twice')
+        matrix[i, k] = matrix[k, i] = value
+    try:
+        return np.asarray(np.linalg.cholesky(matrix))
+    except np.linalg.LinAlgError as error:
+        raise ParameterError(
+            'correlations are inconsistent: the matrix is not positive definite'
+        ) from error
