@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FREE = {'__future__', 'collections', 'math', 'needle_dynamics.arrays', 'numba', 'numpy', 'typing'}
 
 #: Modules of the compiled folder without compiled functions.
-MACHINERY = ('cache.py', 'held.py', 'signatures.py', 'store.py')
+MACHINERY = ('cache.py', 'boxed.py', 'signatures.py', 'store.py')
 
 #: Enforce file permissions also for root: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE.
 WITHOUT_RIGHTS = """
