@@ -21,7 +21,7 @@ from needle_insertion.experiment.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
-from needle_ros.status import RequestStatus, Verdict
+from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.timing import nanoseconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint

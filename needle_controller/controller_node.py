@@ -77,7 +77,7 @@ class ControllerNode(ModelNode):
     if these are published. Both are checked against the limits in any case.
 
     The node passes messages to a `Supervisor`, which decides, and publishes its commands. Each
-    target and trajectory is acknowledged in the status, see `needle_ros.status`.
+    target and trajectory is acknowledged in the status, see `needle_ros.requests`.
     """
 
     LIVE = frozenset(

@@ -24,9 +24,9 @@ from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
 from needle_ros import contract
 from needle_ros.errors import printable
 from needle_ros.publishers_node import Publishers
+from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
-from needle_ros.status import RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 import numpy as np

@@ -23,7 +23,7 @@ from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, ENTRY, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.status import RequestLog, Verdict
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
 from needle_ros.wire import Reading

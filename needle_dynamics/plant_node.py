@@ -25,9 +25,9 @@ from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.errors import JobError, MessageError, NeedleError, ParameterError, printable
 from needle_ros.publishers_node import offer_lease, Publishers
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
-from needle_ros.status import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading

@@ -35,7 +35,7 @@ from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import ENTRY, INSERTION, JOINT_STATES, ROLL, TARGET, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.status import RequestLog, RequestStatus, Verdict
+from needle_ros.requests import RequestLog, RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np

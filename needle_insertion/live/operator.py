@@ -14,7 +14,7 @@ from needle_ros.base_node import profile
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
-from needle_ros.status import no_answer, PendingRequest, RequestStatus
+from needle_ros.requests import no_answer, PendingRequest, RequestStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client

@@ -19,8 +19,8 @@ from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.publishers_node import request_stamp
+from needle_ros.requests import PendingRequest, RequestStatus
 from needle_ros.run_node import run
-from needle_ros.status import PendingRequest, RequestStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
 from rclpy.clock import Clock

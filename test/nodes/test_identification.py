@@ -306,7 +306,7 @@ def test_apply_has_a_timeout(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The call ends with the reason, without blocking the node."""
-    monkeypatch.setattr('needle_ros.status.CALL_TIMEOUT', 0.3)
+    monkeypatch.setattr('needle_ros.requests.CALL_TIMEOUT', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
     # A node without a spinning executor offers the service, but does not respond.
     deaf = Node('deaf', context=ros_graph.context)

@@ -7,7 +7,7 @@ from typing import Any
 from needle_controller.controller_node import ControllerNode
 from needle_insertion.live.operator import Operator
 from needle_ros.calls_node import Calls
-from needle_ros.status import CALL_TIMEOUT
+from needle_ros.requests import CALL_TIMEOUT
 import pytest
 from rclpy.node import Node
 from std_srvs.srv import Trigger

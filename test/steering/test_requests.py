@@ -19,7 +19,7 @@ from needle_controller.steering.planning import (
 )
 from needle_ros.contract import INSERTION, JOINT_TRAJECTORY, Stamp, TARGET, TOPICS
 from needle_ros.errors import JobError
-from needle_ros.status import (
+from needle_ros.requests import (
     Acknowledgement,
     PendingRequest,
     RequestLog,

@@ -11,7 +11,7 @@ from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrio
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 from needle_ros.contract import JOINT_TRAJECTORY
-from needle_ros.status import RequestLog, Verdict
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.wire import Reading
 import numpy as np
 import pytest
