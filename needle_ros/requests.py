@@ -9,7 +9,7 @@ second, so that a lost message is replaced. The sender repeats the request until
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from time import monotonic
 from typing import Final
@@ -100,16 +100,14 @@ class RequestStatus:
 
     """
 
-    takes: Mapping[str, tuple[str, ...]]
+    takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     answers: tuple[Acknowledgement, ...] = ()
     paused: bool = False
 
-    def to_values(self) -> dict[str, object]:
+    def to_values(self) -> dict[str, str]:
         """Return the fields as values of a DiagnosticStatus."""
-        values: dict[str, object] = {
-            f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()
-        }
-        values[_PAUSED] = self.paused
+        values = {f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()}
+        values[_PAUSED] = str(self.paused)
         for one in self.answers:
             key = f'{_REQUEST}{one.topic} {one.stamp}'
             values[key] = f'{one.verdict.value}: {one.reason}' if one.reason else one.verdict.value
