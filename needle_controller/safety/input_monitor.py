@@ -193,7 +193,15 @@ class InputMonitor:
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
     def status(self, now: int) -> InputStatus:
-        """Return rate, age and counts at a time [ns]."""
+        """
+        Return rate, age and counts.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        """
         counted = (ACCEPTED, REPEATED, DROPPED)
         return InputStatus(
             rate=self.window.rate(now),

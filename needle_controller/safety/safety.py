@@ -283,5 +283,13 @@ class Safety:
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def inputs(self, now: int) -> dict[str, InputStatus]:
-        """Return the status of each input with messages, by topic, at a time [ns]."""
+        """
+        Return the status of each input with messages, by topic.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        """
         return {name: one.status(now) for name, one in self.streams.items() if one.counts}
