@@ -209,11 +209,12 @@ class SteeringStatus(NodeStatus):
     step: int = entry(0, '', 'completed steps')
     steps: int = entry(0, '', 'steps of the insertion')
     guide_setpoint: tuple[float, float] | None = entry(None, 'm', 'guide setpoint x, z')
-    turns_left: int = entry(0, '', 'half turns that are left')
+    turns_left: int | None = entry(None, '', 'half turns that are left')
     hit_probability: float | None = entry(None, '', 'probability of a hit within 1 mm')
     bending_length_ratio: float | None = entry(
         None, '', 'estimated bending length over the nominal one'
     )
+    law: Mapping[str, float] = entry(dict, '', 'further values of the steering law, by name')
     expected_tip: tuple[float, float] | None = entry(
         None, 'm', 'expected tip position x, z at the target depth'
     )
