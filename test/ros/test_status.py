@@ -160,7 +160,7 @@ def lookups(source: str) -> list[str]:
             found.append(node.slice)
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith('.get'):
             found += node.args[:1]
-    return [one.value for one in found if isinstance(one, ast.Constant)]
+    return [str(one.value) for one in found if isinstance(one, ast.Constant)]
 
 
 def test_readers_use_the_dataclasses() -> None:
