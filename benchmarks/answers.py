@@ -21,7 +21,8 @@ from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
-from needle_ros.status import RequestStatus, Verdict
+from needle_ros.requests import Verdict
+from needle_ros.status import ControllerPhase, ControllerStatus
 from needle_ros.timing import nanoseconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -59,9 +60,10 @@ def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, lis
         def hear(array: DiagnosticArray) -> None:
             for status in array.status:
                 if status.name == '/controller':
-                    active.append(status.message == 'active')
                     values = {one.key: one.value for one in status.values}
-                    for answer in RequestStatus.from_values(values).answers:
+                    found = ControllerStatus.from_values(values)
+                    active.append(found.phase is ControllerPhase.ACTIVE)
+                    for answer in found.requests.answers:
                         heard.setdefault(answer.stamp, (monotonic(), answer.verdict))
 
         node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, hear, COMMAND)

@@ -20,7 +20,6 @@ from time import monotonic
 from typing import Any, Final, NamedTuple
 
 from needle_controller.controller_node import ControllerNode
-from needle_controller.steering.executive import Phase
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph.node_process import GraphError
@@ -30,6 +29,7 @@ from needle_insertion.report.text import table
 from needle_ros import contract
 from needle_ros.base_node import message_class, profile
 from needle_ros.contract import Topic
+from needle_ros.status import SteeringPhase
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from rclpy.clock import Clock
@@ -287,17 +287,17 @@ def insert(
                 raise GraphError(f'{node.get_name()} does not start: {node.failure}')
 
         def ready() -> bool:
-            seen = steering.diagnose()[2]
-            taken = [str(seen.get(f'input {one.name}', ' 0 taken')) for one in _STATES[::2]]
+            inputs = steering.diagnose().status.input
+            accepted = [inputs[one.name].accepted for one in _STATES[::2] if one.name in inputs]
             heard = {'controller', 'plant'} <= {*steering._loop._monitor._receivers}
             known = 'steering' in operator.states
-            return known and heard and not any(' 0 taken' in one for one in taken)
+            return known and heard and len(accepted) == len(_STATES[::2]) and all(accepted)
 
         graph.spin_until(ready, 'the nodes', _HANGS)
         relay.fault, relay.armed = fault, True
         pending = operator.target(*TARGET)
         loop = steering._loop
-        ends = (Phase.DONE, Phase.STOPPED)
+        ends = (SteeringPhase.DONE, SteeringPhase.STOPPED)
 
         def ended() -> bool:
             return loop.phase in ends or (pending.done and not pending.outcome[0])
@@ -313,7 +313,7 @@ def insert(
             return InsertionOutcome('hangs', line, np.inf, relay.counts, relay.struck is not None)
         struck = relay.struck is not None
         after = end - relay.struck if relay.struck is not None else 0.0
-        if loop.phase is Phase.DONE:
+        if loop.phase is SteeringPhase.DONE:
             x, y, z = np.array(plant._run.plant.insertion.needle.tip)
             off = float(np.hypot(x - TARGET[0], z - TARGET[2]))
             there = off < LARGEST_MISS and abs(y - TARGET[1]) < LARGEST_MISS
@@ -321,7 +321,7 @@ def insert(
             return InsertionOutcome(
                 'target' if there else 'missed', line, after, relay.counts, struck
             )
-        if loop.phase is Phase.STOPPED:
+        if loop.phase is SteeringPhase.STOPPED:
             kind = 'stopped' if after <= LONGEST_STOP else 'late'
             return InsertionOutcome(kind, loop.fault, after, relay.counts, struck)
         return InsertionOutcome('rejected', pending.outcome[1], after, relay.counts, struck)

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.status import ControllerStatus, NodeStatus, read_status
 from sensor_msgs.msg import JointState
 
 #: Publishes force commands repeatedly: for 6 to 48 ms, or for the first 80 ms after its start.
@@ -136,9 +137,14 @@ class Bystander:
 
         self.until(rests, f'{depth} m')
 
-    def endures(self, script: str, *arguments: object, word: str = '') -> tuple[int, float]:
+    def endures(
+        self,
+        script: str,
+        *arguments: object,
+        condition: Callable[[NodeStatus], bool] | None = None,
+    ) -> tuple[int, float]:
         """
-        Run the program of an unexpected node; terminate it after a word on diagnostics, if given.
+        Run the program of an unexpected node; end it once a status meets the condition, if given.
 
         Returns the number of connections, and the motion of the needle [m].
         """
@@ -149,9 +155,9 @@ class Bystander:
             stdout=subprocess.PIPE,
             text=True,
         )
-        if word:
+        if condition is not None:
             self.until(
-                lambda: self.was_told(word) or stranger.poll() is not None, f'the word {word!r}'
+                lambda: self.reported(condition) or stranger.poll() is not None, 'the report'
             )
             stranger.terminate()
         self.until(lambda: stranger.poll() is not None, 'the end of the other node')
@@ -163,9 +169,15 @@ class Bystander:
         """Motion of the needle since the start of the last disturbance [m]."""
         return max(self.depths) - min(self.depths)
 
-    def was_told(self, what: str) -> bool:
-        """Return whether diagnostics contained a text."""
-        return any(what in status.message for one in self._health for status in one.status)
+    @property
+    def _statuses(self) -> list[NodeStatus]:
+        statuses = (status for one in self._health for status in one.status)
+        found = (read_status({one.key: one.value for one in status.values}) for status in statuses)
+        return [status for status in found if status is not None]
+
+    def reported(self, condition: Callable[[NodeStatus], bool]) -> bool:
+        """Return whether any status met a condition."""
+        return any(map(condition, self._statuses))
 
     @property
     def complaints(self) -> str:
@@ -174,11 +186,9 @@ class Bystander:
         return '; '.join(f'{name}: {message!r}' for name, message in last.items())
 
     @property
-    def stops(self) -> set[str]:
+    def stops(self) -> set[int]:
         """Number of latched stops reported by the controllers."""
-        statuses = (status for one in self._health for status in one.status)
-        values = ({one.key: one.value for one in status.values} for status in statuses)
-        return {one['stops latched'] for one in values if 'stops latched' in one}
+        return {one.stops for one in self._statuses if isinstance(one, ControllerStatus)}
 
 
 def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Bar]]:
@@ -195,7 +205,7 @@ def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Ba
                 found = 1e3 * act(graph, bystander)
                 moved = f'{found:.3f} mm'
                 bystander.goes_to(NEXT)
-                afterwards = 'goes on' if bystander.stops <= {'0'} else 'goes on after a stop'
+                afterwards = 'goes on' if bystander.stops <= {0} else 'goes on after a stop'
             except GraphError as error:
                 afterwards = f'{error}: {bystander.complaints}'
         rows.append((what, str(count), moved, f'{bar:g} mm', afterwards))

@@ -26,6 +26,7 @@ from benchmarks.pairs import cpu_seconds
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.errors import JobError
+from needle_ros.status import PlantStatus, read_status
 import numpy as np
 from rclpy.node import Node
 
@@ -91,9 +92,9 @@ def measure() -> dict[str, list[float]]:
 
         def hear(array: DiagnosticArray) -> None:
             for status in array.status:
-                values = {pair.key: pair.value for pair in status.values}
-                if 'real-time factor' in values:
-                    factors.append(float(values['real-time factor']))
+                found = read_status({pair.key: pair.value for pair in status.values})
+                if isinstance(found, PlantStatus):
+                    factors.append(found.real_time_factor)
 
         node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
         pids = {

@@ -31,6 +31,7 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
+from needle_ros.status import ControllerStatus, Diagnosis
 from needle_ros.timing import nanoseconds, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
@@ -77,7 +78,7 @@ class ControllerNode(ModelNode):
     if these are published. Both are checked against the limits in any case.
 
     The node passes messages to a `Supervisor`, which decides, and publishes its commands. Each
-    target and trajectory is acknowledged in the status, see `needle_ros.status`.
+    target and trajectory is acknowledged in the status, see `needle_ros.requests`.
     """
 
     LIVE = frozenset(
@@ -385,14 +386,14 @@ class ControllerNode(ModelNode):
         if self._supervisor.requests.due():
             self.publish_diagnostics()
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[ControllerStatus]:
         """Report target, state, faults and answers to requests."""
-        severity, held, values = self._supervisor.diagnose(self.now())
+        severity, held, status = self._supervisor.diagnose(self.now())
         if self._driver is not None:
-            values |= self._driver.describe()
+            status = self._driver.with_robot(status)
             if held is not None and self._supervisor.waits and self._missing:
                 held = f'{held}: {self._missing}'
-        return severity.level, held or super().diagnose()[1], values
+        return Diagnosis(severity, held or self.state, status)
 
 
 def main() -> int:

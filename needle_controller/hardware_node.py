@@ -24,6 +24,7 @@ from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, SENSOR
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -215,14 +216,15 @@ class Driver:
             event_callbacks=SubscriptionEventCallbacks(matched=on_match),
         )
 
-    def describe(self) -> dict[str, object]:
-        """Return the diagnostics of the robot."""
+    def with_robot(self, status: ControllerStatus) -> ControllerStatus:
+        """Return the status of the controller with the topics of the robot."""
         joints = ', '.join(self._settings.joints)
-        return {
-            'robot': f'{self.topics.state.name}, {self._settings.command} of {joints} on '
+        return replace(
+            status,
+            robot=f'{self.topics.state.name}, {self._settings.command} of {joints} on '
             f'{self.topics.command.name}',
-            'velocity of the robot': 'estimated' if self.robot.estimates else 'reported',
-        }
+            velocity_source='estimated' if self.robot.estimates else 'reported',
+        )
 
     def missing(self) -> str:
         """Describe from the ROS graph why no joint states are received."""

@@ -9,6 +9,7 @@ from needle_controller.controller import Measurement
 from needle_controller.observer.observer import Observer
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.errors import ParameterError
+from needle_ros.status import ObserverStatus
 import numpy as np
 
 #: Samples between two consistency checks of the observer.
@@ -132,21 +133,22 @@ class LoadEstimator:
                 f'instead of 1; the load of the bent needle is not used'
             )
 
-    def describe(self) -> dict[str, object]:
-        """Return the diagnostics of the observer; empty before its first estimate."""
+    def status(self) -> ObserverStatus | None:
+        """Return the status of the observer; None before its first estimate."""
         observer = self.observer
         if observer is None or not observer.ready:
-            return {}
-        consistency, (tip, spread) = observer.nis, observer.tip_deflection
-        force, deviation = observer.tip_force
-        return {
-            'tip deflection [m]': f'{tip:.6f} +- {spread:.6f}',
-            'load of the bent needle [N]': f'{observer.load:.4f}',
-            'observer consistency (NIS)': (
-                f'{consistency.ratio:.3f} in [{consistency.low:.3f}, {consistency.high:.3f}]'
-            ),
-            'lateral force at the tip [N]': f'{force:.3f} +- {deviation:.3f}',
-            'observer samples refused': observer.refused,
-            'observer restarts': observer.restarts,
-            'observer warning': observer.warning or '',
-        }
+            return None
+        nis, (tip, deviation) = observer.nis, observer.tip_deflection
+        force, force_deviation = observer.tip_force
+        return ObserverStatus(
+            tip_deflection=tip,
+            tip_deflection_deviation=deviation,
+            tip_force=force,
+            tip_force_deviation=force_deviation,
+            load=observer.load,
+            nis=nis.ratio,
+            nis_interval=(nis.low, nis.high),
+            rejected=observer.refused,
+            restarts=observer.restarts,
+            warning=observer.warning or '',
+        )

@@ -23,10 +23,12 @@ from needle_dynamics.simulated.assembly import defaults_of
 from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
 from needle_ros import contract
 from needle_ros.errors import printable
+from needle_ros.event_log import Severity
 from needle_ros.publishers_node import Publishers
+from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
-from needle_ros.status import RequestStatus, Verdict
+from needle_ros.status import Diagnosis, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 import numpy as np
@@ -280,15 +282,14 @@ class SteeringNode(CompiledNode):
         message.pose.covariance = covariance.ravel()
         self._tip_expected.publish(message)
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[SteeringStatus]:
         """Report the state, the expected tip and faults."""
         if self._loop is None:
-            return super().diagnose()
+            return Diagnosis(Severity.INFO, self.state, SteeringStatus())
         if not self.is_active:
-            level, state, _ = super().diagnose()
-            return level, state, self._loop.requests.status().to_values()
-        severity, state, values = self._loop.diagnose(self.now())
-        return severity.level, state, values
+            status = SteeringStatus(requests=self._loop.requests.status())
+            return Diagnosis(Severity.INFO, self.state, status)
+        return Diagnosis(*self._loop.diagnose(self.now()))
 
 
 def main() -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from time import monotonic
 from typing import Final
 
@@ -23,7 +24,8 @@ from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, ENTRY, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.status import RequestLog, Verdict
+from needle_ros.requests import RequestLog, Verdict
+from needle_ros.status import ControllerPhase, ControllerStatus
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
 from needle_ros.wire import Reading
@@ -624,7 +626,7 @@ class Supervisor:
             controller.forget()
             return self._stop_for('the command is not finite', stamp)
         if command.notice is not None:
-            self.journal.complaint = command.notice
+            self.journal.last_rejection = command.notice
             self.journal.say(Severity.ERROR, command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.speed - measured.speed
@@ -742,9 +744,58 @@ class Supervisor:
 
     # Status.
 
-    def diagnose(self, now: int) -> tuple[Severity, str | None, dict[str, object]]:
+    @property
+    def _phase(self) -> ControllerPhase:
+        if self.safety.stop is not None:
+            return ControllerPhase.STOPPED
+        if self._active is None:
+            return ControllerPhase.INACTIVE
+        if self.fault is None:
+            return ControllerPhase.ACTIVE
+        return ControllerPhase.WAITING if self.waits else ControllerPhase.FAULT
+
+    def _warning(self, now: int) -> str:
+        if self._active is None:
+            return ''
+        pace = self._pace.warning() if self._pace is not None else None
+        late = self._lateness.warning(now)
+        return self.safety.warning(now) or self.bending.warning or late or pace or ''
+
+    def _status(self, now: int) -> ControllerStatus:
+        safety, control = self.safety, self.controller
+        paused = self._active is not None and self._active.guide.paused
+        status = ControllerStatus(
+            phase=self._phase,
+            fault=self.fault or '',
+            stop=safety.stop or '',
+            stops=safety.stops,
+            warning=self._warning(now),
+            duplicate_publishers=safety.rivals or '',
+            observer=self.bending.status(),
+            latency=self._lateness.status(),
+            command_rate=safety.saturation.rate(now),
+            saturated_fraction=safety.saturation.share(now),
+            input=safety.inputs(now),
+            rejected=self.journal.rejected,
+            last_rejection=self.journal.last_rejection,
+            requests=self.requests.status(paused=paused),
+        )
+        if control is None:
+            return status
+        name, limit = max(control.limits.items(), key=lambda item: item[1].radius - item[1].bound)
+        return replace(
+            status,
+            target=control.target,
+            law=control.law,
+            least_stable_axis=name,
+            spectral_radius=limit.radius,
+            spectral_radius_limit=limit.bound,
+            learned=control.learned,
+        )
+
+    def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:
         """
-        Return severity, fault if there is any, and values by name.
+        Return severity, fault if there is any, and status.
 
         Parameters
         ----------
@@ -752,33 +803,8 @@ class Supervisor:
             Time [ns].
 
         """
-        values: dict[str, object] = {}
-        paused = self._active is not None and self._active.guide.paused
-        if self.controller is not None:
-            control = self.controller
-            name, limit = max(
-                control.limits.items(), key=lambda item: item[1].radius - item[1].bound
-            )
-            values = {
-                'target [m]': control.target,
-                'law': control.law,
-                'least stable axis': name,
-                'spectral radius': f'{limit.radius:.9g} (at most {limit.bound:.9g})',
-            }
-            for what, (value, error) in control.learned.items():
-                values[what] = f'{value:+.4g} +- {1.96 * error:.2g}'
-        values |= {
-            **self.bending.describe(),
-            **self._lateness.describe(),
-            'inputs refused': self.journal.refused,
-            'last complaint': self.journal.complaint,
-            **self.safety.describe(now),
-            **self.requests.status(paused=paused).to_values(),
-        }
+        status = self._status(now)
         if self.safety.stop is not None:
-            return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', values
-        late = self._lateness.warning(now)
-        pace = self._pace.warning() if self._pace is not None else None
-        held = self.fault or self.safety.warning(now) or self.bending.warning or late or pace
-        held = held if self._active is not None else None
-        return Severity.WARNING if held else Severity.INFO, held, values
+            return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', status
+        held = (self.fault or status.warning) if self._active is not None else ''
+        return Severity.WARNING if held else Severity.INFO, held or None, status

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 import json
 from math import ceil
@@ -24,10 +24,12 @@ from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TA
 from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.errors import JobError, MessageError, NeedleError, ParameterError, printable
+from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
-from needle_ros.status import RequestLog, Verdict
+from needle_ros.status import Diagnosis, PlantPhase, PlantStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
@@ -694,49 +696,68 @@ class PlantNode(ModelNode):
         line.points = [Point(x=x, y=y, z=z) for x, y, z in points]
         self._needle_shape.publish(line)
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    @property
+    def _phase(self) -> PlantPhase:
+        if not self.is_active:
+            return PlantPhase.INACTIVE
+        if self._halted:
+            return PlantPhase.HALTED
+        return PlantPhase.PAUSED if self._time.paused else PlantPhase.RUNNING
+
+    def _status(self, plant_run: PlantRun) -> PlantStatus:
+        clock, given, now = self._time, plant_run.commands, monotonic_ns()
+        late = self._looks >= _LONG
+        return replace(
+            plant_run.plant.report,
+            phase=self._phase,
+            halt=self._halted or '',
+            time=clock.stamp / NANOSECONDS,
+            real_time_factor=self._sample_rate.rate(now) / plant_run.constants.own.rate,
+            command_rate=self._command_rate.rate(now),
+            commanders=given.rivals + 1 if given.rivals else 0,
+            exhausted=given.exhausted,
+            computed_later=self._made_up,
+            skipped=clock.lost,
+            waited=clock.waited / NANOSECONDS,
+            awaited=clock.missing if late else '',
+            rejected=given.refused + self._refused_trajectories,
+            stale=given.stale,
+            superseded=given.overtaken,
+            saturated=self._saturated,
+            sensor_fault='' if self._fault is None else self.text('fault.kind'),
+            faulty_topic='' if self._fault is None else self._faulty,
+            lockstep_nodes=clock.participants + len(clock.recorded),
+            requests=self._requests.status(),
+        )
+
+    def diagnose(self) -> Diagnosis[PlantStatus]:
         """Report needle state, timing and errors."""
         if self._run is None:
-            return super().diagnose()
-        clock, rate, given = self._time, self._run.constants.own.rate, self._run.commands
-        now = monotonic_ns()
-        samples, commands = self._sample_rate.rate(now), self._command_rate.rate(now)
-        values: dict[str, object] = {
-            **self._run.plant.report,
-            'real-time factor': f'{samples / rate:.3f}',
-            'commands per second [Hz]': f'{commands:.1f}',
-            'samples computed after stalls': self._made_up,
-            'samples given up': clock.lost,
-            'waited for the machine [s]': f'{clock.waited / NANOSECONDS:.3f}',
-            'commands refused': given.refused + self._refused_trajectories,
-            'commands too old': given.stale,
-            'commands overtaken': given.overtaken,
-            'saturated readings': self._saturated,
-            **self._requests.status().to_values(),
-            'nodes in lock-step': clock.participants + len(clock.recorded),
-        }
-        if not self.is_active:
-            return *super().diagnose()[:2], values
+            return Diagnosis(Severity.INFO, self.state, PlantStatus())
+        status = self._status(self._run)
+        rate, commands = self._run.constants.own.rate, status.command_rate
+        samples = status.real_time_factor * rate
+        if status.phase is PlantPhase.INACTIVE:
+            return Diagnosis(Severity.INFO, self.state, status)
         if self._halted:
-            return DiagnosticStatus.ERROR, self._halted, values
-        if given.rivals:
-            return DiagnosticStatus.ERROR, f'{given.rivals + 1} nodes command', values
-        if given.exhausted:
-            return DiagnosticStatus.ERROR, self._exhausted, values
+            return Diagnosis(Severity.ERROR, self._halted, status)
+        if status.commanders:
+            return Diagnosis(Severity.ERROR, f'{status.commanders} nodes command', status)
+        if status.exhausted:
+            return Diagnosis(Severity.ERROR, self._exhausted, status)
         warnings = []
-        if clock.paused:
-            warnings.append(f'paused at {clock.stamp / NANOSECONDS:.6f} s')
-        if self._looks >= _LONG:
-            warnings.append(f'{clock.missing} the sample of {clock.stamp / NANOSECONDS:.6f} s')
-        if clock.lost:
-            warnings.append(f'{clock.lost} samples skipped after stalls')
+        if status.phase is PlantPhase.PAUSED:
+            warnings.append(f'paused at {status.time:.6f} s')
+        if status.awaited:
+            warnings.append(f'{status.awaited} the sample of {status.time:.6f} s')
+        if status.skipped:
+            warnings.append(f'{status.skipped} samples skipped after stalls')
         if commands > _TOO_MANY * max(samples, rate):
             warnings.append(f'{commands:.0f} commands per second for {samples:.0f} samples')
-        if self._fault is not None:
-            warnings.append(f'{self._faulty} has the fault {self.text("fault.kind")}')
-        if warnings:
-            return DiagnosticStatus.WARN, '; '.join(warnings), values
-        return *super().diagnose()[:2], values
+        if status.sensor_fault:
+            warnings.append(f'{status.faulty_topic} has the fault {status.sensor_fault}')
+        severity = Severity.WARNING if warnings else Severity.INFO
+        return Diagnosis(severity, '; '.join(warnings) or self.state, status)
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, Protocol
 
-from needle_ros.status import no_answer
+from needle_ros.requests import no_answer
 
 #: Parameters that a running plant can change; all others are fixed.
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')

@@ -31,8 +31,10 @@ from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.event_log import Severity
 from needle_ros.run_node import run
 from needle_ros.settings import check_constants, constant
+from needle_ros.status import Diagnosis, IdentificationStatus
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
@@ -169,16 +171,17 @@ class IdentificationNode(BaseNode):
         """Set the recordings of the next identification."""
         self._bags = [name for name in changes['bags'] if name]
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[IdentificationStatus]:
+        status = IdentificationStatus()
         if self._live is not None:
-            values: dict[str, object] = {'samples': self._live.samples, **self._live.dropped}
-            if not self._live.samples:
+            samples, discarded = self._live.samples, self._live.dropped
+            status = IdentificationStatus(samples=samples, discarded=discarded)
+            if not samples:
                 message = f'no joint_states of {self._joint} paired with base_wrench'
-                return DiagnosticStatus.WARN, message, values
-            return DiagnosticStatus.OK, sentence(self._live_statistics()), values
-        if not self._found:
-            return DiagnosticStatus.OK, 'nothing identified yet', {}
-        return DiagnosticStatus.OK, self._words, {}
+                return Diagnosis(Severity.WARNING, message, status)
+            return Diagnosis(Severity.INFO, sentence(self._live_statistics()), status)
+        message = self._words if self._found else 'nothing identified yet'
+        return Diagnosis(Severity.INFO, message, status)
 
     # Recordings.
 

@@ -10,7 +10,6 @@ import time
 from typing import Any, Final
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.playback import BagPlayback, PlaybackSettings
 from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
@@ -18,7 +17,9 @@ from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class
 from needle_ros.errors import MessageError, NeedleError, ParameterError
+from needle_ros.event_log import Severity
 from needle_ros.run_node import run
+from needle_ros.status import Diagnosis, PlayerPhase, PlayerStatus
 from needle_ros.timing import NANOSECONDS
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -35,6 +36,13 @@ _LONGEST_BURST: Final = 1e-3
 
 #: Time between checks for other publishers [s].
 _LOOK: Final = 0.25
+
+#: Message by phase, before the path of the bag.
+_STATES: Final = {
+    PlayerPhase.PLAYING: 'playing',
+    PlayerPhase.PAUSED: 'paused in',
+    PlayerPhase.ENDED: 'at the end of',
+}
 
 #: Queue length of a topic that is not latched.
 _DEPTH: Final = 1000
@@ -300,29 +308,31 @@ class PlayerNode(BaseNode):
         if self._playback.is_paused:
             self._show_time(self._playback.position)
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[PlayerStatus]:
         if not self.is_active:
-            return super().diagnose()
+            return Diagnosis(Severity.INFO, self.state, PlayerStatus())
         playback = self._playback
-        values: dict[str, object] = {
-            'position [s]': f'{playback.seconds(playback.position):.3f}',
-            'rate': playback.settings.rate,
-            'late [s]': f'{playback.late:.4f}',
-            'latest so far [s]': f'{playback.latest:.4f}',
-            'messages': self._played,
-            'loops': playback.loops,
-            'left out': ', '.join(sorted(self._left_out)) or 'none',
-        }
+        paused = PlayerPhase.PAUSED if playback.is_paused else PlayerPhase.PLAYING
+        status = PlayerStatus(
+            phase=PlayerPhase.ENDED if playback.is_ended else paused,
+            path=str(playback.bag.path),
+            position=playback.seconds(playback.position),
+            rate=playback.settings.rate,
+            delay=playback.late,
+            largest_delay=playback.latest,
+            messages=self._played,
+            loops=playback.loops,
+            left_out=', '.join(sorted(self._left_out)),
+            duplicate_publishers=', '.join(sorted(self._contested)),
+        )
         complaints = [*playback.bag.losses] if playback.is_ended else []
         if self._contested:
-            complaints.append(f'other publishers of {", ".join(sorted(self._contested))}')
+            complaints.append(f'other publishers of {status.duplicate_publishers}')
         if playback.late > _LATE and playback.is_running:
             complaints.append(f'{playback.late:.2f} s late: the machine is too slow for this rate')
         if complaints:
-            return DiagnosticStatus.WARN, '; '.join(complaints), values
-        paused = 'paused in' if playback.is_paused else 'playing'
-        state = 'at the end of' if playback.is_ended else paused
-        return DiagnosticStatus.OK, f'{state} {playback.bag.path}', values
+            return Diagnosis(Severity.WARNING, '; '.join(complaints), status)
+        return Diagnosis(Severity.INFO, f'{_STATES[status.phase]} {playback.bag.path}', status)
 
 
 def _profile(topics: list[BagTopic]) -> QoSProfile:

@@ -8,14 +8,15 @@ import sys
 import time
 from typing import Any, Final, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
+from needle_ros.event_log import Severity
 from needle_ros.run_node import run
+from needle_ros.status import Diagnosis, RecorderStatus
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader
 from rclpy.clock import Clock
@@ -112,20 +113,21 @@ class RecorderNode(BaseNode):
         if self._bag is not None:
             self._end(self._bag)
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[RecorderStatus]:
         if self._bag is None:
-            return DiagnosticStatus.OK, 'not recording', {}
+            return Diagnosis(Severity.INFO, 'not recording', RecorderStatus())
         counts, lost = self._bag.counts, self._bag.lost
-        values: dict[str, object] = {
-            'messages': sum(counts.values()),
-            'bytes': self._bag.size,
-            **counts,
-        }
-        values |= {f'lost of {topic}': number for topic, number in lost.items()}
+        status = RecorderStatus(
+            path=str(self._bag.path),
+            messages=sum(counts.values()),
+            size=self._bag.size,
+            recorded=counts,
+            lost=lost,
+        )
         what = f'recording to {self._bag.path}'
         if lost:
-            return DiagnosticStatus.WARN, f'{what}; lost {described(lost)}', values
-        return DiagnosticStatus.OK, what, values
+            return Diagnosis(Severity.WARNING, f'{what}; lost {described(lost)}', status)
+        return Diagnosis(Severity.INFO, what, status)
 
     # Services.
 
@@ -136,7 +138,7 @@ class RecorderNode(BaseNode):
                 raise RecordingError('not active')
             if self._bag is None:
                 self._begin()
-            response.success, response.message = True, self.diagnose()[1]
+            response.success, response.message = True, self.diagnose().message
         except RecordingError as error:
             response.message = str(error)
         return response

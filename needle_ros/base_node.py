@@ -12,7 +12,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib import import_module
 import traceback
 from typing import Any, ClassVar, TypeVar
@@ -25,6 +25,7 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import LifeCycle
 from needle_ros.preparation import imports, Preparation, PreparationProgress
 from needle_ros.settings import from_values, unknown_name
+from needle_ros.status import Diagnosis, NodeStatus
 from needle_ros.wire import MessageReader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
@@ -145,7 +146,7 @@ class BaseNode(LifecycleNode):
         self.declare_text('autostart', True, 'configure and activate at start')
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
-        self._last_level = DiagnosticStatus.OK
+        self._last_severity = Severity.INFO
         # Steady clock: diagnostics continue in a paused simulation.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
@@ -181,9 +182,14 @@ class BaseNode(LifecycleNode):
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return level, one-line message and values of the DiagnosticStatus."""
-        return DiagnosticStatus.OK, 'active' if self.is_active else 'not active', {}
+    def diagnose(self) -> Diagnosis[NodeStatus]:
+        """Return severity, one-line message and typed status."""
+        return Diagnosis(Severity.INFO, self.state, NodeStatus())
+
+    @property
+    def state(self) -> str:
+        """Message of a node without faults."""
+        return 'active' if self.is_active else 'not active'
 
     # Messages.
 
@@ -484,22 +490,25 @@ class BaseNode(LifecycleNode):
 
     def publish_diagnostics(self) -> None:
         """Publish the state of the node; called once a second and on change."""
-        level, message, values = self.diagnose()
+        diagnosis = self.diagnose()
+        severity, message = diagnosis.severity, diagnosis.message
         if self.is_preparing:
             message = str(self._preparation.progress)
             self.get_logger().info(message, throttle_duration_sec=_LONG, skip_first=True)
         if self.failure:
-            level, message = DiagnosticStatus.ERROR, self.failure
-        self._last_level = level
-        for topic, count in self.invalid.items():
-            values[f'invalid messages on {topic}'] = count
-        status = DiagnosticStatus(
-            level=level,
+            severity, message = Severity.ERROR, self.failure
+        self._last_severity = severity
+        status = replace(
+            diagnosis.status, invalid_messages=self.invalid, failure=self.failure or ''
+        )
+        values = status.to_values()
+        published = DiagnosticStatus(
+            level=severity.level,
             name=self.get_fully_qualified_name(),
             message=message,
-            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-        array = DiagnosticArray(status=[status])
+        array = DiagnosticArray(status=[published])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
@@ -520,5 +529,5 @@ class BaseNode(LifecycleNode):
 
     def report_change(self) -> None:
         """Publish diagnostics if the level has changed."""
-        if self.diagnose()[0] != self._last_level:
+        if self.diagnose().severity != self._last_severity:
             self.publish_diagnostics()

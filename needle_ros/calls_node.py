@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
-from needle_ros import status
+from needle_ros import requests
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -64,10 +64,10 @@ class Calls:
         now = monotonic()
         for one in self._calls:
             elapsed = now - one.begun
-            repeats = min(status.REPEATS, int(elapsed / status.REPEAT_AFTER))
+            repeats = min(requests.REPEATS, int(elapsed / requests.REPEAT_AFTER))
             if one.later.done():
                 continue
-            if elapsed > status.CALL_TIMEOUT:
+            if elapsed > requests.CALL_TIMEOUT:
                 one.later.set_result(None)
             elif one.repeats < repeats:
                 one.repeats += 1

@@ -68,7 +68,7 @@ class Stamp(Enum):
     Meaning of the stamp of a message, which decides whether its age matters.
 
     `needle_controller.safety.input_monitor.InputMonitor` checks samples by this rule,
-    `needle_ros.status.RequestLog` checks requests.
+    `needle_ros.requests.RequestLog` checks requests.
     """
 
     #: Time of a sample, or of the sample that a command answers. Older messages and messages

@@ -39,9 +39,9 @@ class EventLog:
 
     Attributes
     ----------
-    refused : int
+    rejected : int
         Number of rejected inputs.
-    complaint : str
+    last_rejection : str
         Reason of the last rejection, or last fault of the motion.
     changed : bool
         Whether there are new lines or changes.
@@ -49,8 +49,8 @@ class EventLog:
     """
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
-        self.refused = 0
-        self.complaint = ''
+        self.rejected = 0
+        self.last_rejection = ''
         self.changed = False
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []
@@ -78,8 +78,8 @@ class EventLog:
 
     def refuse(self, complaint: str) -> None:
         """Count a rejected input, and add an error line with its name and the reason."""
-        self.refused += 1
-        self.complaint = printable(complaint)
+        self.rejected += 1
+        self.last_rejection = printable(complaint)
         # The first word is the topic or service.
         self.say(Severity.ERROR, complaint, f'refused {complaint.partition(" ")[0]}')
 

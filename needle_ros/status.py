@@ -1,327 +1,453 @@
 """
-Requests on topics, and their acknowledgement in the status of the receiver.
+Status of the state machines, and its mapping to the key-value pairs of a DiagnosticStatus.
 
-A request is a message on a topic with stamp `Stamp.REQUEST` in the contract: a target or a
-trajectory. The receiver answers in its status on ``/diagnostics``, immediately and then once a
-second, so that a lost message is replaced. The sender repeats the request until the answer.
+A node publishes its status on ``/diagnostics``. Readers use the dataclasses of this file; the keys
+of the pairs are for people and plots. A key is the name of the field with its unit, such as
+``insertion depth [m]``; the fields of a nested dataclass and the entries of a mapping follow the
+name of the field, such as ``input joint_states rate [Hz]``. An optional field without a value has
+no pair.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
-from time import monotonic
-from typing import Final
+from functools import cache
+from types import NoneType, UnionType
+from typing import (
+    Any,
+    ClassVar,
+    Final,
+    Generic,
+    get_args,
+    get_origin,
+    get_type_hints,
+    TypeVar,
+)
 
-from needle_ros.contract import REQUEST_AGE, Stamp, Topic
-from needle_ros.errors import printable
-from needle_ros.timing import apart, NANOSECONDS
+from needle_ros.event_log import Severity
+from needle_ros.requests import RequestStatus
 
-#: Interval of repetitions without an answer [s], and the maximum number of repetitions.
-REPEAT_AFTER: Final = 1.0
-REPEATS: Final = 3
+#: Key of the kind of a status.
+_KIND: Final = 'kind'
 
-#: Timeout of a request without an answer [s]: a later receiver rejects it as stale, so that it is
-#: not executed after the timeout.
-_GIVE_UP: Final = REQUEST_AGE + 1.0
+#: Result of a field that is missing or invalid in a status.
+_MISSING: Final = object()
 
-#: Timeout of a service call [s], longer than the response time on a slow machine.
-CALL_TIMEOUT: Final = 10.0
-
-#: Number of answers in a status, and number of answers kept to detect duplicates.
-_PUBLISHED: Final = 8
-_KEPT: Final = 64
-
-#: Minimum time between two statuses published for an answer [s].
-_PAUSE: Final = 0.05
-
-#: Keys and key prefixes in a status.
-_TAKES: Final = 'takes '
-_REQUEST: Final = 'request '
-_PAUSED: Final = 'paused'
-
-_MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
+_Status = TypeVar('_Status', bound='NodeStatus')
+_Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
 
 
-class Verdict(Enum):
-    """Result of a request."""
-
-    #: Received and being checked; another verdict follows.
-    RECEIVED = 'received'
-    ACCEPTED = 'accepted'
-    REJECTED = 'rejected'
-    #: Not executed, because the receiver executes a newer request.
-    SUPERSEDED = 'superseded'
+def entry(default: Any, unit: str, description: str) -> Any:
+    """Declare a field of a status; a default of `dict` or `RequestStatus` is called."""
+    meta = {'unit': unit, 'description': description}
+    if isinstance(default, type):
+        return field(default_factory=default, metadata=meta)
+    return field(default=default, metadata=meta)
 
 
-@dataclass(frozen=True, slots=True)
-class Acknowledgement:
-    """
-    Answer of a receiver to a request.
+class ControllerPhase(Enum):
+    """Phase of the controller."""
 
-    Attributes
-    ----------
-    topic : str
-        Topic of the request, by its name in the contract.
-    stamp : int
-        Stamp of the request [ns]; 0 for a message without a stamp.
-    verdict : Verdict
-        The result.
-    reason : str
-        Reason of a rejection, for users.
-
-    """
-
-    topic: str
-    stamp: int
-    verdict: Verdict
-    reason: str = ''
-
-    @property
-    def refused(self) -> bool:
-        """Whether the request is not executed."""
-        return self.verdict in (Verdict.REJECTED, Verdict.SUPERSEDED)
+    INACTIVE = 'inactive'
+    #: No `joint_states` received yet.
+    WAITING = 'waiting'
+    #: Answers measurements.
+    ACTIVE = 'active'
+    #: Without force, or with a reference that waits, as long as a fault lasts.
+    FAULT = 'fault'
+    #: Without force until `~/clear_stop`.
+    STOPPED = 'stopped'
 
 
-@dataclass(frozen=True, slots=True)
-class RequestStatus:
-    """
-    Accepted request topics of a node and its latest answers, as fields of a DiagnosticStatus.
+class SteeringPhase(Enum):
+    """Phase of a steered insertion."""
 
-    Attributes
-    ----------
-    takes : Mapping of str to tuple of str
-        Moved joints by topic of the request.
-    answers : tuple of Acknowledgement
-        The latest answers, the newest last.
-    paused : bool
-        Whether a user has paused the motion, for an unlimited time.
+    INACTIVE = 'inactive'
+    IDLE = 'idle'
+    PLANNING = 'planning'
+    GUIDING = 'guiding'
+    INSERTING = 'inserting'
+    MEASURING = 'measuring'
+    DONE = 'done'
+    STOPPED = 'stopped'
 
-    """
 
-    takes: Mapping[str, tuple[str, ...]]
-    answers: tuple[Acknowledgement, ...] = ()
-    paused: bool = False
+class PlantPhase(Enum):
+    """Phase of the plant."""
 
-    def to_values(self) -> dict[str, object]:
-        """Return the fields as values of a DiagnosticStatus."""
-        values: dict[str, object] = {
-            f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()
-        }
-        values[_PAUSED] = self.paused
-        for one in self.answers:
-            key = f'{_REQUEST}{one.topic} {one.stamp}'
-            values[key] = f'{one.verdict.value}: {one.reason}' if one.reason else one.verdict.value
-        return values
+    INACTIVE = 'inactive'
+    RUNNING = 'running'
+    #: Simulated time stands still.
+    PAUSED = 'paused'
+    #: Stopped by an error until a reset.
+    HALTED = 'halted'
+
+
+class PlayerPhase(Enum):
+    """Phase of the player."""
+
+    INACTIVE = 'inactive'
+    PLAYING = 'playing'
+    PAUSED = 'paused'
+    ENDED = 'ended'
+
+
+class SlicerPhase(Enum):
+    """Phase of the connection to 3D Slicer."""
+
+    INACTIVE = 'inactive'
+    WAITING = 'waiting'
+    CONNECTED = 'connected'
+    ERROR = 'error'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputStatus:
+    """Status of an input monitor."""
+
+    rate: float = entry(0.0, 'Hz', 'messages in the last second')
+    age: float | None = entry(None, 's', 'time since the last accepted message')
+    accepted: int = entry(0, '', 'accepted messages')
+    repeated: int = entry(0, '', 'messages received twice')
+    out_of_order: int = entry(0, '', 'messages that are older than the message before')
+    rejected: Mapping[str, int] = entry(dict, '', 'rejected messages by reason')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LatencyStatus:
+    """Status of the latency monitor."""
+
+    answered: int = entry(0, '', 'measurements answered by a command')
+    late: int = entry(0, '', 'commands later than the configured delay')
+    longest: float = entry(0.0, 's', 'largest age of an answered measurement')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObserverStatus:
+    """Status of the observer of the bent needle."""
+
+    tip_deflection: float = entry(0.0, 'm', 'estimated tip deflection')
+    tip_deflection_deviation: float = entry(0.0, 'm', 'standard deviation of the tip deflection')
+    tip_force: float = entry(0.0, 'N', 'estimated lateral force at the tip')
+    tip_force_deviation: float = entry(0.0, 'N', 'standard deviation of the lateral force')
+    load: float = entry(0.0, 'N', 'axial load of the bent needle')
+    nis: float = entry(1.0, '', 'normalized innovation squared; 1 for a consistent observer')
+    nis_interval: tuple[float, float] = entry((0.0, 0.0), '', 'interval of a consistent observer')
+    rejected: int = entry(0, '', 'rejected samples')
+    restarts: int = entry(0, '', 'restarts')
+    warning: str = entry('', '', 'why the estimate is not used')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeStatus:
+    """Status of any node."""
+
+    #: Value of the key `kind`.
+    KIND: ClassVar[str] = 'node'
+
+    invalid_messages: Mapping[str, int] = entry(dict, '', 'unreadable messages by topic')
+    failure: str = entry('', '', 'reason of the last refused transition')
+
+    def to_values(self) -> dict[str, str]:
+        """Return the fields as key-value pairs."""
+        return {_KIND: self.KIND, **dict(_pairs(self, '', ''))}
 
     @classmethod
-    def from_values(cls, values: Mapping[str, str]) -> RequestStatus:
-        """Parse the fields from values of a DiagnosticStatus; other keys are ignored."""
-        takes: dict[str, tuple[str, ...]] = {}
-        answers = []
-        for key, value in values.items():
-            if key.startswith(_TAKES):
-                takes[key[len(_TAKES) :]] = tuple(filter(None, value.split(', ')))
-            elif key.startswith(_REQUEST):
-                topic, _, stamp = key[len(_REQUEST) :].rpartition(' ')
-                verdict, _, reason = value.partition(': ')
-                if stamp.isdecimal() and verdict in _VERDICTS:
-                    answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
-        return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
-
-    def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
-        """Return the answer to a request with a topic and stamp [ns], or None."""
-        for one in self.answers:
-            if (one.topic, one.stamp) == (topic, stamp):
-                return one
-        return None
+    def from_values(cls: type[_Status], values: Mapping[str, str]) -> _Status:
+        """Parse the fields from key-value pairs; a missing or invalid one has its default."""
+        found = _filled(cls, values, '')
+        return cls() if found is _MISSING else found
 
 
-_VERDICTS: Final = {one.value for one in Verdict}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerStatus(NodeStatus):
+    """Status of the node `controller`."""
+
+    KIND: ClassVar[str] = 'controller'
+
+    phase: ControllerPhase = entry(ControllerPhase.INACTIVE, '', 'phase')
+    fault: str = entry('', '', 'why no force is commanded or the reference waits')
+    stop: str = entry('', '', 'reason of the latched stop')
+    warning: str = entry('', '', 'inputs, observer or rate that need attention')
+    stops: int = entry(0, '', 'latched stops')
+    duplicate_publishers: str = entry('', '', 'topics with several publishers')
+    target: float | None = entry(None, 'm', 'target insertion depth')
+    law: str = entry('', '', 'control law')
+    least_stable_axis: str = entry('', '', 'axis with the smallest stability margin')
+    spectral_radius: float | None = entry(None, '', 'largest pole magnitude of this axis')
+    spectral_radius_limit: float | None = entry(None, '', 'largest permitted pole magnitude')
+    learned: Mapping[str, tuple[float, float]] = entry(
+        dict, '', 'learned friction by term, with its standard deviation'
+    )
+    observer: ObserverStatus | None = entry(None, '', 'observer, from its first estimate')
+    latency: LatencyStatus = entry(LatencyStatus, '', 'latency of the commands')
+    command_rate: float = entry(0.0, 'Hz', 'commands in the last second')
+    saturated_fraction: float = entry(
+        0.0, '', 'fraction of the commands of the last second at their limit'
+    )
+    input: Mapping[str, InputStatus] = entry(dict, '', 'inputs by topic')
+    rejected: int = entry(0, '', 'rejected messages and requests')
+    last_rejection: str = entry('', '', 'reason of the last rejection')
+    robot: str = entry('', '', 'topics and joints of a robot with topics of its own')
+    velocity_source: str = entry('', '', 'velocity of this robot: estimated or reported')
+    requests: RequestStatus = entry(RequestStatus, '', 'requests and their acknowledgement')
 
 
-class RequestLog:
-    """
-    Log of received requests: accept each once, in the order of the stamps, and record answers.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringStatus(NodeStatus):
+    """Status of the node `steering`."""
 
-    Parameters
-    ----------
-    takes : Mapping of Topic to sequence of str
-        Moved joints by topic of the request.
-    frames : sequence of str
-        Valid frames of a request.
-    steady : callable
-        Returns the time of a steady clock [s].
+    KIND: ClassVar[str] = 'steering'
 
-    """
-
-    def __init__(
-        self,
-        takes: Mapping[Topic, Sequence[str]],
-        frames: Sequence[str] = ('',),
-        steady: Callable[[], float] = monotonic,
-    ) -> None:
-        for topic in takes:
-            if topic.stamp is not Stamp.REQUEST:
-                raise ValueError(f'{topic.name} is not a request')
-        self._takes = {topic.name: tuple(joints) for topic, joints in takes.items()}
-        self._frames, self._steady = frames, steady
-        self._answers: dict[tuple[str, int], Acknowledgement] = {}
-        #: Stamp of the newest request that was accepted, by joint [ns].
-        self._newest: dict[str, int] = {}
-        self._changed = False
-        self._published = -_PAUSE
-
-    def forget(self) -> None:
-        """Delete all requests, after a start or after the clock was set back."""
-        self._answers.clear()
-        self._newest.clear()
-
-    def check(
-        self, topic: Topic, stamp: int, now: int, frame: str = '', joints: Iterable[str] = ()
-    ) -> Acknowledgement | None:
-        """
-        Return None for a new request, else its answer; times are in ns.
-
-        The caller executes and answers a new request; a stamp of 0 always counts as new. A
-        duplicate gets its first answer again. A request with a stale stamp or a wrong frame is
-        rejected, and a request older than the current request of one of its joints is superseded.
-        """
-        known = self._answers.get((topic.name, stamp)) if stamp else None
-        if known is not None:
-            # The status with the answer may have been lost.
-            self._changed = True
-            return known
-        verdict, reason = Verdict.REJECTED, ''
-        if stamp and not -_MOST_AGE <= now - stamp <= _MOST_AGE:
-            reason = f'{topic.name} is stale: its stamp is {apart(now - stamp)}'
-        elif frame not in self._frames:
-            valid = ' or '.join(map(repr, self._frames))
-            reason = f'{topic.name} must be in frame {valid}, got {frame!r}'
-        elif stamp and any(stamp < self._follows(joint, now) for joint in joints):
-            verdict, reason = Verdict.SUPERSEDED, 'a newer request has priority'
-        return self.answer(topic, stamp, verdict, reason) if reason else None
-
-    def _follows(self, joint: str, now: int) -> int:
-        newest = self._newest.get(joint, 0)
-        # The clock has been set back.
-        return newest if newest <= now + _MOST_AGE else 0
-
-    def answer(
-        self,
-        topic: Topic,
-        stamp: int,
-        verdict: Verdict,
-        reason: str = '',
-        joints: Iterable[str] = (),
-    ) -> Acknowledgement:
-        """Record and return the answer to a request; arguments as for `check`."""
-        made = Acknowledgement(topic.name, stamp, verdict, printable(reason))
-        if stamp and not made.refused:
-            for joint in joints:
-                self._newest[joint] = max(stamp, self._newest.get(joint, 0))
-        # Newest answer last.
-        self._answers.pop((topic.name, stamp), None)
-        self._answers[topic.name, stamp] = made
-        while len(self._answers) > _KEPT:
-            del self._answers[next(iter(self._answers))]
-        self._changed = True
-        return made
-
-    def supersede(self, now: int) -> None:
-        """Supersede all requests sent before `now` [ns]: a stop or a retraction has priority."""
-        for joints in self._takes.values():
-            for joint in joints:
-                self._newest[joint] = max(now, self._newest.get(joint, 0))
-
-    def due(self) -> bool:
-        """
-        Return whether the status must be published now because of an unpublished answer.
-
-        Call it after each request and from a timer of at most 0.1 s: this limits the number of
-        statuses for a burst of requests.
-        """
-        now = self._steady()
-        if not self._changed or now - self._published < _PAUSE:
-            return False
-        self._changed, self._published = False, now
-        return True
-
-    def status(self, *, paused: bool = False) -> RequestStatus:
-        """Return the status with the latest answers."""
-        answers = tuple(self._answers.values())[-_PUBLISHED:]
-        return RequestStatus(self._takes, answers, paused)
+    phase: SteeringPhase = entry(SteeringPhase.INACTIVE, '', 'phase')
+    fault: str = entry('', '', 'reason of the stop')
+    planned_fraction: float | None = entry(None, '', 'completed fraction of the planning')
+    paused_by: str = entry('', '', 'node that a user has paused')
+    target: tuple[float, float, float] | None = entry(None, 'm', 'target x, y, z of the tip')
+    step: int = entry(0, '', 'completed steps')
+    steps: int = entry(0, '', 'steps of the insertion')
+    guide_setpoint: tuple[float, float] | None = entry(None, 'm', 'guide setpoint x, z')
+    turns_left: int | None = entry(None, '', 'half turns that are left')
+    hit_probability: float | None = entry(None, '', 'probability of a hit within 1 mm')
+    bending_length_ratio: float | None = entry(
+        None, '', 'estimated bending length over the nominal one'
+    )
+    law: Mapping[str, float] = entry(dict, '', 'further values of the steering law, by name')
+    expected_tip: tuple[float, float] | None = entry(
+        None, 'm', 'expected tip position x, z at the target depth'
+    )
+    expected_tip_half_width: tuple[float, float] | None = entry(
+        None, 'm', 'half width of its 95 % interval'
+    )
+    last_measurement_readings: int | None = entry(None, '', 'readings of the last tip measurement')
+    last_measurement_error: float | None = entry(
+        None, 'm', 'standard error of the last tip measurement'
+    )
+    warning: str = entry('', '', 'warning')
+    input: Mapping[str, InputStatus] = entry(dict, '', 'inputs by topic')
+    rejected: int = entry(0, '', 'rejected messages and requests')
+    last_rejection: str = entry('', '', 'reason of the last rejection')
+    requests: RequestStatus = entry(RequestStatus, '', 'requests and their acknowledgement')
 
 
-class PendingRequest:
-    """
-    A request that is repeated until it is answered.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantStatus(NodeStatus):
+    """Status of the node `plant`."""
 
-    Parameters
-    ----------
-    topic : Topic
-        Its topic.
-    stamp : int
-        Its stamp [ns], equal in all repetitions, so that the request is executed once.
-    node : str
-        Name of the expected receiver.
-    steady : callable
-        Returns the time of a steady clock [s].
+    KIND: ClassVar[str] = 'plant'
 
-    Attributes
-    ----------
-    answer : Acknowledgement or None
-        The latest answer.
-    node : str
-        Name of the expected receiver, or of the node that has answered.
-
-    """
-
-    def __init__(
-        self, topic: Topic, stamp: int, node: str, steady: Callable[[], float] = monotonic
-    ) -> None:
-        self._topic, self._stamp, self._steady = topic.name, stamp, steady
-        self._begun, self._repeats = steady(), 0
-        self.answer: Acknowledgement | None = None
-        self.node = node
-
-    def hear(self, node: str, status: RequestStatus) -> None:
-        """Process the status of a node."""
-        answer = status.answer_to(self._topic, self._stamp)
-        if answer is not None and (self.answer is None or not self.done):
-            self.answer, self.node = answer, node
-
-    @property
-    def done(self) -> bool:
-        """Whether the request is accepted, refused, or expired."""
-        if self.answer is not None:
-            return self.answer.verdict is not Verdict.RECEIVED
-        return self._elapsed > _GIVE_UP
-
-    @property
-    def _elapsed(self) -> float:
-        return self._steady() - self._begun
-
-    def repeat(self) -> bool:
-        """Return whether the request must be sent again now."""
-        due = self._repeats < min(REPEATS, int(self._elapsed / REPEAT_AFTER))
-        if self.answer is not None or not due:
-            return False
-        self._repeats += 1
-        return True
-
-    @property
-    def outcome(self) -> tuple[bool, str]:
-        """Result of a request that is done: whether accepted, and one line for users."""
-        if self.answer is None:
-            return False, f'{self.node}: no answer to {self._topic} within {_GIVE_UP:g} s'
-        verb = self.answer.verdict.value
-        if self.answer.refused:
-            return False, f'{self.node}: {self._topic} {verb}: {self.answer.reason}'
-        return True, f'{self.node}: {self._topic} {verb}'
+    phase: PlantPhase = entry(PlantPhase.INACTIVE, '', 'phase')
+    halt: str = entry('', '', 'error that has halted the plant')
+    time: float = entry(0.0, 's', 'simulated time')
+    insertion_depth: float | None = entry(None, 'm', 'insertion depth')
+    tip: tuple[float, float] | None = entry(None, 'm', 'tip position x, z of a steered needle')
+    tip_roll: float | None = entry(None, 'rad', 'roll of the tip of a steered needle')
+    joint: Mapping[str, float] = entry(dict, 'm or rad', 'positions of guide and roll by joint')
+    force: tuple[float, float] | None = entry(None, 'N', 'force x, z of the indenter')
+    real_time_factor: float = entry(0.0, '', 'simulated time over real time, last second')
+    command_rate: float = entry(0.0, 'Hz', 'commands in the last second')
+    commanders: int = entry(0, '', 'nodes that publish commands, if more than one')
+    exhausted: bool = entry(False, '', 'whether the commands exceed the energy limit')
+    computed_later: int = entry(0, '', 'samples computed after a stall')
+    skipped: int = entry(0, '', 'samples skipped after a stall')
+    waited: float = entry(0.0, 's', 'time that the simulation has waited for the machine')
+    awaited: str = entry('', '', 'answer that has been missing for two seconds')
+    rejected: int = entry(0, '', 'rejected commands and trajectories')
+    stale: int = entry(0, '', 'stale commands')
+    superseded: int = entry(0, '', 'commands superseded by a newer one')
+    saturated: int = entry(0, '', 'sensor readings at the end of their range')
+    sensor_fault: str = entry('', '', 'simulated fault of a sensor')
+    faulty_topic: str = entry('', '', 'topic with this fault')
+    lockstep_nodes: int = entry(0, '', 'nodes in lock-step')
+    requests: RequestStatus = entry(RequestStatus, '', 'requests and their acknowledgement')
 
 
-def no_answer(service: str) -> str:
-    """Return the one-line error of a service call without a response."""
-    return f'{service}: no answer within {CALL_TIMEOUT:g} s'
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecorderStatus(NodeStatus):
+    """Status of the node `recorder`."""
+
+    KIND: ClassVar[str] = 'recorder'
+
+    path: str = entry('', '', 'bag of the recording, empty without a recording')
+    messages: int = entry(0, '', 'recorded messages')
+    size: int = entry(0, 'B', 'size of the bag')
+    recorded: Mapping[str, int] = entry(dict, '', 'recorded messages by topic')
+    lost: Mapping[str, int] = entry(dict, '', 'lost messages by topic')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayerStatus(NodeStatus):
+    """Status of the node `player`."""
+
+    KIND: ClassVar[str] = 'player'
+
+    phase: PlayerPhase = entry(PlayerPhase.INACTIVE, '', 'phase')
+    path: str = entry('', '', 'bag')
+    position: float = entry(0.0, 's', 'position in the bag')
+    rate: float = entry(0.0, '', 'speed of the playback; 1 is real time')
+    delay: float = entry(0.0, 's', 'delay of the last message')
+    largest_delay: float = entry(0.0, 's', 'largest delay so far')
+    messages: int = entry(0, '', 'published messages')
+    loops: int = entry(0, '', 'completed loops')
+    left_out: str = entry('', '', 'topics that are not played')
+    duplicate_publishers: str = entry('', '', 'topics with another publisher')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentificationStatus(NodeStatus):
+    """Status of the node `identification`."""
+
+    KIND: ClassVar[str] = 'identification'
+
+    samples: int = entry(0, '', 'processed samples of the running topics')
+    discarded: Mapping[str, int] = entry(dict, '', 'discarded samples by reason')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlicerStatus(NodeStatus):
+    """Status of the node `slicer`."""
+
+    KIND: ClassVar[str] = 'slicer'
+
+    phase: SlicerPhase = entry(SlicerPhase.INACTIVE, '', 'phase of the connection')
+    peer: str = entry('', '', 'address of the connected peer')
+    error: str = entry('', '', 'error of the connection')
+    shape_source: str = entry('', '', 'source of the shape, empty without a shape')
+    shapes: int = entry(0, '', 'transmitted shapes')
+    shape_rate: float = entry(0.0, 'Hz', 'shapes in the last second')
+    left_out: int = entry(0, '', 'messages left out for a slow peer')
+    targets: int = entry(0, '', 'published targets')
+    rejected: int = entry(0, '', 'rejected messages')
+    last_rejection: str = entry('', '', 'reason of the last rejection')
+
+
+#: Status classes by kind.
+STATUSES: Final[Mapping[str, type[NodeStatus]]] = {
+    kind.KIND: kind
+    for kind in (
+        NodeStatus,
+        PlantStatus,
+        ControllerStatus,
+        SteeringStatus,
+        RecorderStatus,
+        PlayerStatus,
+        IdentificationStatus,
+        SlicerStatus,
+    )
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis(Generic[_Reported_co]):
+    """State of a node: severity, one line for users, and the typed status."""
+
+    severity: Severity
+    message: str
+    status: _Reported_co
+
+
+def read_status(values: Mapping[str, str]) -> NodeStatus | None:
+    """Parse the status of a node from key-value pairs; None if it is not of this suite."""
+    kind = STATUSES.get(values.get(_KIND, ''))
+    return None if kind is None else kind.from_values(values)
+
+
+# Mapping to and from key-value pairs.
+
+
+def _key(prefix: str, name: str) -> str:
+    words = name.replace('_', ' ')
+    return f'{prefix} {words}' if prefix else words
+
+
+def _with_unit(key: str, unit: str) -> str:
+    return f'{key} [{unit}]' if unit else key
+
+
+def _pairs(value: Any, key: str, unit: str) -> Iterator[tuple[str, str]]:
+    """Yield the key-value pairs of a value."""
+    if value is None:
+        return
+    if isinstance(value, RequestStatus):
+        yield from value.to_values().items()
+    elif is_dataclass(value):
+        for one in fields(value):
+            part = getattr(value, one.name)
+            yield from _pairs(part, _key(key, one.name), one.metadata['unit'])
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from _pairs(part, f'{key} {name}', unit)
+    else:
+        yield _with_unit(key, unit), _text(value)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, float):
+        # Shortest text that is read as the same number.
+        return repr(float(value))
+    return ', '.join(map(_text, value)) if isinstance(value, tuple) else str(value)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _filled(kind: Any, values: Mapping[str, str], prefix: str) -> Any:
+    """Return a dataclass from key-value pairs; `_MISSING` without any pair of it."""
+    hints = _hints(kind)
+    found = {
+        one.name: _value(hints[one.name], values, _key(prefix, one.name), one.metadata['unit'])
+        for one in fields(kind)
+    }
+    found = {name: value for name, value in found.items() if value is not _MISSING}
+    return kind(**found) if found else _MISSING
+
+
+def _value(hint: Any, values: Mapping[str, str], key: str, unit: str) -> Any:
+    """Return the value of a type from key-value pairs; `_MISSING` if there is none."""
+    if get_origin(hint) is UnionType:
+        (hint,) = (one for one in get_args(hint) if one is not NoneType)
+    if hint is RequestStatus:
+        return RequestStatus.from_values(values)
+    if is_dataclass(hint):
+        return _filled(hint, values, key)
+    if get_origin(hint) is Mapping:
+        return _entries(get_args(hint)[1], values, key, unit)
+    text = values.get(_with_unit(key, unit))
+    try:
+        return _MISSING if text is None else _parsed(hint, text)
+    except ValueError:
+        return _MISSING
+
+
+def _entries(hint: Any, values: Mapping[str, str], key: str, unit: str) -> Any:
+    """Return a mapping whose names follow a key; names with nested fields have no spaces."""
+    start, end = f'{key} ', _with_unit('', unit)
+    names = [
+        name[len(start) : len(name) - len(end)]
+        for name in values
+        if name.startswith(start) and name.endswith(end)
+    ]
+    if is_dataclass(hint):
+        names = [name.partition(' ')[0] for name in names]
+    found = {name: _value(hint, values, f'{key} {name}', unit) for name in names}
+    return {name: value for name, value in found.items() if value is not _MISSING} or _MISSING
+
+
+def _parsed(hint: Any, text: str) -> Any:
+    """Parse a text as a type; raise ValueError if it is invalid."""
+    if hint is bool:
+        if text not in ('True', 'False'):
+            raise ValueError(text)
+        return text == 'True'
+    if get_origin(hint) is tuple:
+        kinds = get_args(hint)
+        return tuple(
+            _parsed(kind, part) for kind, part in zip(kinds, text.split(', '), strict=True)
+        )
+    return hint(text)

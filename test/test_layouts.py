@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ET
 
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
+from needle_ros.status import RecorderStatus
 import pytest
 from rosbags.highlevel import AnyReader
 import yaml
@@ -91,14 +92,15 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Return a bag of an insertion with the shipped parameters, recorded by the nodes."""
     folder = tmp_path_factory.mktemp('layouts')
     settings = yaml.safe_load((CONFIG / 'insertion.yaml').read_text())
-    counts: dict[str, str] = {}
+    counts: dict[str, int] = {}
     heard: list[str] = []
 
     def hear(message: DiagnosticArray) -> None:
         for status in message.status:
             heard.append(status.name)
             if status.name == '/recorder':
-                counts.update({item.key: item.value for item in status.values})
+                values = {item.key: item.value for item in status.values}
+                counts.update(RecorderStatus.from_values(values).recorded)
 
     with Graph(folder / 'logs') as graph:
         probe = graph.node('probe')
@@ -108,7 +110,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
             graph.start(node, settings[f'/**/{node}']['ros__parameters'])
         # On a fresh machine the first nodes compile, in parallel with other tests.
         graph.spin_until(
-            lambda: all(int(counts.get(topic, 0)) for topic in STREAMS), 'the streams', 400.0
+            lambda: all(counts.get(topic, 0) for topic in STREAMS), 'the streams', 400.0
         )
         # The recorder has subscribed, so further messages of the nodes are recorded.
         heard.clear()

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final, NamedTuple
 
+from needle_ros.status import InputStatus
 from needle_ros.timing import apart, NANOSECONDS, RateCounter
 
-#: Kinds of discarded messages that are harmless.
+#: Kind of accepted messages, and kinds of discarded messages that are harmless.
+ACCEPTED: Final = 'accepted'
 REPEATED: Final = 'repeated'
 DROPPED: Final = 'dropped'
 
@@ -125,7 +127,7 @@ class InputMonitor:
         refusal = self._judge(stamp, now, frame, values)
         self.window.add(now, refusal is not None and refusal.kind == DROPPED)
         if refusal is None:
-            self.counts['taken'] += 1
+            self.counts[ACCEPTED] += 1
             self.counted = now
         else:
             self.counts[refusal.kind] += 1
@@ -190,9 +192,9 @@ class InputMonitor:
         """
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
-    def describe(self, now: int) -> str:
+    def status(self, now: int) -> InputStatus:
         """
-        Return rate and counts in one line.
+        Return rate, age and counts.
 
         Parameters
         ----------
@@ -200,13 +202,12 @@ class InputMonitor:
             Time [ns].
 
         """
-        refused = {
-            kind: count
-            for kind, count in self.counts.items()
-            if kind not in ('taken', REPEATED, DROPPED)
-        }
-        return (
-            f'{self.window.rate(now):.1f} Hz; {self.counts["taken"]} taken, '
-            f'{self.counts[REPEATED]} repeated, {self.counts[DROPPED]} dropped; refused: '
-            f'{", ".join(f"{count} {kind}" for kind, count in refused.items()) or "none"}'
+        counted = (ACCEPTED, REPEATED, DROPPED)
+        return InputStatus(
+            rate=self.window.rate(now),
+            age=None if self.counted is None else self.silence(now),
+            accepted=self.counts[ACCEPTED],
+            repeated=self.counts[REPEATED],
+            out_of_order=self.counts[DROPPED],
+            rejected={kind: n for kind, n in self.counts.items() if kind not in counted},
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from needle_ros.status import LatencyStatus
 from needle_ros.timing import RateCounter
 
 #: Tolerated fraction of late commands, and tolerated number per second [Hz].
@@ -48,10 +49,6 @@ class LatencyMonitor:
             'the rate, or free the machine'
         )
 
-    def describe(self) -> dict[str, object]:
-        """Return the diagnostics of the latency."""
-        return {
-            'measurements answered': self._answered,
-            'answered too late for the delay': self._late,
-            'oldest measurement answered [s]': f'{self._oldest:.4f}',
-        }
+    def status(self) -> LatencyStatus:
+        """Return the numbers of answers, and the largest latency."""
+        return LatencyStatus(answered=self._answered, late=self._late, longest=self._oldest)

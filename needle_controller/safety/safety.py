@@ -11,6 +11,7 @@ from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import BASE
+from needle_ros.status import InputStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
 #: Topics whose absence or duplicate publishers prevent any force.
@@ -281,9 +282,9 @@ class Safety:
         )
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
-    def describe(self, now: int) -> dict[str, object]:
+    def inputs(self, now: int) -> dict[str, InputStatus]:
         """
-        Return the diagnostics of inputs, stops and saturation.
+        Return the status of each input with messages, by topic.
 
         Parameters
         ----------
@@ -291,14 +292,4 @@ class Safety:
             Time [ns].
 
         """
-        return {
-            **{
-                f'input {name}': stream.describe(now)
-                for name, stream in self.streams.items()
-                if stream.counts
-            },
-            'stop': self.stop or '',
-            'stops latched': self.stops,
-            'commands per second': f'{self.saturation.rate(now):.1f}',
-            'share of commands at their limit': f'{self.saturation.share(now):.3f}',
-        }
+        return {name: one.status(now) for name, one in self.streams.items() if one.counts}

@@ -10,7 +10,7 @@ needle moves when the guide has arrived: the path is independent of their speeds
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import Enum
+from dataclasses import replace
 from math import ceil, sqrt
 from time import monotonic
 from typing import Final
@@ -35,7 +35,9 @@ from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import ENTRY, INSERTION, JOINT_STATES, ROLL, TARGET, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.status import RequestLog, RequestStatus, Verdict
+from needle_ros.requests import RequestLog, RequestStatus, Verdict
+from needle_ros.status import SteeringPhase as Phase
+from needle_ros.status import SteeringStatus
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
@@ -75,18 +77,6 @@ _SCATTERED: Final = 3.0
 _NORMAL: Final = 1.96
 
 _NONE: Final = np.zeros(1)
-
-
-class Phase(Enum):
-    """State of the executive; the values are in the field ``phase`` of its status."""
-
-    IDLE = 'idle'
-    PLANNING = 'planning'
-    GUIDING = 'guiding'
-    INSERTING = 'inserting'
-    MEASURING = 'measuring'
-    DONE = 'done'
-    STOPPED = 'stopped'
 
 
 #: Descriptions of the phases for the user.
@@ -904,29 +894,34 @@ class SteeringExecutive:
             f'{1e3 * half[1]:.2f} mm (95 %), {1e3 * off:.2f} mm from the target'
         )
 
-    def _describe_control(self) -> tuple[dict[str, object], str]:
-        """Return values of the controller for the status, and its warning."""
-        values: dict[str, object] = {}
+    def _describe_control(self) -> tuple[SteeringStatus, str]:
+        """Return the status of the controller, and its warning."""
         control = self.control
         if control is None:
-            return values, ''
+            return SteeringStatus(), ''
         x, z = control.target.tolist()
-        values['target x, y, z [m]'] = f'{x:.6f}, {self.depth:.6f}, {z:.6f}'
         steps = len(self._depths) - 1
-        values['step'] = f'{min(control.step, steps)} of {steps}'
-        values['guide x, z [m]'] = f'{self._goal[1]:.6f}, {self._goal[2]:.6f}'
-        values['turns left'] = control.turns
-        values['chance to come within 1 mm'] = f'{control.chance:.3f}'
-        values['bending length over the believed one'] = f'{control.bending:.3f}'
+        status = SteeringStatus(
+            target=(x, self.depth, z),
+            step=min(control.step, steps),
+            steps=steps,
+            guide_setpoint=(float(self._goal[1]), float(self._goal[2])),
+            turns_left=control.turns,
+            hit_probability=control.chance,
+            bending_length_ratio=control.bending,
+        )
         if self.expected is not None:
             half = _NORMAL * np.sqrt(np.diag(self.expected.covariance))
-            for name, mean, wide in zip('xz', self.expected.mean, half, strict=True):
-                values[f'{name} expected at the target depth [m]'] = f'{mean:.6f} +- {wide:.6f}'
-        return values, control.warning if self.steers else ''
+            status = replace(
+                status,
+                expected_tip=tuple(self.expected.mean.tolist()),
+                expected_tip_half_width=tuple(half.tolist()),
+            )
+        return status, control.warning if self.steers else ''
 
-    def diagnose(self, now: int) -> tuple[Severity, str, dict[str, object]]:
+    def diagnose(self, now: int) -> tuple[Severity, str, SteeringStatus]:
         """
-        Return severity, the state in one line, and values by name.
+        Return severity, the state in one line, and status.
 
         Parameters
         ----------
@@ -934,34 +929,44 @@ class SteeringExecutive:
             Time [ns].
 
         """
-        values, warning = self._describe_control()
+        status, warning = self._describe_control()
         if self._seen is not None:
             seen, noise = self._seen, self._belief.noise
-            values['readings of the last look'] = seen.readings
-            values['standard error of the last look [m]'] = f'{seen.error:.2g}'
+            status = replace(
+                status,
+                last_measurement_readings=seen.readings,
+                last_measurement_error=seen.error,
+            )
             if not warning and seen.error > _SCATTERED * noise:
                 warning = (
                     f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
                     f'configured {1e3 * noise:.2f} mm (belief.noise)'
                 )
-        values['phase'] = self.phase.value
-        values |= self.requests.status().to_values()
-        values['inputs refused'] = self.journal.refused
-        values['last complaint'] = self.journal.complaint
-        for stream in (self._joint_stream, self._tip_stream):
-            values[f'input {stream.name}'] = stream.describe(now)
+        streams = (self._joint_stream, self._tip_stream)
+        status = replace(
+            status,
+            phase=self.phase,
+            fault=self.fault,
+            planned_fraction=None if self._job is None else self._job.fraction,
+            paused_by=self._monitor.paused if self.steers else '',
+            warning=warning,
+            input={stream.name: stream.status(now) for stream in streams},
+            rejected=self.journal.rejected,
+            last_rejection=self.journal.last_rejection,
+            requests=self.requests.status(),
+        )
         if self.phase is Phase.STOPPED:
-            return Severity.ERROR, f'stopped: {self.fault}', values
+            return Severity.ERROR, f'stopped: {self.fault}', status
         if warning:
-            return Severity.WARNING, warning, values
+            return Severity.WARNING, warning, status
         if self.phase is Phase.DONE:
-            return Severity.INFO, f'done: {self._outcome()}', values
+            return Severity.INFO, f'done: {self._outcome()}', status
         state = _DESCRIPTIONS[self.phase]
         if self._job is not None:
             state = f'{state}: {self._job.fraction:.0%}'
         elif self.steers and self._monitor.paused:
             state = f'{state}; {self._monitor.paused} is paused'
-        return Severity.INFO, state, values
+        return Severity.INFO, state, status
 
 
 def _words(point: tuple[float, float, float]) -> str:

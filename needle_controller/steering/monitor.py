@@ -9,7 +9,7 @@ from typing import Final
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_ros.contract import JOINT_TRAJECTORY
-from needle_ros.status import Acknowledgement, REPEAT_AFTER, REPEATS, RequestStatus, Verdict
+from needle_ros.requests import Acknowledgement, REPEAT_AFTER, REPEATS, RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 

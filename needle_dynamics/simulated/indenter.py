@@ -16,6 +16,7 @@ from needle_dynamics.simulated.plant import AT_REST
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, Topic
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant
+from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
@@ -157,11 +158,10 @@ class Indenter:
         self._count = 0
 
     @property
-    def report(self) -> dict[str, object]:
-        """Forces for the diagnostics."""
-        return {
-            f'force {axis} [N]': f'{f:.3f}' for axis, f in zip(JOINTS, self._force, strict=True)
-        }
+    def report(self) -> PlantStatus:
+        """Status with the forces only."""
+        x, z = self._force
+        return PlantStatus(force=(x, z))
 
     def follow(
         self,

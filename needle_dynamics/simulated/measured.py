@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.contract import Topic
+from needle_ros.status import PlantStatus
 import numpy as np
 
 #: Measurement for one topic: topic name, sample intervals since the time of the stamp, and values
@@ -65,8 +66,8 @@ class SimulatedPlant(Protocol):
         """Insertion depth [m]."""
 
     @property
-    def report(self) -> dict[str, object]:
-        """State for the diagnostics."""
+    def report(self) -> PlantStatus:
+        """Status with the state of the simulation only."""
 
     def follow(
         self,

@@ -25,6 +25,7 @@ from needle_ros.contract import (
     Topic,
 )
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.status import PlantStatus
 from needle_ros.trajectories import joint_values
 import numpy as np
 
@@ -132,9 +133,9 @@ class Plant:
         return self.integrator.depth
 
     @property
-    def report(self) -> dict[str, object]:
-        """Needle state for the diagnostics."""
-        return {'inserted length [m]': f'{self.integrator.depth:.6f}'}
+    def report(self) -> PlantStatus:
+        """Status with the state of the needle only."""
+        return PlantStatus(insertion_depth=self.integrator.depth)
 
     def follow(
         self,

@@ -28,6 +28,7 @@ from needle_ros.contract import (
 )
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant
+from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
@@ -120,18 +121,10 @@ class SteeredPlant:
         return self.insertion.depth
 
     @property
-    def report(self) -> dict[str, object]:
-        """Needle state for the diagnostics."""
+    def report(self) -> PlantStatus:
+        """Status with the state of needle and guide only."""
         x, y, z, roll = self._tip
-        return {
-            'inserted length [m]': f'{y:.6f}',
-            'tip x, z [m]': f'{x:.6f}, {z:.6f}',
-            'roll of the tip [rad]': f'{roll:.4f}',
-            **{
-                f'{joint.name} [{joint.unit}]': f'{self._at[joint.name]:.6f}'
-                for joint in STEERING_JOINTS
-            },
-        }
+        return PlantStatus(insertion_depth=y, tip=(x, z), tip_roll=roll, joint=dict(self._at))
 
     def follow(
         self,

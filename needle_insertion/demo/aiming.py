@@ -10,7 +10,6 @@ from typing import Final
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from matplotlib.figure import Figure
-from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.demo.bending import read_needles
@@ -25,6 +24,7 @@ from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
+from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
 
@@ -111,7 +111,7 @@ def record_aimed(
             if waiting and sample.time >= WARM_UP:
                 waiting = False
                 aim(target_message(sample.stamp, TARGET))
-            if steered and end == inf and _is_done(run.values.get('steering', {}), sample.time):
+            if steered and end == inf and _is_done(run.statuses.get('steering'), sample.time):
                 # Stamp of the last tip measurement; time since the first sample.
                 last = nanoseconds(expected.message.header.stamp)
                 end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
@@ -125,16 +125,20 @@ def record_aimed(
         run.record(bag, nodes, act)
 
 
-def _is_done(values: Mapping[str, str], time: float) -> bool:
+def _is_done(status: NodeStatus | None, time: float) -> bool:
     """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
-    phase = values.get('phase')
-    if phase == Phase.STOPPED.value:
-        raise GraphError(f'steering {values[""]}')
+    phase, rejection = SteeringPhase.INACTIVE, ''
+    if isinstance(status, SteeringStatus):
+        phase, rejection = status.phase, status.last_rejection
+        if phase is SteeringPhase.STOPPED:
+            raise GraphError(f'steering stopped: {status.fault}')
     if time > _LONGEST:
-        raise GraphError(f'steering is not at the target depth after {_LONGEST:g} s: {phase}')
-    if phase == Phase.IDLE.value and time > WARM_UP + _ANSWER:
-        raise GraphError(f'steering: {values["last complaint"]}')
-    return phase == Phase.DONE.value
+        raise GraphError(
+            f'steering is not at the target depth after {_LONGEST:g} s: {phase.value}'
+        )
+    if phase is SteeringPhase.IDLE and time > WARM_UP + _ANSWER:
+        raise GraphError(f'steering: {rejection}')
+    return phase is SteeringPhase.DONE
 
 
 @dataclass(frozen=True, eq=False)

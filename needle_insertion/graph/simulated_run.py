@@ -15,6 +15,7 @@ from needle_insertion.progress import Show
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, profile, SENSOR
 from needle_ros.contract import ENTRY
+from needle_ros.status import NodeStatus, PlantStatus, read_status
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader
 from rclpy.duration import Duration
@@ -22,9 +23,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
-
-#: Key on /diagnostics of a plant: number of nodes in lock-step.
-IN_LOCKSTEP: Final = 'nodes in lock-step'
 
 #: Time before the target is sent, until all sensors have reported [s].
 WARM_UP: Final = 0.1
@@ -120,8 +118,9 @@ class SimulatedRun:
     def __init__(self, graph: Graph, show: Show, *, lockstep: bool = True) -> None:
         self._graph, self._show, self._lockstep = graph, show, lockstep
         self.node = node = graph.node('demo')
-        #: Latest values of each node on /diagnostics by its name; key of its message: empty.
-        self.values: dict[str, dict[str, str]] = {}
+        #: Latest status and message of each node by its name.
+        self.statuses: dict[str, NodeStatus] = {}
+        self._messages: dict[str, str] = {}
         node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, self._hear, 10)
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
@@ -154,13 +153,14 @@ class SimulatedRun:
         self._show('starting plant')
         graph.change(node, 'plant', CONFIGURE)
         # The bag must contain every sample, and lock-step must include all nodes.
-        participants = str(self._lockstep * (2 + ('steering' in nodes)))
+        participants = self._lockstep * (2 + ('steering' in nodes))
+
+        def in_lockstep() -> bool:
+            plant = self.statuses.get('plant')
+            return isinstance(plant, PlantStatus) and plant.lockstep_nodes == participants
+
         graph.spin_until(
-            lambda: (
-                witness.is_matched
-                and self._is_recorded()
-                and self.values.get('plant', {}).get(IN_LOCKSTEP) == participants
-            ),
+            lambda: witness.is_matched and self._is_recorded() and in_lockstep(),
             'the recorder and the nodes in lock-step',
         )
         graph.change(node, 'plant', ACTIVATE)
@@ -176,7 +176,7 @@ class SimulatedRun:
 
     def _show_start(self, name: str) -> None:
         """Show the starting node and its status."""
-        said = self.values.get(name, {}).get('', '')
+        said = self._messages.get(name, '')
         self._show(f'starting {name}' + (f': {said}' if said else ''))
 
     def _is_recorded(self) -> bool:
@@ -190,5 +190,8 @@ class SimulatedRun:
 
     def _hear(self, array: DiagnosticArray) -> None:
         for status in array.status:
-            values = {one.key: one.value for one in status.values}
-            self.values[status.name.rpartition('/')[2]] = {**values, '': status.message}
+            name = status.name.rpartition('/')[2]
+            self._messages[name] = status.message
+            found = read_status({one.key: one.value for one in status.values})
+            if found is not None:
+                self.statuses[name] = found

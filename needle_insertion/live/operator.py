@@ -14,7 +14,8 @@ from needle_ros.base_node import profile
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
-from needle_ros.status import no_answer, PendingRequest, RequestStatus
+from needle_ros.requests import no_answer, PendingRequest, RequestStatus
+from needle_ros.status import NodeStatus, read_status
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
@@ -38,7 +39,10 @@ class State(NamedTuple):
     #: 0 OK, 1 warning, 2 error.
     level: int
     message: str
-    values: dict[str, str]
+    #: Typed status of a node of the suite.
+    status: NodeStatus | None
+    #: Requests that the node accepts, and its answers.
+    requests: RequestStatus
     #: Time of receipt by `time.monotonic` [s].
     heard: float
 
@@ -46,11 +50,6 @@ class State(NamedTuple):
     def age(self) -> float:
         """Time since receipt [s]; the node publishes every second."""
         return monotonic() - self.heard
-
-    @property
-    def requests(self) -> RequestStatus:
-        """Requests that the node accepts, and its answers."""
-        return RequestStatus.from_values(self.values)
 
 
 class RequestOutcome(NamedTuple):
@@ -102,11 +101,13 @@ class Operator:
     def _hear(self, array: DiagnosticArray) -> None:
         for status in array.status:
             name = printable(status.name.rpartition('/')[2])
+            values = {printable(one.key): printable(one.value) for one in status.values}
             self.states[name] = state = State(
                 # rclpy represents a byte as bytes.
                 int.from_bytes(status.level, 'little'),
                 printable(status.message),
-                {printable(one.key): printable(one.value) for one in status.values},
+                read_status(values),
+                RequestStatus.from_values(values),
                 monotonic(),
             )
             for pending, _ in self._sending:

@@ -68,13 +68,13 @@ class Readings:
         reading = self.newest(contract.JOINT_STATES)
         return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
-    def reference_rests_at(self, target: tuple[float, ...]) -> bool:
-        """Return whether the reference rests at a target depth [m]; False without target."""
+    def reference_rests_at(self, target: float) -> bool:
+        """Return whether the reference rests at a target depth [m]."""
         reference = self.insertion(contract.REFERENCE)
-        if reference is None or not target:
+        if reference is None:
             return False
         depth, velocity = reference
-        return abs(depth - target[0]) < _SAME and abs(velocity) < _SAME
+        return abs(depth - target) < _SAME and abs(velocity) < _SAME
 
     def line(self) -> str:
         """Return depth, velocity, force and tip deflection as one line of text."""

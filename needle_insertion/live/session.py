@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.graph.simulated_run import IN_LOCKSTEP, RunSample, WARM_UP, Witness
+from needle_insertion.graph.simulated_run import RunSample, WARM_UP, Witness
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
@@ -21,6 +21,7 @@ from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
+from needle_ros.status import PlantStatus
 from rclpy.node import Node
 
 #: Folder of the parameter files, below the prefix of pip or colcon.
@@ -180,7 +181,8 @@ def _begin_plant(graph: Graph, node: Node, operator: Operator, number: int) -> N
 
     def found() -> bool:
         state = operator.states.get('plant')
-        return state is not None and state.values.get(IN_LOCKSTEP) == str(number)
+        status = None if state is None else state.status
+        return isinstance(status, PlantStatus) and status.lockstep_nodes == number
 
     graph.spin_until(found, 'the nodes in lock-step')
     graph.change(node, 'plant', ACTIVATE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from math import inf, isfinite
 import re
 import shlex
@@ -11,7 +10,6 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from needle_controller import LAWS
-from needle_controller.steering.executive import Phase
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator, RequestOutcome, State
 from needle_insertion.live.readings import Readings
@@ -20,6 +18,7 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.status import ControllerStatus, SteeringPhase, SteeringStatus
 from rclpy.task import Future
 import yaml
 
@@ -49,7 +48,7 @@ _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
 _ERROR: Final = _LEVELS.index('ERROR')
 
 #: Phases in which no insertion is under way.
-_AT_REST: Final = (Phase.IDLE.value, Phase.DONE.value)
+_AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE)
 
 
 class _Word(NamedTuple):
@@ -219,15 +218,16 @@ class Terminal:
             now = self._readings.time
             self._screen.show(self._readings.line())
             state = self._state(STEERING if self._steers else CONTROLLER)
+            status = state.status
             if state.level >= _ERROR:
                 raise JobError(state.message)
             if now - begin > longest:
                 raise JobError(f'target not reached after {longest:g} s: {self._readings.line()}')
             if self._steers:
-                return state.values.get('phase') in _AT_REST
-            if not _aim(state):
+                return isinstance(status, SteeringStatus) and status.phase in _AT_REST
+            if not isinstance(status, ControllerStatus) or status.target is None:
                 raise JobError('there is no target to wait for')
-            rests = self._readings.reference_rests_at(_aim(state))
+            rests = self._readings.reference_rests_at(status.target)
             arrived = min(arrived, now) if rests else inf
             return now > arrived + _SETTLING
 
@@ -293,14 +293,8 @@ def _length(word: str) -> float:
 
 
 def _sees(state: State, topic: str) -> bool:
-    """Return whether a node has received a measurement."""
-    return ' 0 taken' not in state.values.get(f'input {topic}', ' 0 taken')
-
-
-def _aim(state: State) -> tuple[float, ...]:
-    """Return the target of a node [m]: a depth, or a point; empty without a target."""
-    for name, text in state.values.items():
-        if name in ('target [m]', 'target x, y, z [m]'):
-            with suppress(ValueError):
-                return tuple(map(float, text.split(',')))
-    return ()
+    """Return whether a node has accepted a measurement."""
+    status = state.status
+    if not isinstance(status, (ControllerStatus, SteeringStatus)):
+        return False
+    return topic in status.input and status.input[topic].accepted > 0

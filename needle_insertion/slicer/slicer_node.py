@@ -8,7 +8,7 @@ import sys
 from time import monotonic
 from typing import Any, Final, TYPE_CHECKING
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.needle import NeedleView, Shape
@@ -19,8 +19,9 @@ from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.publishers_node import request_stamp
+from needle_ros.requests import PendingRequest, RequestStatus
 from needle_ros.run_node import run
-from needle_ros.status import PendingRequest, RequestStatus
+from needle_ros.status import Diagnosis, SlicerPhase, SlicerStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
 from rclpy.clock import Clock
@@ -308,25 +309,31 @@ class SlicerNode(BaseNode):
     def _steady_ns(self) -> int:
         return int(monotonic() * NANOSECONDS)
 
-    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+    def diagnose(self) -> Diagnosis[SlicerStatus]:
         """Report the connection, the transmitted shapes and the received targets."""
         link = self._link
         if link is None or not self.is_active:
-            return super().diagnose()
+            return Diagnosis(Severity.INFO, self.state, SlicerStatus())
         source = self._source or (
             f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
             f'{contract.TIP_DEFLECTION.name} received'
         )
-        values: dict[str, object] = {
-            'shapes sent': self._shapes,
-            'shapes per second [Hz]': f'{self._rate.rate(self._steady_ns()):.1f}',
-            'messages left out for a slow peer': link.left_out,
-            'targets passed on': self._targets,
-            'refused': self._journal.refused,
-            'refused last': self._journal.complaint,
-        }
-        level = DiagnosticStatus.ERROR if link.complaint else DiagnosticStatus.OK
-        return level, f'{link.state}; shape: {source}', values
+        broken = SlicerPhase.ERROR if link.complaint else SlicerPhase.WAITING
+        phase = SlicerPhase.CONNECTED if link.peer else broken
+        status = SlicerStatus(
+            phase=phase,
+            peer=link.peer,
+            error=link.complaint,
+            shape_source=self._source,
+            shapes=self._shapes,
+            shape_rate=self._rate.rate(self._steady_ns()),
+            left_out=link.left_out,
+            targets=self._targets,
+            rejected=self._journal.rejected,
+            last_rejection=self._journal.last_rejection,
+        )
+        severity = Severity.ERROR if link.complaint else Severity.INFO
+        return Diagnosis(severity, f'{link.state}; shape: {source}', status)
 
 
 def _quaternion(orientation: Any) -> list[float]:

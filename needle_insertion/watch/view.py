@@ -10,6 +10,7 @@ from needle_dynamics import FloatArray
 from needle_insertion.watch.scene import scene
 from needle_ros import contract
 from needle_ros.errors import printable
+from needle_ros.status import ControllerStatus, NodeStatus, read_status, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -32,13 +33,6 @@ _NODES: Final = 64
 
 #: Half width of a 95 % interval, in standard deviations.
 _NORMAL: Final = 1.96
-
-#: Keys of /diagnostics for the target of a node.
-_AIM: Final = 'target x, y, z [m]'
-_DEPTH: Final = 'target [m]'
-
-#: Keys of /diagnostics that are shown in addition to the message.
-_SHOWN: Final = ('step', 'chance to come within 1 mm', 'last complaint')
 
 
 def number(value: float | None) -> float | None:
@@ -85,7 +79,7 @@ class View:
         self._lines: dict[str, tuple[float, list[list[float]]]] = {}
         self._expected: dict[str, Any] | None = None
         self._configurations: dict[str, dict[str, Any]] = {}
-        self._nodes: dict[str, tuple[float, Any]] = {}
+        self._nodes: dict[str, tuple[float, Any, NodeStatus | None]] = {}
 
     # Input.
 
@@ -123,7 +117,8 @@ class View:
     def status(self, status: Any, now: float) -> None:
         """Store the status of a node at a time [s]."""
         if status.name in self._nodes or len(self._nodes) < _NODES:
-            self._nodes[status.name] = now, status
+            values = {pair.key: pair.value for pair in status.values}
+            self._nodes[status.name] = now, status, read_status(values)
 
     # Output.
 
@@ -150,6 +145,7 @@ class View:
             'roll': joints.get(contract.ROLL, _NOTHING)[0],
             'target': self._target(),
             'expected': self._expected,
+            'hit_probability': self._hit_probability(),
             **self._shape(depth, tip, guide, now),
             'silent': self._silent(now),
             'nodes': self._told(now),
@@ -173,18 +169,21 @@ class View:
 
     def _target(self) -> list[float | None] | None:
         """Return the target x, y, z [m]; x and z are None for a depth target."""
-        told = [{pair.key: pair.value for pair in one.values} for _, one in self._nodes.values()]
-        aims = [values[_AIM] for values in told if _AIM in values]
-        depths = [values[_DEPTH] for values in told if _DEPTH in values]
-        try:
-            if aims:
-                return [number(float(part)) for part in aims[0].split(',')][:3]
-            if depths and not self.scene['steered']:
-                return None if depths[0] == 'None' else [None, number(float(depths[0])), None]
-        except ValueError:
-            return None
+        statuses = [status for _, _, status in self._nodes.values()]
+        for status in statuses:
+            if isinstance(status, SteeringStatus) and status.target is not None:
+                return [number(part) for part in status.target]
+        for status in () if self.scene['steered'] else statuses:
+            if isinstance(status, ControllerStatus) and status.target is not None:
+                return [None, number(status.target), None]
         # Target for a controller of another package.
-        return self._vector(contract.TARGET.name) if not told else None
+        return self._vector(contract.TARGET.name) if not statuses else None
+
+    def _hit_probability(self) -> float | None:
+        """Return the hit probability of the steered insertion."""
+        statuses = [status for _, _, status in self._nodes.values()]
+        found = [one.hit_probability for one in statuses if isinstance(one, SteeringStatus)]
+        return next((number(one) for one in found if one is not None), None)
 
     def _shape(
         self,
@@ -223,9 +222,9 @@ class View:
     def _told(self, now: float) -> list[dict[str, Any]]:
         """Return the status of each node, sorted by level, the worst first."""
         nodes = []
-        for name, (came, status) in self._nodes.items():
+        for name, (came, status, typed) in self._nodes.items():
             level = status.level
-            values = {pair.key: pair.value for pair in status.values}
+            rejection = getattr(typed, 'last_rejection', '')
             age = max(0.0, now - came)
             nodes.append(
                 {
@@ -234,10 +233,18 @@ class View:
                     'words': printable(status.message),
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
-                    'values': {key: printable(values[key]) for key in _SHOWN if values.get(key)},
+                    'last_rejection': printable(rejection),
+                    **_progress(typed),
                 }
             )
         return sorted(nodes, key=lambda node: (-node['level'], node['name']))
+
+
+def _progress(status: NodeStatus | None) -> dict[str, int]:
+    """Return completed and all steps of a steered insertion; empty for other nodes."""
+    if not isinstance(status, SteeringStatus) or not status.steps:
+        return {}
+    return {'step': status.step, 'steps': status.steps}
 
 
 def row(frame: Mapping[str, Any]) -> list[float | None]:

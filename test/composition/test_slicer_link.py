@@ -146,7 +146,7 @@ def test_other_protocol_closes_connection(
         visitor(desk, stack).sendall(words)
         desk.until(lambda: not desk.link.peer, 'the end')
     assert sum(line in said for said in desk.lines) == 1
-    assert desk.journal.refused == 5
+    assert desk.journal.rejected == 5
     assert '\n' not in ''.join(desk.lines)
 
 

@@ -30,6 +30,7 @@ from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
 from needle_insertion.watch.view import row, View
 from needle_ros import contract
 from needle_ros.errors import JobError, MessageError, ParameterError
+from needle_ros.status import ControllerStatus, SteeringStatus
 from needle_ros.wire import read_line, Reading
 import numpy as np
 import pytest
@@ -161,10 +162,13 @@ def test_nodes_are_sorted_by_level() -> None:
     view.status(status('/a', 'active'), 0.0)
     view.status(status('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
     view.status(status('/c', 'active'), 0.0)
-    view.status(status('/c', 'stopped', {'step': '3 of 20'}, level=2), 1.0)
+    stopped = SteeringStatus(step=3, steps=20, hit_probability=0.25, last_rejection='a\nb')
+    view.status(status('/c', 'stopped', stopped, level=2), 1.0)
     nodes = view.frame(1.0)['nodes']
     assert [(one['name'], one['level']) for one in nodes] == [('/c', 2), ('/b', 1), ('/a', 0)]
-    assert nodes[0]['values'] == {'step': '3 of 20'}
+    assert [nodes[0][key] for key in ('step', 'steps', 'last_rejection')] == [3, 20, 'a b']
+    assert nodes[1]['last_rejection'] == ''
+    assert view.frame(1.0)['hit_probability'] == 0.25
     assert nodes[1]['words'] == 'no joint_states?[2J'
 
 
@@ -173,16 +177,15 @@ def test_target_is_accepted_target_of_diagnostics() -> None:
     view = View()
     view.reading('target', numbers(1e-3, 0.2, 0.0), 0.0)
     assert view.frame(0.0)['target'] == [1e-3, 0.2, 0.0]
-    view.status(status('/controller', 'active', {'target [m]': 'None'}), 0.0)
+    view.status(status('/controller', 'active', ControllerStatus()), 0.0)
     assert view.frame(0.0)['target'] is None
-    view.status(status('/controller', 'active', {'target [m]': '0.08'}), 0.0)
+    view.status(status('/controller', 'active', ControllerStatus(target=0.08)), 0.0)
     assert view.frame(0.0)['target'] == [None, 0.08, None]
     told(view, 'steering')
     assert view.frame(0.0)['target'] is None
-    aim = {'target x, y, z [m]': '0.004, 0.1, -0.002'}
-    view.status(status('/steering', 'inserts', aim), 0.0)
+    view.status(status('/steering', 'inserts', SteeringStatus(target=TARGET)), 0.0)
     assert view.frame(0.0)['target'] == list(TARGET)
-    view.status(status('/steering', 'inserts', {'target x, y, z [m]': 'none'}), 0.0)
+    view.status(status('/steering', 'waits', SteeringStatus()), 0.0)
     assert view.frame(0.0)['target'] is None
 
 

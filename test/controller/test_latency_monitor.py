@@ -24,9 +24,8 @@ def test_more_than_five_percent_late_commands_give_a_warning(
     warning = lateness.warning(now)
     share = f'{late / rate:.0%} of the commands are too late for delay 1: raise it'
     assert (warning is not None and warning.startswith(share)) == said
-    values = lateness.describe()
-    assert values['measurements answered'] == 2 * rate + 1
-    assert values['answered too late for the delay'] == 2 * late + 1
+    status = lateness.status()
+    assert (status.answered, status.late) == (2 * rate + 1, 2 * late + 1)
     # A second without commands ends the warning.
     lateness.add(now + 1 * NANOSECONDS, 0.0)
     lateness.add(now + 2 * NANOSECONDS, 0.0)

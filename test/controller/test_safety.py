@@ -53,7 +53,7 @@ def test_stale_future_and_missing_stamps_are_rejected(
     refusal = wrench.check(stamp, 10 * SECOND)
     assert (refusal.kind if refusal else None) == kind
     assert words in (refusal.line if refusal else '')
-    assert wrench.counts[kind or 'taken'] == 1
+    assert wrench.counts[kind or 'accepted'] == 1
 
 
 def test_zero_stamps_are_valid_at_time_zero() -> None:
@@ -73,7 +73,9 @@ def test_repeated_and_out_of_order_messages_are_discarded() -> None:
     # A clock that was set back restarts the stream.
     wrench.forget()
     assert wrench.check(5 * SECOND, 5 * SECOND) is None
-    assert '5 taken, 1 repeated, 1 dropped; refused: none' in wrench.describe(5 * SECOND)
+    status = wrench.status(5 * SECOND)
+    assert (status.accepted, status.repeated, status.out_of_order) == (5, 1, 1)
+    assert (status.rejected, status.age) == ({}, 0.0)
 
 
 def test_wrong_frames_and_non_finite_values_are_rejected() -> None:
@@ -85,7 +87,7 @@ def test_wrong_frames_and_non_finite_values_are_rejected() -> None:
     for i, value in enumerate((nan, inf, -inf)):
         assert wrench.check(now + i + 1, now, 'needle_base', [0.0, value]).kind == 'not finite'
     assert wrench.check(now + 9, now, 'needle_base', [0.0, 1.0]) is None
-    assert wrench.describe(now).endswith('refused: 1 frame, 3 not finite')
+    assert wrench.status(now).rejected == {'frame': 1, 'not finite': 3}
 
 
 def feed(watched: InputMonitor, readings: list[Any]) -> list[str]:

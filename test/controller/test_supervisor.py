@@ -337,7 +337,7 @@ def test_inactive_supervisor_accepts_only_the_stop() -> None:
     assert supervisor.emergency_stop(SECOND).answer == ForceCommand(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
-    assert supervisor.journal.complaint == 'target rejected: the controller is not active'
+    assert supervisor.journal.last_rejection == 'target rejected: the controller is not active'
     assert supervisor.pause(True).message == 'pause refused: the controller is not active'
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
@@ -415,7 +415,7 @@ def test_many_rejected_targets_give_one_log_line_per_second() -> None:
         loop.supervisor.target(0, '', 9.0, 0.0, loop.now)
         changes += loop.supervisor.journal.changed
         loop.supervisor.journal.take()
-    assert loop.supervisor.journal.refused == 1000
+    assert loop.supervisor.journal.rejected == 1000
     assert changes == 1
 
 

@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from needle_controller import LAWS
 from needle_controller.reference.generator import REFERENCES
-from needle_controller.steering.executive import Phase
 from needle_dynamics.compiled.store import SUFFIX
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
+from needle_ros.status import SteeringPhase, SteeringStatus
 import pytest
 from rclpy.node import Node
 from rclpy.task import Future
@@ -193,9 +193,13 @@ def test_steering_preloads_an_insertion(
     one = rig(**nodes)
 
     one.send(1e-3, 0.031, -1e-3)
-    ends = (Phase.DONE.value, Phase.STOPPED.value)
-    states = one.operator.states
-    one.until(lambda: states['steering'].values.get('phase') in ends, 'the end of the insertion')
+
+    def ended() -> bool:
+        status = one.operator.states['steering'].status
+        ends = (SteeringPhase.DONE, SteeringPhase.STOPPED)
+        return isinstance(status, SteeringStatus) and status.phase in ends
+
+    one.until(ended, 'the end of the insertion')
 
 
 def test_nodes_respond_while_they_compile(ros_graph: RosGraph, tmp_path: Path) -> None:

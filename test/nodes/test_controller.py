@@ -7,12 +7,14 @@ from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.compiled.laws import INTEGRAL
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.event_log import Severity
+from needle_ros.status import ControllerPhase, ControllerStatus, InputStatus
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -23,7 +25,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from std_srvs.srv._set_bool import SetBool_Request, SetBool_Response
 from std_srvs.srv._trigger import Trigger_Request, Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Both nodes in the thread of the test.
@@ -101,11 +103,16 @@ class Bench:
 
     def said(self) -> str:
         """Return the first diagnostics message."""
-        return self.controller.diagnose()[1]
+        return self.controller.diagnose().message
 
-    def value(self, key: str) -> str:
-        """Return one value of the diagnostics."""
-        return str(self.controller.diagnose()[2].get(key, ''))
+    @property
+    def status(self) -> ControllerStatus:
+        """Latest status of the controller."""
+        return self.controller.diagnose().status
+
+    def input(self, topic: str) -> InputStatus:
+        """Return the status of an input."""
+        return self.status.input.get(topic, InputStatus())
 
     def wrench(
         self,
@@ -138,7 +145,7 @@ class Bench:
         message = PointStamped()
         message.point.y, message.point.z = depth, deflection
         self.target.publish(message)
-        self.graph.spin_until(lambda: self.controller.diagnose()[2]['target [m]'], 'the target')
+        self.graph.spin_until(lambda: self.controller.diagnose().status.target, 'the target')
 
     def push(self) -> float:
         """Publish measurements until the reference moves and a force is commanded."""
@@ -177,7 +184,7 @@ def test_zero_force_after_the_measurement_timeout(ros_graph: RosGraph) -> None:
     bench.aim(0.1)
     assert bench.push() > 0.5
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
-    assert 'stale' in bench.controller.diagnose()[1]
+    assert 'stale' in bench.status.fault
 
 
 @pytest.mark.parametrize(
@@ -197,7 +204,7 @@ def test_zero_force_for_invalid_measurements(ros_graph: RosGraph, message: Joint
     message.header.stamp = bench.node.get_clock().now().to_msg()
     bench.states.publish(message)
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
-    assert 'joint_states' in bench.controller.diagnose()[1]
+    assert 'joint_states' in bench.status.fault
 
 
 def test_emergency_stop_latches(ros_graph: RosGraph) -> None:
@@ -222,7 +229,7 @@ def test_target_out_of_range_is_rejected(ros_graph: RosGraph) -> None:
         bench.target.publish(message)
     bench.aim(0.05)
     ros_graph.spin_until(
-        lambda: bench.controller.diagnose()[2]['target [m]'] == 0.05, 'the next good target'
+        lambda: bench.controller.diagnose().status.target == 0.05, 'the next good target'
     )
 
 
@@ -265,7 +272,7 @@ def test_zero_force_for_stale_future_and_missing_stamps(
         message.header.stamp = moment.to_msg()
     bench.states.publish(message)
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
-    assert 'stale' in bench.controller.diagnose()[1]
+    assert 'stale' in bench.status.fault
     # Valid measurements are answered again.
     assert bench.push() > 0.5
 
@@ -279,7 +286,7 @@ def test_target_is_discarded_if_the_needle_moved_during_a_fault(
     assert bench.push() > 0.5
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
     assert [bench.measure(0.05) for _ in range(5)] == [0.0] * 5
-    assert bench.controller.diagnose()[2]['target [m]'] is None
+    assert bench.controller.diagnose().status.target is None
 
 
 def test_repeated_configure_does_not_duplicate_subscriptions(ros_graph: RosGraph) -> None:
@@ -360,7 +367,7 @@ class Loop:
         message = PointStamped()
         message.point.y = depth
         self.targets.publish(message)
-        self.until(lambda: self.said('target [m]') == depth, 'the target')
+        self.until(lambda: self.status.target == depth, 'the target')
 
     def call(
         self,
@@ -374,8 +381,10 @@ class Loop:
         self.until(answer.done, name)
         return answer.result()
 
-    def said(self, key: str) -> Any:
-        return self.node.diagnose()[2][key]
+    @property
+    def status(self) -> ControllerStatus:
+        """Latest status of the controller."""
+        return self.node.diagnose().status
 
     def speed(self) -> float:
         return self.aims[-1].velocity[0]
@@ -404,7 +413,7 @@ def test_pause_resume_and_retract(ros_graph: RosGraph) -> None:
     count = len(loop.aims)
     loop.until(lambda: len(loop.aims) > count + 40, 'a while')
     assert {m.position[0] for m in loop.aims[count:]} == {held}
-    assert loop.said('paused') is True
+    assert loop.status.requests.paused
     assert loop.call(SetBool, 'pause', SetBool.Request(data=False)).success
     loop.until(lambda: loop.speed() > 0.0, 'motion')
     assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting to 0.019 m'
@@ -426,8 +435,8 @@ def test_trajectory_is_followed(ros_graph: RosGraph) -> None:
     loop.until(lambda: loop.aims[-1].position[0] == 0.022, 'the end')
     assert max(m.position[0] for m in loop.aims) > 0.0235
     loop.until(lambda: abs(loop.states[-1].position[0] - 0.022) < 1e-4, 'the needle')
-    assert loop.said('inputs refused') == 0
-    assert loop.plant.diagnose()[2]['commands refused'] == 0
+    assert loop.status.rejected == 0
+    assert loop.plant.diagnose().status.rejected == 0
 
 
 @pytest.mark.parametrize(
@@ -449,9 +458,8 @@ def test_infeasible_trajectory_is_rejected(
     paths = bench.node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
     ros_graph.spin_until(paths.get_subscription_count, 'discovery')
     paths.publish(message)
-    said = bench.controller.diagnose
-    ros_graph.spin_until(lambda: said()[2]['inputs refused'] == 1, 'the refusal')
-    assert reason in said()[2]['last complaint']
+    ros_graph.spin_until(lambda: bench.status.rejected == 1, 'the rejection')
+    assert reason in bench.status.last_rejection
     assert bench.measure(0.02) == 0.0
 
 
@@ -468,7 +476,7 @@ def test_bumpless_transfer_of_law_and_gains(ros_graph: RosGraph) -> None:
         forces = [m.wrench.force.y for m in loop.forces[count - 1 :]]
         # 3.6 N; the handover decays by 5 % of its value in a period of 5 ms.
         assert max(abs(b - a) for a, b in pairwise(forces)) < 0.05 * forces[0]
-    assert loop.said('law') == 'inverse_dynamics'
+    assert loop.status.law == 'inverse_dynamics'
 
 
 @pytest.mark.parametrize(
@@ -490,7 +498,7 @@ def test_invalid_gains_are_rejected_while_active(
     assert not answer.successful
     assert reason in answer.reason
     assert node.get_parameter(name).value == before
-    assert reason in node.diagnose()[2]['last complaint']
+    assert reason in node.diagnose().status.last_rejection
 
 
 def test_zero_force_after_a_position_jump(ros_graph: RosGraph) -> None:
@@ -499,7 +507,7 @@ def test_zero_force_after_a_position_jump(ros_graph: RosGraph) -> None:
     bench.aim(0.1)
     assert bench.push() > 0.5
     assert bench.measure(0.025) == 0.0
-    assert 'insertion moved by' in bench.controller.diagnose()[1]
+    assert 'insertion moved by' in bench.status.fault
     assert bench.controller.get_parameter('jump').value < 5e-3
 
 
@@ -514,12 +522,14 @@ def test_observer_estimates_the_tip(ros_graph: RosGraph) -> None:
     )  # fmt: skip
     node = ros_graph.add(ControllerNode, parameters={**SLOW, 'observer.tip_exposure': 0.02})
     ros_graph.spin_until(lambda: len(tips) > 25, 'tips')
-    said = node.diagnose()[2]
-    estimate, _, spread = str(said['tip deflection [m]']).split()
+    observed = node.diagnose().status.observer
+    assert observed is not None
     # The needle oscillates to rest; three standard deviations, of estimate and last measurement.
-    assert abs(float(estimate) - tips[-1].point.z) < 3.0 * (float(spread) + 1e-4) + 5e-4
-    assert 'in [' in said['observer consistency (NIS)']
-    assert said['observer restarts'] == 0
+    allowed = 3.0 * (observed.tip_deflection_deviation + 1e-4) + 5e-4
+    assert abs(observed.tip_deflection - tips[-1].point.z) < allowed
+    low, high = observed.nis_interval
+    assert 0.0 < low < 1.0 < high
+    assert observed.restarts == 0
     stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in tips]
     assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
 
@@ -562,17 +572,15 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
 
     def stopped() -> str:
         exceed(bench)
-        return bench.value('stop')
+        return bench.status.stop
 
     ros_graph.spin_until(stopped, 'the stop')
-    assert reason in bench.value('stop')
+    assert reason in bench.status.stop
     ros_graph.spin_until(
-        lambda: [
-            status
-            for array in arrays
-            for status in array.status
-            if reason in status.message and status.level == DiagnosticStatus.ERROR
-        ],
+        lambda: any(
+            reason in one.stop and one.phase is ControllerPhase.STOPPED
+            for one in statuses(arrays, ControllerStatus)
+        ),
         'the reason on /diagnostics',
     )
     assert [bench.measure(0.02) for _ in range(3)] == [0.0] * 3
@@ -590,7 +598,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
         lambda: not bench.controller._supervisor.safety.guard.violated, 'values within the limits'
     )
     assert bench.call('clear_stop').success
-    assert bench.value('stops latched') == '1'
+    assert bench.status.stops == 1
     if limit == 'depth':
         # The needle has moved: the target is discarded.
         bench.measure(0.02)
@@ -602,8 +610,8 @@ def test_frozen_encoders_cause_a_stop(ros_graph: RosGraph) -> None:
     """Frozen encoders with a moving reference are a fault."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
-    ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0 and bench.value('stop'), 'the stop')
-    assert 'tracking error' in bench.value('stop')
+    ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0 and bench.status.stop, 'the stop')
+    assert 'tracking error' in bench.status.stop
     assert bench.call('clear_stop').success
     assert bench.push() > 0.5
 
@@ -615,10 +623,12 @@ def test_single_spike_is_rejected_without_a_stop(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
     for load in (0.0, 0.1, 60.0, 0.1, 0.0):
         bench.wrench(lateral=load)
-    ros_graph.spin_until(lambda: '2 jump' in bench.value('input base_wrench'), 'the readings')
-    ros_graph.spin_until(lambda: '3 taken' in bench.value('input base_wrench'), 'the readings')
+    ros_graph.spin_until(
+        lambda: bench.input('base_wrench').rejected.get('jump') == 2, 'the readings'
+    )
+    ros_graph.spin_until(lambda: bench.input('base_wrench').accepted == 3, 'the readings')
     assert bench.push() > 0.5
-    assert bench.value('stops latched') == '0'
+    assert bench.status.stops == 0
 
 
 @pytest.mark.parametrize(
@@ -641,8 +651,8 @@ def test_invalid_readings_are_counted_and_discarded(
     bench.aim(0.1)
     assert bench.push() > 0.5
     send(bench)
-    ros_graph.spin_until(lambda: f'1 {kind}' in bench.value(f'input {topic}'), 'the refusal')
-    assert '0 taken' in bench.value(f'input {topic}')
+    ros_graph.spin_until(lambda: bench.input(topic).rejected.get(kind) == 1, 'the refusal')
+    assert bench.input(topic).accepted == 0
     assert bench.controller._supervisor.bending.observer.refused == 0
     assert bench.push() > 0.5
 
@@ -655,17 +665,17 @@ def test_motion_continues_without_optional_sensors(ros_graph: RosGraph) -> None:
 
     def stale() -> bool:
         bench.measure(depth)
-        return 'base_wrench is stale' in bench.said() and 'tip_deflection' in bench.said()
+        return all(name in bench.status.warning for name in ('base_wrench', 'tip_deflection'))
 
     ros_graph.spin_until(stale, 'the warning')
-    assert bench.controller.diagnose()[0] == DiagnosticStatus.WARN
+    assert bench.controller.diagnose().severity == Severity.WARNING
     assert bench.measure(depth) > 0.5
 
     def well() -> bool:
         bench.wrench()
         bench.tip(0.0)
         bench.measure(depth)
-        return bench.said() == 'active'
+        return bench.status.phase is ControllerPhase.ACTIVE and not bench.status.warning
 
     ros_graph.spin_until(well, 'the end of the warning')
     assert bench.measure(depth) > 0.5
@@ -683,7 +693,7 @@ def test_missing_required_sensors_cause_a_stop(ros_graph: RosGraph) -> None:
     bench.aim(0.1)
     assert bench.push() > 0.5
     ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0, 'the stop')
-    assert 'is stale' in bench.value('stop')
+    assert 'is stale' in bench.status.stop
     assert 'is stale' in bench.call('clear_stop').message
 
 
@@ -695,7 +705,7 @@ def test_duplicate_commanders_command_zero_force(ros_graph: RosGraph) -> None:
     rival = bench.node.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0, 'zero force')
     assert bench.said() == '2 nodes publish wrench_command'
-    assert bench.controller.diagnose()[0] == DiagnosticStatus.WARN
+    assert bench.controller.diagnose().severity == Severity.WARNING
     bench.node.destroy_publisher(rival)
     assert bench.push() > 0.5
 
@@ -708,7 +718,7 @@ def test_commands_have_the_stamp_of_the_measurement(ros_graph: RosGraph) -> None
     again = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
     again.header.stamp = stamp
     assert bench.ask(again) == force
-    assert '1 repeated' in bench.value('input joint_states')
+    assert bench.input('joint_states').repeated == 1
     # Commands of the watchdog do not answer a measurement.
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
     last = bench.commands[-1].header.stamp
@@ -757,7 +767,7 @@ def test_first_sample_with_stamp_zero_is_answered(ros_graph: RosGraph) -> None:
     bench = SimulatedTime(ros_graph)
     message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
     assert bench.ask(message) == 0.0
-    assert bench.value('measurements answered') == '1'
+    assert bench.status.latency.answered == 1
     bench.aim(0.1)
     assert bench.push() > 0.5
 
@@ -770,10 +780,9 @@ def test_clock_set_back_restarts_the_motion(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
     bench.set(50.0)
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
-    assert 'clock went back by' in bench.said()
+    assert 'clock went back by' in bench.status.fault
     assert bench.push() > 0.5
-    assert bench.said() != 'not active'
-    assert 'clock' not in bench.said()
+    assert bench.status.phase is ControllerPhase.ACTIVE
 
 
 def test_clock_jump_ahead_restarts_the_motion(ros_graph: RosGraph) -> None:
@@ -792,9 +801,9 @@ def test_clock_jump_ahead_restarts_the_motion(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(aimed, 'the reference')
     # A continued motion would have reached the target.
     assert aimed()[0].position[0] < 0.021
-    assert 'continued after 1' in bench.value('last complaint')
-    assert bench.value('stops latched') == '0'
-    assert bench.value('target [m]') == '0.1'
+    assert 'continued after 1' in bench.status.last_rejection
+    assert bench.status.stops == 0
+    assert bench.status.target == 0.1
     assert bench.push() > 0.5
 
 
@@ -835,9 +844,9 @@ def test_target_with_wrong_frame_or_stamp_is_rejected(
     message.header.frame_id, message.header.stamp = frame, stamp
     message.point.y = 0.1
     bench.target.publish(message)
-    ros_graph.spin_until(lambda: bench.value('inputs refused') == '1', 'the refusal')
-    assert reason in bench.value('last complaint')
-    assert bench.value('target [m]') == 'None'
+    ros_graph.spin_until(lambda: bench.status.rejected == 1, 'the refusal')
+    assert reason in bench.status.last_rejection
+    assert bench.status.target is None
 
 
 def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
@@ -850,17 +859,17 @@ def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
     assert 'stopped' in bench.call('retract').message
     bench.target.publish(PointStamped())
     ros_graph.spin_until(
-        lambda: 'target rejected: the controller is not active' in bench.value('last complaint'),
+        lambda: 'target rejected: the controller is not active' in bench.status.last_rejection,
         'the refusal',
     )
     assert bench.controller.trigger_activate() == TransitionCallbackReturn.SUCCESS
     bench.target.publish(PointStamped())
     ros_graph.spin_until(
-        lambda: 'target rejected: stopped: emergency stop' in bench.value('last complaint'),
+        lambda: 'target rejected: stopped: emergency stop' in bench.status.last_rejection,
         'the rejection',
     )
     assert [bench.measure(0.02) for _ in range(5)] == [0.0] * 5
-    assert bench.value('stop') == 'emergency stop'
+    assert bench.status.stop == 'emergency stop'
     assert bench.call('clear_stop').success
     assert bench.call('clear_stop').message == 'there was no stop'
     bench.aim(0.1)
@@ -885,7 +894,7 @@ def test_malformed_joint_states_raise_no_error(ros_graph: RosGraph, message: Joi
     assert bench.push() > 0.5
     message.header.stamp = bench.now()
     assert bench.ask(message) == 0.0
-    assert bench.value('stop') == ''
+    assert bench.status.stop == ''
     assert bench.push() > 0.5
 
 
@@ -907,7 +916,7 @@ def test_malformed_ground_truth_raises_no_error(ros_graph: RosGraph, message: Jo
     bench.aim(0.1)
     message.header.stamp = bench.now()
     truths.publish(message)
-    ros_graph.spin_until(lambda: bench.value('input ground_truth'), 'the truth')
+    ros_graph.spin_until(lambda: 'ground_truth' in bench.status.input, 'the truth')
     assert bench.controller._supervisor.bending.load == 0.0
     assert bench.push() > 0.5
 
@@ -919,10 +928,10 @@ def test_diagnostics_report_rates_and_saturation(ros_graph: RosGraph) -> None:
 
     def saturated() -> bool | float:
         bench.measure(0.02)
-        seen = float(bench.value('input joint_states').split()[0])
-        return seen and bench.value('share of commands at their limit') == '1.000'
+        seen = bench.input('joint_states').rate
+        return seen and bench.status.saturated_fraction == 1.0
 
     ros_graph.spin_until(saturated, 'a second at the limit')
     # One message each 5 ms, plus repeated measurements.
-    assert float(bench.value('commands per second')) == pytest.approx(200.0, abs=1.0)
-    assert float(bench.value('input joint_states').split()[0]) == pytest.approx(200.0, abs=5.0)
+    assert bench.status.command_rate == pytest.approx(200.0, abs=1.0)
+    assert bench.input('joint_states').rate == pytest.approx(200.0, abs=5.0)

@@ -5,12 +5,14 @@ from pathlib import Path
 import resource
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_identification import Bag
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.event_log import Severity
+from needle_ros.status import ControllerPhase, ControllerStatus, PlantStatus, RecorderStatus
 from needle_ros.timing import seconds
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 
 RATE, START, TARGET = 200.0, 0.02, 0.025
 
@@ -55,17 +57,16 @@ class Loop:
         self.controller = graph.add(
             ControllerNode, parameters={'rate': RATE, 'use_sim_time': True, **(controller or {})}
         )
-        self.until(
-            lambda: self.said('measurements answered') > 5 and self.truth.message, 'discovery'
-        )
+        self.until(lambda: self.status.latency.answered > 5 and self.truth.message, 'discovery')
 
     def until(self, condition: Callable[..., Any], what: str) -> None:
         """Spin until a condition holds."""
         self.graph.spin_until(condition, what)
 
-    def said(self, key: str) -> float | None:
-        """Return a value of the controller diagnostics."""
-        return self.controller.diagnose()[2][key]
+    @property
+    def status(self) -> ControllerStatus:
+        """Latest status of the controller."""
+        return self.controller.diagnose().status
 
     @property
     def depth(self) -> Any:
@@ -89,7 +90,7 @@ class Loop:
 
         def taken() -> bool:
             self.targets.publish(message)
-            return self.said('target [m]') == depth
+            return self.status.target == depth
 
         self.until(taken, 'the target')
 
@@ -121,17 +122,17 @@ class Loop:
             lambda: abs(self.depth - depth) < NEAR and abs(self.speed) < REST, 'the arrival'
         )
 
-    def rests_without_force(self, why: str) -> None:
-        """Spin until the command is zero with a reported reason, and the needle rests."""
-        self.until(lambda: why in self.controller.diagnose()[1], why)
+    def rests_without_force(self, phase: ControllerPhase) -> None:
+        """Spin until the controller is in a phase without force, and the needle rests."""
+        self.until(lambda: self.status.phase is phase, phase.value)
         self.until(lambda: self.speed == 0.0, 'rest')
         depth = self.depth
         self.passes(0.3)
         assert self.depth == depth
-        assert self.controller.diagnose()[0] != DiagnosticStatus.OK
+        assert self.controller.diagnose().severity != Severity.INFO
         force = self.command.message.wrench.force.y
         # Without measurements the command timeout of the plant applies.
-        assert force == 0.0 or self.plant.diagnose()[2]['commands per second [Hz]'] == '0.0'
+        assert force == 0.0 or self.plant.diagnose().status.command_rate == 0.0
 
     def clears(self) -> Trigger_Response:
         """Clear the latched stop."""
@@ -160,7 +161,7 @@ def test_lost_and_reordered_measurements_are_tolerated(
     loop.break_down(kind, topic, **values)
     loop.aim()
     loop.arrives()
-    assert 'clear_stop' not in loop.controller.diagnose()[1]
+    assert loop.status.stops == 0
 
 
 @pytest.mark.parametrize('topic', ['base_wrench', 'tip_deflection'])
@@ -176,8 +177,8 @@ def test_motion_continues_without_bending_sensors(
     loop.aim()
     loop.moves()
     loop.break_down(kind, topic, **values)
-    loop.until(lambda: topic in loop.controller.diagnose()[1], 'the warning')
-    assert loop.controller.diagnose()[0] == DiagnosticStatus.WARN
+    loop.until(lambda: topic in loop.status.warning, 'the warning')
+    assert loop.controller.diagnose().severity == Severity.WARNING
     loop.arrives()
 
 
@@ -192,7 +193,8 @@ def test_encoder_loss_gives_zero_force_until_recovery(
     loop.aim(0.04)
     loop.moves()
     loop.break_down(kind, 'joint_states', **values)
-    loop.rests_without_force('joint_states')
+    loop.rests_without_force(ControllerPhase.FAULT)
+    assert 'joint_states' in loop.status.fault
     loop.mend()
     loop.arrives(0.04)
 
@@ -213,7 +215,7 @@ def test_inconsistent_encoders_end_the_motion(
     loop.aim(0.1)
     loop.moves()
     loop.break_down(kind, 'joint_states', **values)
-    loop.until(lambda: why in str(loop.controller.diagnose()), why)
+    loop.until(lambda: why in loop.status.fault, why)
     loop.until(lambda: loop.speed == 0.0, 'rest')
 
 
@@ -227,13 +229,13 @@ def test_overload_latches_a_stop(ros_graph: RosGraph, topic: str, size: float, w
     loop.aim(0.04)
     loop.moves()
     loop.break_down('bias', topic, size=size)
-    loop.rests_without_force('~/clear_stop releases')
-    assert why in loop.controller.diagnose()[1]
+    loop.rests_without_force(ControllerPhase.STOPPED)
+    assert why in loop.status.stop
     refused = loop.clears()
     assert not refused.success
     loop.mend()
     loop.passes(0.1)
-    loop.rests_without_force('~/clear_stop releases')
+    loop.rests_without_force(ControllerPhase.STOPPED)
     assert loop.clears().success
     loop.arrives(0.04)
 
@@ -256,18 +258,17 @@ def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> Non
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
     first.kill()
     ros_graph.spin_until(lambda: truth.message.velocity[0] == 0.0, 'rest')
-    assert plant.diagnose()[2]['commands refused'] == 0
+    assert plant.diagnose().status.rejected == 0
     health = ros_graph.latest(probe, DiagnosticArray, '/diagnostics', COMMAND)
     ros_graph.start('controller', parameters)
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
     # The graph still lists the dead controller, whose lease is over.
     assert probe.count_publishers('wrench_command') == 2
-    assert 'nodes command' not in plant.diagnose()[1]
+    assert plant.diagnose().status.commanders == 0
 
     def is_well() -> bool:
-        statuses = health.message.status if health.message else []
-        values = [{one.key: one.value for one in s.values} for s in statuses]
-        return any(one.get('stops latched') == '0' for one in values)
+        arrays = [health.message] if health.message else []
+        return any(one.stops == 0 for one in statuses(arrays, ControllerStatus))
 
     ros_graph.spin_until(is_well, 'no stop')
 
@@ -289,7 +290,10 @@ def test_controller_resumes_after_a_plant_restart(ros_graph: RosGraph) -> None:
     first = ros_graph.start('plant', {'command_timeout': 1.0})
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
     first.kill()
-    ros_graph.spin_until(lambda: 'stale' in controller.diagnose()[1], 'the fault')
+    ros_graph.spin_until(
+        lambda: controller.diagnose().status.phase is ControllerPhase.FAULT, 'the fault'
+    )
+    assert 'stale' in controller.diagnose().status.fault
     ros_graph.spin_until(lambda: forces.message.wrench.force.y == 0.0, 'no force')
     ros_graph.start('plant', {'command_timeout': 1.0})
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
@@ -304,7 +308,7 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     health: list[Any] = []
 
     def take(message: DiagnosticArray) -> None:
-        health.extend(message.status)
+        health.append(message)
 
     listen = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
     loop.probe.create_subscription(DiagnosticArray, '/diagnostics', take, listen)
@@ -313,9 +317,7 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     size = 200_000
     resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
     loop.until(
-        lambda: any(
-            status.name == '/recorder' and 'File too large' in status.message for status in health
-        ),
+        lambda: any('File too large' in one.failure for one in statuses(health, RecorderStatus)),
         'the report',
     )
     recorder.check()
@@ -359,7 +361,7 @@ def test_clock_jumps_do_not_move_the_needle(ros_graph: RosGraph) -> None:
             goes_on()
             if waited[0] == 0:
                 targets.publish(message)
-            return controller.diagnose()[2].get('target [m]') == depth
+            return controller.diagnose().status.target == depth
 
         ros_graph.spin_until(taken, 'the target')
 
@@ -413,7 +415,8 @@ def test_command_flood_does_not_stop_sampling(ros_graph: RosGraph) -> None:
 
     def warned() -> bool:
         flood()
-        return any('commands per second for' in m.status[0].message for m in health)
+        found = statuses(health, PlantStatus)
+        return any(one.command_rate > 60.0 for one in found)
 
     ros_graph.spin_until(warned, 'the warning')
     first = len(samples)

@@ -17,6 +17,7 @@ from typing import Any
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.status import ControllerStatus, InputStatus
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
@@ -89,20 +90,29 @@ class Bench:
 
         def holds() -> Any:
             # On a busy machine a fault may occur during the motion.
-            if self.goal is not None and self.controller.diagnose()[2]['target [m]'] is None:
+            if self.goal is not None and self.status.target is None:
                 self.target.publish(self.goal)
             return condition()
 
         self.graph.spin_until(holds, what)
 
+    @property
+    def status(self) -> ControllerStatus:
+        """Latest status of the controller."""
+        return self.controller.diagnose().status
+
+    def input(self, topic: str) -> InputStatus:
+        """Return the status of an input."""
+        return self.status.input.get(topic, InputStatus())
+
     def taken(self, topic: str) -> int:
         """Return the number of accepted messages of a topic."""
-        return int(self.controller._supervisor.safety.streams[topic].counts['taken'])
+        return self.input(topic).accepted
 
     @property
     def said(self) -> str:
         """First diagnostics message of the controller."""
-        return str(self.controller.diagnose()[1])
+        return str(self.controller.diagnose().message)
 
     @property
     def stop(self) -> str | None:
@@ -115,7 +125,7 @@ class Bench:
         self.goal = PointStamped()
         self.goal.point.y = depth
         self.target.publish(self.goal)
-        self.until(lambda: self.controller.diagnose()[2]['target [m]'] == depth, 'the target')
+        self.until(lambda: self.status.target == depth, 'the target')
 
     def arrive(self, depth: float) -> None:
         """Spin until the robot is at a depth [m]."""
@@ -225,8 +235,8 @@ def test_foreign_robot_is_controlled_by_parameters_only(ros_graph: RosGraph, whi
         # The whole joint state is read, with the effort, which is monitored.
         assert max(bench.values()) > 0.5 > -0.5 > min(bench.values())
     else:
-        values = bench.controller.diagnose()[2]
-        assert values['velocity of the robot'] == 'estimated'
+        values = bench.controller.diagnose().status
+        assert values.velocity_source == 'estimated'
         steps = [abs(b - a) for a, b in zip(bench.values(), bench.values()[1:], strict=False)]
         # In mm: 0.05 m/s for two periods of 5 ms, and at most 2 mm from the robot.
         assert max(steps) <= 2.0
@@ -272,8 +282,8 @@ def test_wrong_frame_is_reported(ros_graph: RosGraph) -> None:
     """With the expected frame."""
     bench = Bench(ros_graph, hardware__wrench_frame='tool0')
     bench.until(
-        lambda: ' frame' in str(bench.controller.diagnose()[2].get('input base_wrench')),
-        'the refusal',
+        lambda: bench.input('base_wrench').rejected.get('frame'),
+        'the rejection',
     )
     assert bench.taken('base_wrench') == 0
 
@@ -363,7 +373,7 @@ def test_missing_input_is_explained(ros_graph: RosGraph, stranger: Node, there: 
         message = JointState(name=['a', 'b'], position=[0.0, 1.0], velocity=[0.0, 0.0])
         message.header.stamp = user.get_clock().now().to_msg()
         states.publish(message)
-        return str(controller.diagnose()[1]) == expected
+        return str(controller.diagnose().message) == expected
 
     ros_graph.spin_until(said, expected)
 
@@ -373,8 +383,7 @@ def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
     auto = {'hardware__state_topic': 'auto', 'hardware__wrench_topic': 'auto'}
     bench = Bench(ros_graph, **auto)
     bench.until(lambda: bench.taken('base_wrench') > 0, 'the force sensor')
-    said = bench.controller.diagnose()[2]['robot']
-    assert said == '/joint_states, effort of slide on slide/commands'
+    assert bench.status.robot == '/joint_states, effort of slide on slide/commands'
     bench.user.create_publisher(JointState, 'arm/joint_states', 10)
     late = ros_graph.add(ControllerNode, start=False, parameters=bench.parameters)
     assert not late.start()
@@ -413,7 +422,7 @@ def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph
     bench.until(lambda: bench.values()[-1] < -0.5, 'a force')
     for timer in list(bench.robot.timers):
         bench.robot.destroy_timer(timer)
-    bench.until(lambda: 'joint_states is stale' in bench.said, 'the watchdog')
+    bench.until(lambda: 'joint_states is stale' in bench.status.fault, 'the watchdog')
     count = len(bench.commands)
     bench.until(lambda: len(bench.commands) > count + 15, 'more commands')
     assert {*bench.values()[-10:]} == {0.0}
@@ -497,8 +506,9 @@ def test_ended_process_leaves_zero_effort(
 def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
     """With both rates and the parameter; no warning at the correct rate."""
     bench = Bench(ros_graph, rate=1000.0)
-    bench.until(lambda: ' Hz, rate is 1000 Hz: set rate to ' in bench.said, 'the rate')
-    assert bench.said.startswith('joint_states is received at ')
+    bench.until(lambda: bench.status.warning, 'the rate')
+    assert bench.status.warning.startswith('joint_states is received at ')
+    assert ' Hz, rate is 1000 Hz: set rate to ' in bench.status.warning
 
 
 @pytest.mark.parametrize(
@@ -517,7 +527,7 @@ def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, 
 
     def says() -> bool:
         states.publish(message)
-        return str(controller.diagnose()[1]) == said
+        return str(controller.diagnose().message) == said
 
     ros_graph.spin_until(says, said)
 

@@ -5,11 +5,13 @@ from pathlib import Path
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.identification_node import IdentificationNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
+from needle_ros.event_log import Severity
+from needle_ros.status import IdentificationStatus
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
@@ -235,19 +237,19 @@ def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGr
     ros_graph.spin_until(
         lambda: joints.get_subscription_count() and wrenches.get_subscription_count(), 'discovery'
     )
-    level, message, _ = node.diagnose()
-    assert level == DiagnosticStatus.WARN
-    assert 'insertion' in message
+    diagnosis = node.diagnose()
+    assert diagnosis.severity == Severity.WARNING
+    assert 'insertion' in diagnosis.message
     for names, position in ((['other'], [0.1]), (['insertion'], []), ([], [])):
         joints.publish(JointState(name=names, position=position))
     for seconds, force in ((5, 1.0), (4, 1.0), (6, math.nan), (1, 1.0)):
         wrench = WrenchStamped()
         wrench.header.stamp.sec, wrench.wrench.force.y = seconds, force
         wrenches.publish(wrench)
-    ros_graph.spin_until(lambda: sum(node.diagnose()[2].values()) >= 3, 'the counts')
-    assert node.diagnose()[2] == {
-        'samples': 0, 'out of order': 1, 'not finite': 1, 'clock set back': 1,
-    }  # fmt: skip
+    ros_graph.spin_until(lambda: sum(node.diagnose().status.discarded.values()) >= 3, 'the counts')
+    assert node.diagnose().status == IdentificationStatus(
+        discarded={'out of order': 1, 'not finite': 1, 'clock set back': 1}
+    )
     assert node.is_active
 
 
@@ -306,7 +308,7 @@ def test_apply_has_a_timeout(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The call ends with the reason, without blocking the node."""
-    monkeypatch.setattr('needle_ros.status.CALL_TIMEOUT', 0.3)
+    monkeypatch.setattr('needle_ros.requests.CALL_TIMEOUT', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
     # A node without a spinning executor offers the service, but does not respond.
     deaf = Node('deaf', context=ros_graph.context)

@@ -15,7 +15,6 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import ContinuousInverseDynamics
-from needle_controller.steering.executive import Phase
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
@@ -23,6 +22,7 @@ from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.status import ControllerStatus, SteeringPhase, SteeringStatus
 from needle_ros.timing import seconds
 import numpy as np
 import pytest
@@ -73,11 +73,12 @@ def drive(
     errors: list[JointState] = []
     with Graph(logs) as graph:
         probe = graph.node('probe')
-        health = {}
+        health: dict[str, ControllerStatus] = {}
 
         def take(message: DiagnosticArray) -> None:
             for status in message.status:
-                health[status.name] = {pair.key: pair.value for pair in status.values}
+                values = {pair.key: pair.value for pair in status.values}
+                health[status.name] = ControllerStatus.from_values(values)
 
         probe.create_subscription(DiagnosticArray, '/diagnostics', take, 10)
         probe.create_subscription(JointState, 'tracking_error', errors.append, EVERY)
@@ -102,7 +103,7 @@ def drive(
 
         def aims() -> bool:
             aim.publish(message)
-            return health.get('/controller', {}).get('target [m]') == str(target)
+            return health.get('/controller', ControllerStatus()).target == target
 
         graph.spin_until(aims, 'the target')
         if course is not None:
@@ -323,9 +324,11 @@ def steer(folder: Path) -> Path:
             if waiting and sample.time >= 0.1:
                 waiting = False
                 aim(target_message(sample.stamp, (1e-3, 0.015, 0.0)))
-            if end == inf and run.values['steering'].get('phase') == Phase.DONE.value:
+            status = run.statuses['steering']
+            assert isinstance(status, SteeringStatus)
+            if end == inf and status.phase is SteeringPhase.DONE:
                 end = sample.time + 0.5
-            assert run.values['steering'].get('phase') != Phase.STOPPED.value
+            assert status.phase is not SteeringPhase.STOPPED
             assert sample.time < 30.0
             return sample.time < end
 

@@ -17,6 +17,8 @@ from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameter
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph.node_process import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
+from needle_ros.requests import Verdict
+from needle_ros.status import PlantStatus
 import numpy as np
 import pytest
 from rclpy.duration import Duration
@@ -28,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
@@ -99,7 +101,7 @@ class Bench:
     @property
     def waited(self) -> float:
         """Accumulated delay of simulated time by this machine [s]."""
-        return float(self.plant.diagnose()[2]['waited for the machine [s]'])
+        return self.plant.diagnose().status.waited
 
     def zero(self) -> Trigger_Response:
         """Call the tare service; return the response."""
@@ -109,7 +111,7 @@ class Bench:
 
     def refused(self, count: int) -> None:
         """Spin until a number of rejected commands."""
-        self.until(lambda: self.plant.diagnose()[2]['commands refused'] == count, 'the refusal')
+        self.until(lambda: self.plant.diagnose().status.rejected == count, 'the refusal')
 
 
 def test_four_topics_are_published_per_sample(ros_graph: RosGraph) -> None:
@@ -167,7 +169,7 @@ def test_invalid_force_commands_are_rejected(ros_graph: RosGraph, force: float) 
     plant = ros_graph.add(PlantNode, parameters=RATE)
     ros_graph.spin_until(lambda: states and commands.get_subscription_count(), 'discovery')
     commands.publish(wrench(force))
-    ros_graph.spin_until(lambda: plant.diagnose()[2]['commands refused'] == 1, 'the refusal')
+    ros_graph.spin_until(lambda: plant.diagnose().status.rejected == 1, 'the refusal')
     seen = len(states)
     ros_graph.spin_until(lambda: len(states) > seen + 20, 'further samples')
     assert states[-1].position[0] == states[0].position[0]
@@ -205,7 +207,7 @@ def test_needle_below_the_minimum_depth_stops(ros_graph: RosGraph) -> None:
 
     def reported() -> bool:
         commands.publish(wrench(-3.0))
-        return any('minimum_depth' in report.status[0].message for report in reports)
+        return any('minimum_depth' in one.halt for one in statuses(reports, PlantStatus))
 
     ros_graph.spin_until(reported, 'the report')
 
@@ -320,7 +322,7 @@ def test_invalid_parameters_fail_configure(
     node = ros_graph.add(PlantNode, parameters=parameters, start=False)
     assert not node.start()
     assert complaint in node.failure
-    assert node.diagnose()[2] == {}
+    assert node.diagnose().status == PlantStatus()
 
 
 @pytest.mark.parametrize(
@@ -375,7 +377,7 @@ def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) ->
 
     def reported() -> bool:
         commands.publish(wrench(20.0))
-        return any('insertion depth' in report.status[0].message for report in reports)
+        return any('insertion depth' in one.halt for one in statuses(reports, PlantStatus))
 
     ros_graph.spin_until(reported, 'the report')
 
@@ -456,7 +458,7 @@ def test_push_then_motion(ros_graph: RosGraph) -> None:
 
 def has_refused_one(plant: PlantNode) -> bool:
     """Return whether the plant has rejected one command."""
-    return plant.diagnose()[2]['commands refused'] == 1
+    return plant.diagnose().status.rejected == 1
 
 
 def has(messages: list[Any], count: int) -> bool:
@@ -578,7 +580,8 @@ def test_invalid_trajectories_are_rejected_with_a_reason(
     bench.course.publish(message)
     bench.refused(1)
     assert f'joint_trajectory rejected: {reason}\n' in capfd.readouterr().err
-    assert bench.plant.diagnose()[2]['request joint_trajectory 0'] == f'rejected: {reason}'
+    (answer,) = bench.plant.diagnose().status.requests.answers
+    assert (answer.verdict, answer.reason) == (Verdict.REJECTED, reason)
     if bench.states:
         assert bench.states[-1].position[0] == 0.1
 
@@ -657,14 +660,14 @@ def test_stall_drops_samples_or_delays_simulated_time(ros_graph: RosGraph, facto
     time.sleep(0.5)
     bench.further(50)
     stamps = np.diff([stamp_ns(message) for message in bench.states])
-    given_up = bench.plant.diagnose()[2]['samples given up']
+    given_up = bench.plant.diagnose().status.skipped
     if factor == 1.0:
         # 0.5 s minus the backlog.
         assert given_up >= 44
         assert stamps.max() >= 0.44e9
     else:
         assert given_up == 0
-        assert float(bench.plant.diagnose()[2]['waited for the machine [s]']) >= 0.44
+        assert bench.plant.diagnose().status.waited >= 0.44
         assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
 
 
@@ -707,7 +710,7 @@ def test_friction_may_change_during_motion(ros_graph: RosGraph) -> None:
         return bench.states[-1].velocity[0] > 0.0
 
     bench.until(lambda: pushed() and bench.states[-1].position[0] > 0.021, 'motion')
-    depth = bench.plant.diagnose()[2]['inserted length [m]']
+    depth = bench.plant.diagnose().status.insertion_depth
     changed = bench.plant.set_parameters_atomically(
         [
             Parameter('model.coulomb_friction', value=2.06),
@@ -715,7 +718,7 @@ def test_friction_may_change_during_motion(ros_graph: RosGraph) -> None:
         ]
     )
     assert changed.successful
-    assert bench.plant.diagnose()[2]['inserted length [m]'] == depth
+    assert bench.plant.diagnose().status.insertion_depth == depth
     slow = len(bench.states)
     bench.until(lambda: pushed() and len(bench.states) > slow + 40, 'further samples')
     speed = np.array([message.velocity[0] for message in bench.states])

@@ -11,12 +11,12 @@ import time
 from typing import Any
 
 from builtin_interfaces.msg._time import Time
-from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer as McapWriter
 from needle_identification import Bag, BagWriter, OfferedQos, read_topic
 from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode
 from needle_ros.base_node import LATCHED, SENSOR
+from needle_ros.event_log import Severity
 import pytest
 from rclpy.node import Node as RosNode
 from rclpy.parameter import Parameter
@@ -159,7 +159,7 @@ def test_playback_is_identical_and_ordered(
     ros_graph.spin_until(lambda: len(listener.heard) >= 40, 'the messages')
     for topic in BOTH:
         assert listener.of(topic) == bytes_of(bag, f'/{topic}')
-    assert player.diagnose()[2]['messages'] == 42
+    assert player.diagnose().status.messages == 42
 
 
 def test_recording_of_the_playback_equals_the_original(
@@ -177,7 +177,7 @@ def test_recording_of_the_playback_equals_the_original(
     )
     go(ros_graph)
     ros_graph.spin_until(
-        lambda: all(recorder.diagnose()[2].get(topic) == 20 for topic in topics[:2]),
+        lambda: all(recorder.diagnose().status.recorded.get(topic) == 20 for topic in topics[:2]),
         'the messages in the bag',
     )
     recorder.stop()
@@ -204,22 +204,22 @@ def test_playback_timing(ros_graph: RosGraph, tmp_path: Path, rate: float) -> No
     due = [k * step * 1e-3 / rate for k in range(20)]
     came = [at - begin for _, _, at in listener.heard]
     assert all(at >= wanted for at, wanted in zip(came, due, strict=True))
-    values = player.diagnose()[2]
-    assert 0.0 <= float(str(values['late [s]'])) <= float(str(values['latest so far [s]']))
+    status = player.diagnose().status
+    assert 0.0 <= status.delay <= status.largest_delay
     ros_graph.spin_until(
-        lambda: player.diagnose()[2]['position [s]'] == f'{19 * step * 1e-3:.3f}', 'the end'
+        lambda: player.diagnose().status.position == pytest.approx(19e-3 * step), 'the end'
     )
 
 
 def test_latched_messages_reach_late_subscribers(ros_graph: RosGraph, tmp_path: Path) -> None:
     bag = small_bag(tmp_path / 'bag')
     player = ros_graph.add(PlayerNode, parameters={'path': str(bag), 'rate': 0.0, 'delay': 0.0})
-    ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 42, 'the end')
+    ros_graph.spin_until(lambda: player.diagnose().status.messages == 42, 'the end')
     probe = ros_graph.node('probe')
     heard = ros_graph.listen(probe, String, 'latched', LATCHED)
     ros_graph.spin_until(lambda: heard, 'the latched message')
     assert [message.data for message in heard] == ['new']
-    assert player.diagnose()[1] == f'at the end of {bag}'
+    assert player.diagnose().message == f'at the end of {bag}'
 
 
 def test_qos_equals_the_recorded_qos(ros_graph: RosGraph, tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_loop_repeats_all_messages(ros_graph: RosGraph, tmp_path: Path) -> None:
     go(ros_graph)
     ros_graph.spin_until(lambda: len(listener.heard) >= 70, 'three rounds')
     assert listener.of('text')[:60] == 3 * [text(f'{k:03d}') for k in range(20)]
-    assert int(str(player.diagnose()[2]['loops'])) >= 3
+    assert player.diagnose().status.loops >= 3
 
 
 def test_pause_step_and_resume(ros_graph: RosGraph, tmp_path: Path) -> None:
@@ -362,8 +362,8 @@ def test_truncated_recording_is_played_to_its_end(ros_graph: RosGraph, tmp_path:
     go(ros_graph)
     ros_graph.spin_until(lambda: len(listener.heard) == len(whole), 'the messages')
     assert listener.of('text') == whole == [text(f'{k:03d}') for k in range(len(whole))]
-    ros_graph.spin_until(lambda: player.diagnose()[0] == DiagnosticStatus.WARN, 'the report')
-    said = player.diagnose()[1]
+    ros_graph.spin_until(lambda: player.diagnose().severity == Severity.WARNING, 'the report')
+    said = player.diagnose().message
     assert 'bag_0.mcap is cut off' in said
     assert 'the recording was not closed' in said
 
@@ -392,10 +392,10 @@ def test_topic_of_a_missing_type_is_skipped_and_reported(
     path.mkdir()
     foreign_bag(path / 'bag_0.mcap')
     player = play(ros_graph, path)
-    assert player.diagnose()[2]['left out'] == '/foreign'
+    assert player.diagnose().status.left_out == '/foreign'
     assert player._left_out == {'/foreign': 'lab_msgs/msg/Force is not installed'}
     go(ros_graph)
-    ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 1, 'the rest')
+    ros_graph.spin_until(lambda: player.diagnose().status.messages == 1, 'the rest')
 
 
 def foreign_bag(file: Path) -> None:
@@ -415,8 +415,8 @@ def test_duplicate_publisher_is_reported(ros_graph: RosGraph, tmp_path: Path) ->
     probe = ros_graph.node('probe')
     probe.create_publisher(JointState, 'joints', SENSOR)
     player = play(ros_graph, small_bag(tmp_path / 'bag'))
-    ros_graph.spin_until(lambda: player.diagnose()[0] == DiagnosticStatus.WARN, 'the warning')
-    assert player.diagnose()[1] == 'other publishers of /joints'
+    ros_graph.spin_until(lambda: player.diagnose().severity == Severity.WARNING, 'the warning')
+    assert player.diagnose().message == 'other publishers of /joints'
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import sys
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Goals
 from needle_identification import Bag, BagWriter, message_counts, read_topic
@@ -17,6 +17,8 @@ from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import UNLIMITED
 from needle_identification.recorder_node import RecorderNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
+from needle_ros.event_log import Severity
+from needle_ros.status import RecorderStatus
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.duration import Duration
@@ -27,7 +29,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.installed import ROOT
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 import yaml
 
 
@@ -77,10 +79,10 @@ def test_topics_are_recorded_with_their_offered_qos(
     publishers['command'].publish(String(data='go'))
     ros_graph.spin_until(
         lambda: (
-            node.diagnose()[2].get('/sensor') == len(sent)
-            and node.diagnose()[2].get('/command')
-            and node.diagnose()[2].get('/latched')
-            and node.diagnose()[2].get('/recorder/configuration')
+            node.diagnose().status.recorded.get('/sensor') == len(sent)
+            and node.diagnose().status.recorded.get('/command')
+            and node.diagnose().status.recorded.get('/latched')
+            and node.diagnose().status.recorded.get('/recorder/configuration')
         ),
         'the messages',
     )
@@ -162,7 +164,7 @@ def test_publisher_with_weaker_qos_is_recorded(
         # Repeated: each publisher discovers the new subscription at another time.
         weak.publish(String(data='weak'))
         reliable.publish(String(data='strong'))
-        if not node.diagnose()[2]['messages']:
+        if not node.diagnose().status.messages:
             return False
         node._flush()
         return {m.data for _, m in read_topic(tmp_path / 'bag', '/text')} == {'weak', 'strong'}
@@ -184,7 +186,7 @@ def test_topic_of_an_unknown_type_is_reported_once(
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     # The recorder checks the graph ten times a second.
     ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more checks')
-    assert set(node.diagnose()[2]) == {'messages', 'bytes', '/text'}
+    assert set(node.diagnose().status.recorded) == {'/text'}
     assert goals.get_subscription_count() == 0
     [said] = [log.msg for log in logs if 'left out' in log.msg]
     assert said.startswith('/goals left out: no definition of nav_msgs/msg/Goals')
@@ -299,12 +301,16 @@ def test_qos_of_later_publishers_is_recorded(
     node = record(tmp_path / 'bag', topics=['text'])
     ros_graph.spin_until(first.get_subscription_count, 'subscription')
     first.publish(String(data='first'))
-    ros_graph.spin_until(lambda: node.diagnose()[2].get('/text') == 1, 'the first message')
+    ros_graph.spin_until(
+        lambda: node.diagnose().status.recorded.get('/text') == 1, 'the first message'
+    )
     later = probe.create_publisher(String, 'text', COMMAND)
     ros_graph.spin_until(lambda: len(node._recorded['/text'].offered) == 2, 'the later publisher')
     ros_graph.spin_until(later.get_subscription_count, 'subscription')
     later.publish(String(data='later'))
-    ros_graph.spin_until(lambda: node.diagnose()[2].get('/text') == 2, 'the second message')
+    ros_graph.spin_until(
+        lambda: node.diagnose().status.recorded.get('/text') == 2, 'the second message'
+    )
     node.stop()
     (topic,) = Bag(tmp_path / 'bag').topics()
     one, two = topic.offered_qos()
@@ -341,7 +347,7 @@ def test_custom_message_type_is_recorded(
     node = record(tmp_path / 'bag', topics=['goals'])
     ros_graph.spin_until(publisher.get_subscription_count, 'subscription')
     publisher.publish(Goals(goals=[PoseStamped(pose=Pose(position=Point(x=0.5)))]))
-    ros_graph.spin_until(lambda: node.diagnose()[2].get('/goals') == 1, 'the message')
+    ros_graph.spin_until(lambda: node.diagnose().status.recorded.get('/goals') == 1, 'the message')
     node.stop()
     # Decoded with the definition in the bag.
     [(_, message)] = read_topic(tmp_path / 'bag', '/goals')
@@ -380,9 +386,9 @@ def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     publish(ros_graph, probe, 50)
-    counted = KeyValue(key='/text', value='50')
     ros_graph.spin_until(
-        lambda: any(counted in status.values for r in reports for status in r.status), 'messages'
+        lambda: any(one.recorded.get('/text') == 50 for one in statuses(reports, RecorderStatus)),
+        'messages',
     )
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
@@ -404,30 +410,30 @@ def test_lost_messages_are_counted_and_reported(
     calm.publish(String())
 
     def counts() -> tuple[int, int]:
-        values = node.diagnose()[2]
-        return values['/flood'], values['/calm']
+        recorded = node.diagnose().status.recorded
+        return recorded['/flood'], recorded['/calm']
 
     ros_graph.spin_until(lambda: counts() == (1, 1), 'the first')
-    assert node.diagnose()[0] == DiagnosticStatus.OK
+    assert node.diagnose().severity == Severity.INFO
     sent = 20_000
     for _ in range(sent):
         # The queue is full: the recorder is in this thread and is not spun.
         flood.publish(JointState())
-    ros_graph.spin_until(lambda: node.diagnose()[0] == DiagnosticStatus.WARN, 'the warning')
+    ros_graph.spin_until(lambda: node.diagnose().severity == Severity.WARNING, 'the warning')
     flood.publish(JointState())
     calm.publish(String())
 
     def are_all_there() -> bool:
-        values = node.diagnose()[2]
-        return counts()[1] == 2 and counts()[0] + values['lost of /flood'] == sent + 2
+        lost = node.diagnose().status.lost['/flood']
+        return counts()[1] == 2 and counts()[0] + lost == sent + 2
 
     ros_graph.spin_until(are_all_there, 'the rest')
-    _, message, values = node.diagnose()
-    lost = values['lost of /flood']
+    message, status = node.diagnose().message, node.diagnose().status
+    lost = status.lost['/flood']
     assert lost > 0
     assert message.endswith(f'lost {lost} of /flood')
     _, answer = call(ros_graph, 'recorder/stop')
     assert answer.endswith(f'; lost {lost} of /flood')
     bag = Bag(tmp_path / 'bag')
     assert bag.losses == [f'the recorder lost {lost} of /flood']
-    assert message_counts(tmp_path / 'bag')['/flood'] == values['/flood']
+    assert message_counts(tmp_path / 'bag')['/flood'] == status.recorded['/flood']

@@ -7,7 +7,7 @@ from typing import Any
 from needle_controller.controller_node import ControllerNode
 from needle_insertion.live.operator import Operator
 from needle_ros.calls_node import Calls
-from needle_ros.status import CALL_TIMEOUT
+from needle_ros.requests import CALL_TIMEOUT
 import pytest
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -64,7 +64,7 @@ def test_lost_target_is_repeated(ros_graph: RosGraph) -> None:
     controller = ros_graph.add(ControllerNode)
     ros_graph.spin_until(lambda: pending.done, 'the answer')
     assert pending.outcome == (True, 'controller: target accepted')
-    assert controller.diagnose()[2]['target [m]'] == 0.05
+    assert controller.diagnose().status.target == 0.05
 
 
 @pytest.mark.parametrize(
@@ -89,4 +89,4 @@ def test_rejected_target_is_never_reported_as_active(
     assert not accepted
     with pytest.raises(AssertionError, match=line):
         raise AssertionError(said)
-    assert controller.diagnose()[2]['target [m]'] is None
+    assert controller.diagnose().status.target is None

@@ -30,6 +30,7 @@ from needle_identification.recorder_node import is_hidden
 from needle_insertion.replay.rerun import verify
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, message_class, SENSOR
+from needle_ros.status import PlantStatus
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
@@ -65,10 +66,7 @@ class Driver:
         self.set: dict[tuple[str, str], float] = {}
         self.active, self.update = True, lambda: None
         self.state: dict[tuple[str, str], float] = {}
-        self.health: dict[str, str] = {}
-        self.complaint = ''
-        #: All diagnostics messages of the plant.
-        self.words: set[str] = set()
+        self.status = PlantStatus()
         self.node.create_subscription(JointState, 'joint_states', self._on_state, HEARD)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
         self.commands = self.node.create_publisher(JointState, 'joint_commands', SENT)
@@ -84,9 +82,8 @@ class Driver:
     def _on_health(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name == '/plant':
-                self.words.add(status.message)
-                self.complaint = status.message
-                self.health = {item.key: item.value for item in status.values}
+                values = {item.key: item.value for item in status.values}
+                self.status = PlantStatus.from_values(values)
 
     def write(self) -> None:
         """Send a message like `JointStateTopicSystem::write` with a threshold of -1."""
@@ -111,7 +108,7 @@ class Driver:
     @property
     def refused(self) -> int:
         """Number of rejected commands in the diagnostics of the plant."""
-        return int(self.health.get('commands refused', 0))
+        return self.status.rejected
 
     def at(self, joint: str = 'insertion') -> float:
         return self.state[joint, 'position']
@@ -220,7 +217,7 @@ def test_duplicate_commanders_move_nothing(ros_graph: RosGraph, tmp_path: Path) 
     driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
     for kind, topic in ((WrenchStamped, 'wrench_command'), (JointState, 'joint_commands')):
         rival = driver.node.create_publisher(kind, topic, COMMAND)
-        driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
+        driver.until(lambda: driver.status.commanders == 2, 'the report')
         driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
         before = driver.at()
         driver.further(0.3)
@@ -288,7 +285,7 @@ def test_duplicate_position_commanders_are_not_followed(
 ) -> None:
     driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
     rival = driver.node.create_publisher(JointState, 'joint_commands', COMMAND)
-    driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
+    driver.until(lambda: driver.status.commanders == 2, 'the report')
     driver.set['insertion', 'position'] = 0.031
     driver.further(0.5)
     assert driver.at() == pytest.approx(0.03, abs=1e-6)

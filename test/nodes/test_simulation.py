@@ -10,6 +10,7 @@ from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.status import PlantPhase, PlantStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -93,9 +94,10 @@ class Bench:
         changed = self.plant.set_parameters_atomically(parameters)
         assert changed.successful, changed.reason
 
-    def counts(self, name: str) -> int:
-        """Return a value of the diagnostics."""
-        return self.plant.diagnose()[2][name]
+    @property
+    def status(self) -> PlantStatus:
+        """Latest status of the plant."""
+        return self.plant.diagnose().status
 
     def quiet(self) -> None:
         """Spin until no message has arrived for ten periods."""
@@ -137,7 +139,7 @@ def test_pause_stops_time_and_steps_take_single_samples(ros_graph: RosGraph) -> 
     assert granted
     assert said.startswith('paused at ')
     bench.quiet()
-    assert 'paused at' in bench.plant.diagnose()[1]
+    assert bench.status.phase is PlantPhase.PAUSED
     before = stamp_ns(bench.states[-1])
     for k in (1, 2, 3):
         seen = len(bench.states)
@@ -184,7 +186,7 @@ def test_reset_restores_the_needle_and_keeps_time(ros_graph: RosGraph) -> None:
 def test_reset_after_the_needle_left_the_tissue(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, depth=0.002)
     bench.force = -3.0
-    bench.until(lambda: 'minimum_depth' in bench.plant.diagnose()[1], 'the end')
+    bench.until(lambda: 'minimum_depth' in bench.status.halt, 'the end')
     bench.force = 0.0
     bench.quiet()
     assert bench.call('reset')[0]
@@ -205,10 +207,8 @@ def test_lockstep_plant_waits_and_reports_the_reason(ros_graph: RosGraph) -> Non
     bench = Bench(ros_graph, lockstep=True)
     bench.until(lambda: len(bench.states) >= 2, 'the repeated sample')
     assert {stamp_ns(message) for message in bench.states} == {PERIOD}
-    bench.until(
-        lambda: 'no command has answered the sample of 0.005000 s' in bench.plant.diagnose()[1],
-        'the warning',
-    )
+    bench.until(lambda: bench.status.awaited == 'no command has answered', 'the warning')
+    assert bench.status.time == 0.005
     bench.force = 0.0
     bench.further(20)
     assert stamp_ns(bench.states[-1]) > 15 * PERIOD
@@ -232,7 +232,7 @@ def test_out_of_order_command_is_discarded(ros_graph: RosGraph) -> None:
     # Only the newest message is queued for the plant.
     bench.further(20)
     bench.command(3.56, stamp=earlier.header.stamp)
-    bench.until(lambda: bench.counts('commands overtaken') == 1, 'the refusal')
+    bench.until(lambda: bench.status.superseded == 1, 'the refusal')
     assert not any(message.velocity[0] for message in bench.further(20))
 
 
@@ -244,9 +244,9 @@ def test_stale_and_wrong_frame_commands_are_discarded(ros_graph: RosGraph) -> No
     bench.further(40)
     # 40 samples are 0.2 s; command_timeout is 0.1 s.
     bench.command(3.56, stamp=old)
-    bench.until(lambda: bench.counts('commands too old') == 1, 'the refusal')
+    bench.until(lambda: bench.status.stale == 1, 'the refusal')
     bench.command(3.56, frame='needle_tip')
-    bench.until(lambda: bench.counts('commands refused') == 1, 'the refusal')
+    bench.until(lambda: bench.status.rejected == 1, 'the refusal')
     assert not any(message.velocity[0] for message in [*bench.states, *bench.further(20)])
     bench.force = 3.56
     bench.until(lambda: bench.states[-1].position[0] > 0.0201, 'motion')
@@ -257,11 +257,11 @@ def test_overloaded_plant_accepts_commands(ros_graph: RosGraph) -> None:
     # 10^7 steps per second exceed any machine. On a busy machine, an answer may take longer than
     # 0.1 s.
     bench = Bench(ros_graph, rate=1000.0, step=1e-7, command_timeout=2.0)
-    bench.until(lambda: bench.counts('samples given up') > 300, 'the overload')
+    bench.until(lambda: bench.status.skipped > 300, 'the overload')
     bench.force = 8.0
     bench.until(lambda: bench.states[-1].position[0] > 0.03, 'motion')
-    given_up = bench.counts('samples given up')
-    bench.until(lambda: bench.counts('samples given up') > given_up, 'more samples')
+    given_up = bench.status.skipped
+    bench.until(lambda: bench.status.skipped > given_up, 'more samples')
 
 
 def test_backlog_is_limited_by_the_command_timeout(ros_graph: RosGraph) -> None:
@@ -280,7 +280,7 @@ def test_duplicate_commanders_apply_no_force(ros_graph: RosGraph) -> None:
     bench.force = 3.56
     bench.until(lambda: bench.states and bench.states[-1].velocity[0] > 0.0, 'motion')
     other = bench.probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
-    bench.until(lambda: bench.plant.diagnose()[1] == '2 nodes command', 'the error')
+    bench.until(lambda: bench.status.commanders == 2, 'the error')
     bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
     assert not any(message.velocity[0] for message in bench.further(20))
     bench.probe.destroy_publisher(other)
@@ -331,7 +331,7 @@ def test_steered_needle_publishes_shape_and_path(ros_graph: RosGraph) -> None:
     soon = Duration(nanosec=500_000_000)
     message.points = [JointTrajectoryPoint(positions=[0.03, 9e-3, -11e-3], time_from_start=soon)]
     course.publish(message)
-    bench.until(lambda: bench.plant.diagnose()[2]['commands refused'] == 1, 'the refusal')
+    bench.until(lambda: bench.plant.diagnose().status.rejected == 1, 'the refusal')
     bench.until(lambda: bench.states, 'a sample')
     assert bench.states[-1].name == [
         'insertion', 'guide_x', 'guide_z', 'guide_tilt_x', 'guide_tilt_z', 'roll',
@@ -367,7 +367,7 @@ def test_faults_may_be_set_and_cleared_while_active(ros_graph: RosGraph) -> None
     bench.further(5)
     bench.set(fault__kind='bias', fault__topic='base_wrench', fault__size=20.0)
     bench.until(lambda: bench.wrenches[-1].wrench.force.x > 15.0, 'the bias')
-    assert 'base_wrench has the fault bias' in bench.plant.diagnose()[1]
+    assert (bench.status.faulty_topic, bench.status.sensor_fault) == ('base_wrench', 'bias')
     bench.set(fault__kind='nan', fault__topic='joint_states')
     bench.until(lambda: np.isnan(bench.states[-1].position[0]), 'the fault')
     bench.until(lambda: abs(bench.wrenches[-1].wrench.force.x) < 1.0, 'the end of the bias')
@@ -379,7 +379,7 @@ def test_faults_may_be_set_and_cleared_while_active(ros_graph: RosGraph) -> None
     assert len(bench.tips) == dropped
     bench.set(fault__kind='none')
     bench.until(lambda: len(bench.tips) > dropped + 10, 'the tip')
-    assert 'fault' not in bench.plant.diagnose()[1]
+    assert bench.status.sensor_fault == ''
 
 
 def test_delayed_reading_keeps_its_stamp_after_a_stall(
@@ -390,7 +390,7 @@ def test_delayed_reading_keeps_its_stamp_after_a_stall(
     bench.further(40)
     sleep(0.5)
     bench.further(40)
-    assert bench.counts('samples given up') > 0
+    assert bench.status.skipped > 0
     samples = {stamp_ns(message) for message in bench.states}
     first = min(samples)
     late = [stamp_ns(message) for message in bench.tips if stamp_ns(message) >= first]

@@ -25,11 +25,12 @@ from needle_insertion.slicer.needle import LINE, MEASURED
 from needle_insertion.slicer.registration import Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.status import SlicerPhase, SlicerStatus
 import numpy as np
 import pyigtl
 import pytest
 from sensor_msgs.msg import JointState
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
 PLANT = {
@@ -79,10 +80,9 @@ class Room:
         self.until(lambda: len(peer.told(device)) >= count, f'{device} at the peer')
         return peer.told(device)
 
-    def state(self, name: str = '/slicer') -> str:
-        """Return the latest state of a node."""
-        said = [one.message for a in self.states for one in a.status if one.name == name]
-        return said[-1] if said else ''
+    def status(self) -> SlicerStatus:
+        """Return the latest status of the node."""
+        return (statuses(self.states, SlicerStatus) or [SlicerStatus()])[-1]
 
 
 @pytest.fixture
@@ -191,9 +191,9 @@ def test_needle_without_shape_sensor_is_a_line(room: Room) -> None:
     (way,) = np.diff(line, axis=0)
     matrix = np.array(room.wait_for(peer, 'NeedleTip')[-1].content)
     np.testing.assert_allclose(matrix[:3, 1], way / np.linalg.norm(way), atol=1e-6)
-    room.until(lambda: room.state().endswith(f'shape: {LINE}'), 'the state')
+    room.until(lambda: room.status().shape_source == LINE, 'the state')
     # Nothing is sent after the end of the inputs.
-    room.until(lambda: 'shape: none, neither needle_poses' in room.state(), 'the end')
+    room.until(lambda: not room.status().shape_source, 'the end')
 
 
 def test_predicted_tip_pose_is_sent(room: Room) -> None:
@@ -207,8 +207,8 @@ def test_predicted_tip_pose_is_sent(room: Room) -> None:
     position.x, position.y, position.z = 1e-3, 0.1, float('nan')
     message.pose.pose.orientation.w = 1.0
     expected.publish(message)
-    refused = 'refused last'
-    room.until(lambda: 'tip_expected refused' in node.diagnose()[2][refused], 'the refusal')
+    room.until(lambda: node.diagnose().status.rejected == 1, 'the rejection')
+    assert 'tip_expected refused' in node.diagnose().status.last_rejection
     position.z = 2e-3
     expected.publish(message)
     for _ in range(2):
@@ -224,7 +224,7 @@ def test_invalid_needle_poses_are_rejected(room: Room) -> None:
     node = room.slicer()
 
     def refused(complaint: str) -> bool:
-        return complaint in node.diagnose()[2]['refused last']
+        return complaint in node.diagnose().status.last_rejection
 
     # Best effort, as a driver may offer.
     poses = room.probe.create_publisher(PoseArray, 'needle_poses', SENSOR)
@@ -244,7 +244,7 @@ def test_invalid_needle_poses_are_rejected(room: Room) -> None:
         poses.publish(message)
         room.until(partial(refused, complaint), complaint)
     poses.publish(good)
-    room.until(lambda: node.diagnose()[1].endswith(f'shape: {MEASURED}'), 'the shape')
+    room.until(lambda: node.diagnose().status.shape_source == MEASURED, 'the shape')
 
 
 def test_target_flood_is_reported_once_and_the_newest_is_used(
@@ -252,7 +252,7 @@ def test_target_flood_is_reported_once_and_the_newest_is_used(
 ) -> None:
     """Also for invalid targets: at most one line a second, and shapes continue."""
     node = room.slicer()
-    room.until(lambda: room.state().startswith('waits for a peer'), 'the node')
+    room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the node')
     # On the axis of the needle, increasing in depth to 10 cm.
     depths = [*np.linspace(0.01, 0.09, 2000).tolist(), *[float('nan')] * 2000, 0.1]
     flood = b''.join(
@@ -274,7 +274,7 @@ def test_target_flood_is_reported_once_and_the_newest_is_used(
             lambda: room.targets and abs(room.targets[-1].point.y - 0.1) < 1e-6, 'the last target'
         )
     # Fewer than sent; superseded targets of the same moment are dropped.
-    assert node.diagnose()[2]['targets passed on'] < 1000
+    assert node.diagnose().status.targets < 1000
     lines = capfd.readouterr().err.splitlines()
     for words in ('only the newest target is used', 'target refused: it must be three finite'):
         times = [float(line.split('[')[2].split(']')[0]) for line in lines if words in line]
@@ -286,12 +286,13 @@ def test_port_in_use_is_reported_and_retried(room: Room) -> None:
     """On /diagnostics; the node listens as soon as the port is free."""
     with closing(socket.create_server(('127.0.0.1', room.port))):
         room.slicer()
-        room.until(lambda: 'the port is in use' in room.state(), 'the error')
-        levels = [s.level for a in room.states for s in a.status if 'in use' in s.message]
+        room.until(lambda: room.status().phase is SlicerPhase.ERROR, 'the error')
+        assert 'the port is in use' in room.status().error
+        levels = [s.level for a in room.states for s in a.status if s.name == '/slicer']
         assert DiagnosticStatus.ERROR in levels
-    room.until(lambda: room.state().startswith('waits for a peer'), 'the port')
+    room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the port')
     with closing(socket.create_connection(('127.0.0.1', room.port))):
-        room.until(lambda: room.state().startswith('connected with'), 'the peer')
+        room.until(lambda: room.status().phase is SlicerPhase.CONNECTED, 'the peer')
 
 
 def test_slicer_ros2_can_subscribe(room: Room) -> None:

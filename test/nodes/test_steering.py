@@ -11,6 +11,8 @@ from needle_controller.controller_node import ControllerNode
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.requests import Verdict
+from needle_ros.status import ControllerPhase, SteeringPhase, SteeringStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -92,11 +94,22 @@ class Bench:
     @property
     def said(self) -> str:
         """Latest state of the node."""
-        return str(self.steering.diagnose()[1])
+        return str(self.steering.diagnose().message)
 
-    def taken(self, topic: str) -> str:
-        """Return the number of received messages."""
-        return str(self.steering.diagnose()[2][f'input {topic}'])
+    @property
+    def status(self) -> SteeringStatus:
+        """Latest status of the node."""
+        return self.steering.diagnose().status
+
+    def accepted(self, topic: str) -> int:
+        """Return the number of accepted messages."""
+        return self.status.input[topic].accepted
+
+    def end(self) -> SteeringPhase:
+        """Spin until the end of the insertion, and return its phase."""
+        ends = (SteeringPhase.DONE, SteeringPhase.STOPPED)
+        self.until(lambda: self.status.phase in ends, 'the end')
+        return self.status.phase
 
     def send(self, point: tuple[float, float, float]) -> None:
         message = PointStamped()
@@ -108,16 +121,13 @@ class Bench:
         """Send a target when the sensors are available, and wait for the answer."""
         self.until(lambda: self.target.get_subscription_count() >= self.takers, 'the subscriber')
         self.until(
-            lambda: all(
-                ' 0 taken' not in self.taken(topic) for topic in ('joint_states', 'tip_deflection')
-            ),
+            lambda: all(map(self.accepted, ('joint_states', 'tip_deflection'))),
             'the sensors',
         )
         self.send(point)
         self.until(
-            lambda: (
-                self.steering.diagnose()[2]['phase'] not in ('idle', 'planning')
-                or 'target' in self.steering.diagnose()[2]['last complaint']
+            lambda: any(
+                one.verdict is not Verdict.RECEIVED for one in self.status.requests.answers
             ),
             'the answer',
         )
@@ -140,8 +150,7 @@ def test_tip_reaches_its_target(ros_graph: RosGraph) -> None:
     """With a robot; the tip is within the predicted covariance after each tip measurement."""
     bench = Bench(ros_graph)
     bench.aim()
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert bench.said.startswith('done: the tip is at x = ')
+    assert bench.end() is SteeringPhase.DONE
     # Remaining uncertainty of tissue and tilt after six measurements; a fixed guide misses by 2
     # mm.
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
@@ -164,8 +173,7 @@ def test_robot_topics_may_be_remapped(ros_graph: RosGraph) -> None:
     """Each trajectory has all joints of the robot and ends at rest."""
     bench = Bench(ros_graph, prefix='arm/')
     bench.aim()
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert bench.said.startswith('done: the tip is at x = ')
+    assert bench.end() is SteeringPhase.DONE
     assert bench.user.count_publishers('joint_trajectory') == 0
     for move in bench.moves:
         assert move.joint_names == ['insertion', 'guide_x', 'guide_z']
@@ -179,8 +187,7 @@ def test_bevel_steering_moves_only_the_roll(ros_graph: RosGraph) -> None:
         steering__bevel_load=[1.0], belief__tilt=5e-3, belief__frame=5e-3,
     )  # fmt: skip
     bench.aim((1e-3, 0.051, 0.0))
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert bench.said.startswith('done: the tip is at x = ')
+    assert bench.end() is SteeringPhase.DONE
     # A constant bevel direction would deviate by 5 mm.
     assert np.hypot(*(bench.tip - [1e-3, 0.0])) < 1.5e-3
     rolls = {move.positions[3] for message in bench.moves for move in message.points[-1:]}
@@ -208,12 +215,14 @@ def test_steered_controller_follows_the_node(ros_graph: RosGraph, continuous: bo
         },
     )
     bench.takers = 2
-    bench.until(lambda: 'joint_states yet' not in controller.diagnose()[1], 'the controller')
+    bench.until(
+        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING,
+        'the controller',
+    )
     bench.aim()
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert bench.said.startswith('done: the tip is at x = ')
+    assert bench.end() is SteeringPhase.DONE
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
-    assert 'joint_trajectory' not in controller.diagnose()[2]['last complaint']
+    assert 'joint_trajectory' not in controller.diagnose().status.last_rejection
     # At the end of the last path, not at a target.
     assert bench.at('insertion') == pytest.approx(TARGET[1], abs=3e-4)
 
@@ -232,13 +241,13 @@ def test_steered_controller_ignores_targets(ros_graph: RosGraph) -> None:
     message.point.y = 0.1
     target.publish(message)
     free, steered = nodes
-    ros_graph.spin_until(lambda: free.diagnose()[2]['target [m]'] == 0.1, 'the target')
+    ros_graph.spin_until(lambda: free.diagnose().status.target == 0.1, 'the target')
     # Both have received it: messages arrive in order.
     message.point.y = 0.05
     target.publish(message)
-    ros_graph.spin_until(lambda: free.diagnose()[2]['target [m]'] == 0.05, 'the next target')
-    assert steered.diagnose()[2]['target [m]'] is None
-    assert steered.diagnose()[2]['inputs refused'] == 0
+    ros_graph.spin_until(lambda: free.diagnose().status.target == 0.05, 'the next target')
+    assert steered.diagnose().status.target is None
+    assert steered.diagnose().status.rejected == 0
 
 
 def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
@@ -251,8 +260,8 @@ def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
         for name, value in (('fault.topic', 'tip_deflection'), ('fault.kind', 'freeze'))
     ]
     assert bench.plant.set_parameters_atomically(frozen).successful
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert 'stopped: the tip sensor is frozen' in bench.said
+    assert bench.end() is SteeringPhase.STOPPED
+    assert 'the tip sensor is frozen' in bench.status.fault
     depth = bench.at('insertion')
     count = len(bench.moves)
     end = bench.user.get_clock().now().nanoseconds + 500_000_000
@@ -273,7 +282,7 @@ def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
         answer = bench.stop.call_async(Trigger.Request())
         bench.until(answer.done, 'the answer')
         assert answer.result().message == 'stopped; retract the needle before the next target'
-        assert bench.said == 'stopped: ~/stop'
+        assert bench.status.fault == '~/stop'
     else:
         bench.steering.stop()
     still: list[float] = []
@@ -289,15 +298,15 @@ def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
 def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
     """The node answers `~/stop` and receives measurements; the stop cancels the plan."""
     bench = Bench(ros_graph, step_length=5e-4, depth_tolerance=1e-4)
-    bench.until(lambda: ' 0 taken' not in bench.taken('tip_deflection'), 'the sensors')
+    bench.until(lambda: bench.accepted('tip_deflection'), 'the sensors')
     bench.send(TARGET)
-    bench.until(lambda: bench.steering.diagnose()[2]['phase'] == 'planning', 'the plan')
-    job, before = bench.steering._loop._job, bench.taken('joint_states')
-    bench.until(lambda: bench.taken('joint_states') != before, 'measurements')
+    bench.until(lambda: bench.status.phase is SteeringPhase.PLANNING, 'the plan')
+    job, before = bench.steering._loop._job, bench.accepted('joint_states')
+    bench.until(lambda: bench.accepted('joint_states') != before, 'measurements')
     answer = bench.stop.call_async(Trigger.Request())
     bench.until(answer.done, 'the answer')
     assert answer.result().message == 'planning cancelled'
-    assert bench.said == 'waits for a target'
+    assert bench.status.phase is SteeringPhase.IDLE
     assert not bench.moves
     # The thread ends before the test does.
     bench.until(lambda: job.done, 'the end of the thread')
@@ -320,9 +329,12 @@ def test_rejected_motion_stops_the_insertion(
         },
     )
     bench.takers = 2
-    bench.until(lambda: 'joint_states yet' not in controller.diagnose()[1], 'the controller')
+    bench.until(
+        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING,
+        'the controller',
+    )
     bench.aim()
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.end() is SteeringPhase.STOPPED
     assert re.match(
         r'stopped: controller rejected the motion: (speed|acceleration) after .* must be',
         bench.said,
@@ -334,7 +346,7 @@ def test_missing_controller_is_reported(ros_graph: RosGraph) -> None:
     """The plant moves the guide only."""
     bench = Bench(ros_graph, mode='simulation', lockstep=False)
     bench.aim()
-    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.end() is SteeringPhase.STOPPED
     assert bench.said == (
         'stopped: insertion is at 1.000 mm, not at 11.000 mm: joint_trajectory sent 4 times, '
         'no node reports that it takes joint_trajectory'
@@ -345,7 +357,7 @@ def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> Non
     """A target out of range, a short needle, invalid constants."""
     bench = Bench(ros_graph)
     bench.aim((0.05, 0.051, 0.0))
-    assert 'out of reach' in bench.steering.diagnose()[2]['last complaint']
+    assert 'out of reach' in bench.status.last_rejection
     for name, value, complaint in (
         ('speed', 0.0, 'speed must be finite, > 0 m/s, got 0.0'),
         ('belief.noise', 0.0, 'belief.noise must be finite, > 0 m, got 0.0'),
@@ -378,13 +390,13 @@ def test_shipped_parameters_start_the_three_nodes(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(
         lambda: (
             target.get_subscription_count() == 2
-            and ' 0 taken' not in str(steering.diagnose()[2]['input tip_deflection'])
+            and steering.diagnose().status.input['tip_deflection'].accepted
         ),
         'the sensors',
     )
     target.publish(message)
     ros_graph.spin_until(lambda: moves, 'the first step')
-    assert 'target' not in steering.diagnose()[2]['last complaint']
+    assert 'target' not in steering.diagnose().status.last_rejection
 
 
 def test_needle_and_guide_rest_after_a_kill_of_the_node(ros_graph: RosGraph) -> None:

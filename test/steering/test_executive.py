@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import ExecutiveSettings, ReferenceLimits, SteeringPrior
 from needle_controller.reference.path import Path
-from needle_controller.steering.executive import Phase
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
 from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics import ParameterError
 from needle_ros.event_log import Severity
+from needle_ros.status import SteeringPhase as Phase
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
@@ -464,9 +464,9 @@ def test_noisy_readings_give_a_warning() -> None:
     robot.tick(5)
     robot.aim()
     robot.tick(60)
-    severity, state, _ = robot.loop.diagnose(robot.now)
+    severity, _, status = robot.loop.diagnose(robot.now)
     assert severity is Severity.WARNING
-    assert 'noise of the tip measurement is 0.0' in state
+    assert 'noise of the tip measurement is 0.0' in status.warning
 
 
 def test_averaged_measurement_rejects_outliers() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller.steering.executive import Phase, SteeringExecutive
+from needle_controller.steering.executive import SteeringExecutive
 from needle_controller.steering.planning import (
     CancelledError,
     ComputedJob,
@@ -19,13 +19,14 @@ from needle_controller.steering.planning import (
 )
 from needle_ros.contract import INSERTION, JOINT_TRAJECTORY, Stamp, TARGET, TOPICS
 from needle_ros.errors import JobError
-from needle_ros.status import (
+from needle_ros.requests import (
     Acknowledgement,
     PendingRequest,
     RequestLog,
     RequestStatus,
     Verdict,
 )
+from needle_ros.status import SteeringPhase as Phase
 import numpy as np
 import pytest
 from support.steered_robot import CONTINUOUS, NEEDLE, PERIOD, Robot, SECOND, SETTINGS, STEERING
@@ -192,7 +193,7 @@ def test_pause_by_the_user_may_last() -> None:
     robot.moves = lambda _wanted: held.copy()
     robot.tick(6000)
     assert robot.loop.steers
-    assert 'controller is paused' in robot.loop.diagnose(robot.now)[1]
+    assert robot.loop.diagnose(robot.now)[2].paused_by == 'controller'
     robot.paused = False
     robot.moves = lambda wanted: wanted
     robot.ways = [(times + 6000 * PERIOD, way) for times, way in robot.ways]
@@ -267,7 +268,7 @@ def test_messages_are_processed_during_planning() -> None:
     assert robot.verdict(stamp) == ('received', '')
     robot.tick(2000)
     assert robot.loop.busy
-    assert robot.loop.diagnose(robot.now)[1] == 'computes the plan: 25%'
+    assert robot.loop.diagnose(robot.now)[2].planned_fraction == 0.25
     Manual.made[0].done = True
     robot.tick()
     assert not robot.loop.busy

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
 
+from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import BaseNode
+from needle_ros.status import NodeStatus, read_status
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 #: Log line of a node that compiles or loads a function in the active state.
 LATE = 'while the node is active'
+
+_Status = TypeVar('_Status', bound=NodeStatus)
 
 
 class RosGraph(Graph):
@@ -43,3 +47,10 @@ class RosGraph(Graph):
         received: list[Any] = []
         node.create_subscription(kind, topic, received.append, qos)
         return received
+
+
+def statuses(arrays: Iterable[DiagnosticArray], kind: type[_Status]) -> list[_Status]:
+    """Return the status of each node of a kind in messages of /diagnostics."""
+    pairs = [status.values for array in arrays for status in array.status]
+    found = [read_status({one.key: one.value for one in values}) for values in pairs]
+    return [status for status in found if isinstance(status, kind)]

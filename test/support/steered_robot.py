@@ -11,7 +11,7 @@ from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrio
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 from needle_ros.contract import JOINT_TRAJECTORY
-from needle_ros.status import RequestLog, Verdict
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.wire import Reading
 import numpy as np
 import pytest
@@ -128,9 +128,9 @@ class Robot:
 
     def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
         """Send a target; return the reason of a rejection."""
-        before = self.loop.journal.refused
+        before = self.loop.journal.rejected
         self.follow(self.loop.target(0, frame, point, self.now))
-        return self.loop.journal.complaint if self.loop.journal.refused > before else ''
+        return self.loop.journal.last_rejection if self.loop.journal.rejected > before else ''
 
     def steer(self, ticks: int = 6000) -> None:
         """Send a target, and run until the loop has finished."""

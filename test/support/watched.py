@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from needle_identification import BagWriter, encode, message_type
 from needle_ros import contract
+from needle_ros.status import ControllerStatus, NodeStatus, PlantStatus, SteeringStatus
 import numpy as np
 from support.samples import EPOCH
 
@@ -84,13 +84,11 @@ def marker(name: str, points: Any, stamp: int = 0) -> Any:
     )  # fmt: skip
 
 
-def status(
-    name: str, message: str, values: Mapping[str, str] | None = None, level: int = 0
-) -> Any:
+def status(name: str, message: str, typed: NodeStatus | None = None, level: int = 0) -> Any:
     """Create the DiagnosticStatus of a node."""
+    values = {} if typed is None else typed.to_values()
     pairs = [
-        made('diagnostic_msgs/msg/KeyValue', key=key, value=value)
-        for key, value in (values or {}).items()
+        made('diagnostic_msgs/msg/KeyValue', key=key, value=value) for key, value in values.items()
     ]
     return made(
         'diagnostic_msgs/msg/DiagnosticStatus', level=level, name=name, message=message,
@@ -155,11 +153,10 @@ def write_watched(path: Path, space: str = '') -> None:
                 bag.write(f'{space}/needle_shape', encode(marker(name, line, stamp)), stamp)
             if k % RATE:
                 continue
-            aim = ', '.join(f'{value:.6f}' for value in TARGET)
             said = [
-                status('/plant', 'active'),
-                status('/controller', 'active', {'target [m]': 'None'}),
-                status('/steering', 'inserts', {'target x, y, z [m]': aim}, int(time > 2.5)),
+                status('/plant', 'active', PlantStatus()),
+                status('/controller', 'active', ControllerStatus()),
+                status('/steering', 'inserts', SteeringStatus(target=TARGET), int(time > 2.5)),
             ]
             # The controller has ended earlier.
             array = made(

@@ -200,9 +200,8 @@ function tell(node) {
   const words = node.silent ? `silent for ${fixed(node.age, 0)} s; last: ` : name === 'fine' ? '' : `${name}: `;
   line.append(state, words + node.words);
   item.append(line);
-  for (const [key, value] of Object.entries(node.values)) {
-    item.append(make('p', `${key}: ${value}`, 'more'));
-  }
+  if (node.steps) item.append(make('p', `step: ${node.step} of ${node.steps}`, 'more'));
+  if (node.last_rejection) item.append(make('p', `last rejection: ${node.last_rejection}`, 'more'));
   return item;
 }
 
@@ -238,8 +237,9 @@ function tellAim() {
     const {at, half} = frame.expected;
     parts.push(`Predicted tip: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
   }
-  const chance = frame.nodes.map((node) => node.values['chance to come within 1 mm']).find(Boolean);
-  if (chance) parts.push(`Probability of a hit within 1 mm: ${chance}.`);
+  if (frame.hit_probability !== null) {
+    parts.push(`Probability of a hit within 1 mm: ${fixed(frame.hit_probability, 3)}.`);
+  }
   put(find('reach'), parts.join(' '));
 }
 

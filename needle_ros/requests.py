@@ -1,0 +1,325 @@
+"""
+Requests on topics, and their acknowledgement in the status of the receiver.
+
+A request is a message on a topic with stamp `Stamp.REQUEST` in the contract: a target or a
+trajectory. The receiver answers in its status on ``/diagnostics``, immediately and then once a
+second, so that a lost message is replaced. The sender repeats the request until the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from time import monotonic
+from typing import Final
+
+from needle_ros.contract import REQUEST_AGE, Stamp, Topic
+from needle_ros.errors import printable
+from needle_ros.timing import apart, NANOSECONDS
+
+#: Interval of repetitions without an answer [s], and the maximum number of repetitions.
+REPEAT_AFTER: Final = 1.0
+REPEATS: Final = 3
+
+#: Timeout of a request without an answer [s]: a later receiver rejects it as stale, so that it is
+#: not executed after the timeout.
+_GIVE_UP: Final = REQUEST_AGE + 1.0
+
+#: Timeout of a service call [s], longer than the response time on a slow machine.
+CALL_TIMEOUT: Final = 10.0
+
+#: Number of answers in a status, and number of answers kept to detect duplicates.
+_PUBLISHED: Final = 8
+_KEPT: Final = 64
+
+#: Minimum time between two statuses published for an answer [s].
+_PAUSE: Final = 0.05
+
+#: Keys and key prefixes in a status.
+_TAKES: Final = 'takes '
+_REQUEST: Final = 'request '
+_PAUSED: Final = 'paused'
+
+_MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
+
+
+class Verdict(Enum):
+    """Result of a request."""
+
+    #: Received and being checked; another verdict follows.
+    RECEIVED = 'received'
+    ACCEPTED = 'accepted'
+    REJECTED = 'rejected'
+    #: Not executed, because the receiver executes a newer request.
+    SUPERSEDED = 'superseded'
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """
+    Answer of a receiver to a request.
+
+    Attributes
+    ----------
+    topic : str
+        Topic of the request, by its name in the contract.
+    stamp : int
+        Stamp of the request [ns]; 0 for a message without a stamp.
+    verdict : Verdict
+        The result.
+    reason : str
+        Reason of a rejection, for users.
+
+    """
+
+    topic: str
+    stamp: int
+    verdict: Verdict
+    reason: str = ''
+
+    @property
+    def refused(self) -> bool:
+        """Whether the request is not executed."""
+        return self.verdict in (Verdict.REJECTED, Verdict.SUPERSEDED)
+
+
+@dataclass(frozen=True, slots=True)
+class RequestStatus:
+    """
+    Accepted request topics of a node and its latest answers, as fields of a DiagnosticStatus.
+
+    Attributes
+    ----------
+    takes : Mapping of str to tuple of str
+        Moved joints by topic of the request.
+    answers : tuple of Acknowledgement
+        The latest answers, the newest last.
+    paused : bool
+        Whether a user has paused the motion, for an unlimited time.
+
+    """
+
+    takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    answers: tuple[Acknowledgement, ...] = ()
+    paused: bool = False
+
+    def to_values(self) -> dict[str, str]:
+        """Return the fields as values of a DiagnosticStatus."""
+        values = {f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()}
+        values[_PAUSED] = str(self.paused)
+        for one in self.answers:
+            key = f'{_REQUEST}{one.topic} {one.stamp}'
+            values[key] = f'{one.verdict.value}: {one.reason}' if one.reason else one.verdict.value
+        return values
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str]) -> RequestStatus:
+        """Parse the fields from values of a DiagnosticStatus; other keys are ignored."""
+        takes: dict[str, tuple[str, ...]] = {}
+        answers = []
+        for key, value in values.items():
+            if key.startswith(_TAKES):
+                takes[key[len(_TAKES) :]] = tuple(filter(None, value.split(', ')))
+            elif key.startswith(_REQUEST):
+                topic, _, stamp = key[len(_REQUEST) :].rpartition(' ')
+                verdict, _, reason = value.partition(': ')
+                if stamp.isdecimal() and verdict in _VERDICTS:
+                    answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
+        return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
+
+    def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
+        """Return the answer to a request with a topic and stamp [ns], or None."""
+        for one in self.answers:
+            if (one.topic, one.stamp) == (topic, stamp):
+                return one
+        return None
+
+
+_VERDICTS: Final = {one.value for one in Verdict}
+
+
+class RequestLog:
+    """
+    Log of received requests: accept each once, in the order of the stamps, and record answers.
+
+    Parameters
+    ----------
+    takes : Mapping of Topic to sequence of str
+        Moved joints by topic of the request.
+    frames : sequence of str
+        Valid frames of a request.
+    steady : callable
+        Returns the time of a steady clock [s].
+
+    """
+
+    def __init__(
+        self,
+        takes: Mapping[Topic, Sequence[str]],
+        frames: Sequence[str] = ('',),
+        steady: Callable[[], float] = monotonic,
+    ) -> None:
+        for topic in takes:
+            if topic.stamp is not Stamp.REQUEST:
+                raise ValueError(f'{topic.name} is not a request')
+        self._takes = {topic.name: tuple(joints) for topic, joints in takes.items()}
+        self._frames, self._steady = frames, steady
+        self._answers: dict[tuple[str, int], Acknowledgement] = {}
+        #: Stamp of the newest request that was accepted, by joint [ns].
+        self._newest: dict[str, int] = {}
+        self._changed = False
+        self._published = -_PAUSE
+
+    def forget(self) -> None:
+        """Delete all requests, after a start or after the clock was set back."""
+        self._answers.clear()
+        self._newest.clear()
+
+    def check(
+        self, topic: Topic, stamp: int, now: int, frame: str = '', joints: Iterable[str] = ()
+    ) -> Acknowledgement | None:
+        """
+        Return None for a new request, else its answer; times are in ns.
+
+        The caller executes and answers a new request; a stamp of 0 always counts as new. A
+        duplicate gets its first answer again. A request with a stale stamp or a wrong frame is
+        rejected, and a request older than the current request of one of its joints is superseded.
+        """
+        known = self._answers.get((topic.name, stamp)) if stamp else None
+        if known is not None:
+            # The status with the answer may have been lost.
+            self._changed = True
+            return known
+        verdict, reason = Verdict.REJECTED, ''
+        if stamp and not -_MOST_AGE <= now - stamp <= _MOST_AGE:
+            reason = f'{topic.name} is stale: its stamp is {apart(now - stamp)}'
+        elif frame not in self._frames:
+            valid = ' or '.join(map(repr, self._frames))
+            reason = f'{topic.name} must be in frame {valid}, got {frame!r}'
+        elif stamp and any(stamp < self._follows(joint, now) for joint in joints):
+            verdict, reason = Verdict.SUPERSEDED, 'a newer request has priority'
+        return self.answer(topic, stamp, verdict, reason) if reason else None
+
+    def _follows(self, joint: str, now: int) -> int:
+        newest = self._newest.get(joint, 0)
+        # The clock has been set back.
+        return newest if newest <= now + _MOST_AGE else 0
+
+    def answer(
+        self,
+        topic: Topic,
+        stamp: int,
+        verdict: Verdict,
+        reason: str = '',
+        joints: Iterable[str] = (),
+    ) -> Acknowledgement:
+        """Record and return the answer to a request; arguments as for `check`."""
+        made = Acknowledgement(topic.name, stamp, verdict, printable(reason))
+        if stamp and not made.refused:
+            for joint in joints:
+                self._newest[joint] = max(stamp, self._newest.get(joint, 0))
+        # Newest answer last.
+        self._answers.pop((topic.name, stamp), None)
+        self._answers[topic.name, stamp] = made
+        while len(self._answers) > _KEPT:
+            del self._answers[next(iter(self._answers))]
+        self._changed = True
+        return made
+
+    def supersede(self, now: int) -> None:
+        """Supersede all requests sent before `now` [ns]: a stop or a retraction has priority."""
+        for joints in self._takes.values():
+            for joint in joints:
+                self._newest[joint] = max(now, self._newest.get(joint, 0))
+
+    def due(self) -> bool:
+        """
+        Return whether the status must be published now because of an unpublished answer.
+
+        Call it after each request and from a timer of at most 0.1 s: this limits the number of
+        statuses for a burst of requests.
+        """
+        now = self._steady()
+        if not self._changed or now - self._published < _PAUSE:
+            return False
+        self._changed, self._published = False, now
+        return True
+
+    def status(self, *, paused: bool = False) -> RequestStatus:
+        """Return the status with the latest answers."""
+        answers = tuple(self._answers.values())[-_PUBLISHED:]
+        return RequestStatus(self._takes, answers, paused)
+
+
+class PendingRequest:
+    """
+    A request that is repeated until it is answered.
+
+    Parameters
+    ----------
+    topic : Topic
+        Its topic.
+    stamp : int
+        Its stamp [ns], equal in all repetitions, so that the request is executed once.
+    node : str
+        Name of the expected receiver.
+    steady : callable
+        Returns the time of a steady clock [s].
+
+    Attributes
+    ----------
+    answer : Acknowledgement or None
+        The latest answer.
+    node : str
+        Name of the expected receiver, or of the node that has answered.
+
+    """
+
+    def __init__(
+        self, topic: Topic, stamp: int, node: str, steady: Callable[[], float] = monotonic
+    ) -> None:
+        self._topic, self._stamp, self._steady = topic.name, stamp, steady
+        self._begun, self._repeats = steady(), 0
+        self.answer: Acknowledgement | None = None
+        self.node = node
+
+    def hear(self, node: str, status: RequestStatus) -> None:
+        """Process the status of a node."""
+        answer = status.answer_to(self._topic, self._stamp)
+        if answer is not None and (self.answer is None or not self.done):
+            self.answer, self.node = answer, node
+
+    @property
+    def done(self) -> bool:
+        """Whether the request is accepted, refused, or expired."""
+        if self.answer is not None:
+            return self.answer.verdict is not Verdict.RECEIVED
+        return self._elapsed > _GIVE_UP
+
+    @property
+    def _elapsed(self) -> float:
+        return self._steady() - self._begun
+
+    def repeat(self) -> bool:
+        """Return whether the request must be sent again now."""
+        due = self._repeats < min(REPEATS, int(self._elapsed / REPEAT_AFTER))
+        if self.answer is not None or not due:
+            return False
+        self._repeats += 1
+        return True
+
+    @property
+    def outcome(self) -> tuple[bool, str]:
+        """Result of a request that is done: whether accepted, and one line for users."""
+        if self.answer is None:
+            return False, f'{self.node}: no answer to {self._topic} within {_GIVE_UP:g} s'
+        verb = self.answer.verdict.value
+        if self.answer.refused:
+            return False, f'{self.node}: {self._topic} {verb}: {self.answer.reason}'
+        return True, f'{self.node}: {self._topic} {verb}'
+
+
+def no_answer(service: str) -> str:
+    """Return the one-line error of a service call without a response."""
+    return f'{service}: no answer within {CALL_TIMEOUT:g} s'
