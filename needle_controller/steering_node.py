@@ -10,8 +10,8 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from needle_controller.steering.controller import TipEstimate
 from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.law import TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.prior import SteeringPrior

@@ -16,12 +16,8 @@ from time import monotonic
 from typing import Final
 
 from needle_controller.safety.input_monitor import InputMonitor
-from needle_controller.steering.controller import (
-    GuideSetpoint,
-    SteeringController,
-    SteeringFaultError,
-    TipEstimate,
-)
+from needle_controller.steering.law import GuideSetpoint, SteeringFaultError, TipEstimate
+from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw
 from needle_controller.steering.monitor import MotionMonitor
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
 from needle_controller.steering.planning import ComputedJob, Job, Progress, StartJob
@@ -134,7 +130,7 @@ class SteeringExecutive:
         State.
     fault : str
         Reason of the stop, '' without a stop.
-    control : SteeringController or None
+    control : MultiHypothesisLaw or None
         The controller of the latest insertion.
     expected : TipEstimate or None
         Expected position of the tip at the target depth; a new one after each measurement.
@@ -158,12 +154,12 @@ class SteeringExecutive:
         self._joint_stream = InputMonitor(JOINT_STATES.name, timeout, jumps=_JUMPS)
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self.phase, self.fault = Phase.IDLE, ''
-        self.control: SteeringController | None = None
+        self.control: MultiHypothesisLaw | None = None
         self.expected: TipEstimate | None = None
         #: Plan in computation; stamp [ns] and target [m] of its request, depths of the steps and
         #: positions of the joints [m, rad] at its start, and the phase before.
         self._start_job = start
-        self._job: Job[SteeringController] | None = None
+        self._job: Job[MultiHypothesisLaw] | None = None
         self._wanted: tuple[int, tuple[float, float, float], FloatArray, FloatArray] = (
             0, (0.0, 0.0, 0.0), _NONE, _NONE,
         )  # fmt: skip
@@ -330,7 +326,7 @@ class SteeringExecutive:
         depths = np.linspace(depth, point[1], steps + 1)
         roll = float(at[3]) if settings.turns else 0.0
 
-        def work(progress: Progress) -> SteeringController:
+        def work(progress: Progress) -> MultiHypothesisLaw:
             model = SteeringModel(
                 self._needle,
                 self._steering,
@@ -339,7 +335,7 @@ class SteeringExecutive:
                 together=settings.continuous,
                 progress=progress,
             )
-            return SteeringController(
+            return MultiHypothesisLaw(
                 model,
                 (point[0], point[2]),
                 settings.guide_limit,
@@ -718,7 +714,7 @@ class SteeringExecutive:
 
     def _take(
         self,
-        control: SteeringController,
+        control: MultiHypothesisLaw,
         look: TipMeasurements | None,
         at: int,
         depth: float | None = None,
@@ -731,12 +727,12 @@ class SteeringExecutive:
         if slip:
             raise SteeringFaultError(slip)
         if seen is None:
-            control.see(None, at)
+            control.update(None, at)
             return
         self._scatter = max(self._scatter, seen.error * sqrt(seen.readings))
-        control.see(seen.tip[[0, 2]], at, max(seen.error, self._scatter / sqrt(seen.readings)))
+        control.update(seen.tip[[0, 2]], at, max(seen.error, self._scatter / sqrt(seen.readings)))
 
-    def _planned_at(self, control: SteeringController, k: int) -> GuideSetpoint:
+    def _planned_at(self, control: MultiHypothesisLaw, k: int) -> GuideSetpoint:
         """Plan the next step, and log a new warning."""
         to = control.plan()
         self.expected = control.expected()
@@ -826,7 +822,7 @@ class SteeringExecutive:
         )
         return self._stamped(move, now)
 
-    def _pass(self, control: SteeringController, at: FloatArray) -> str:
+    def _pass(self, control: MultiHypothesisLaw, at: FloatArray) -> str:
         """Process the measurement of the depth before, and plan; return the fault, '' if none."""
         k, there = self._passed, self._between[1]
         if np.abs(at[1:3] - there).max() > _LAGGING * self.settings.guide_tolerance:

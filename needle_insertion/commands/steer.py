@@ -12,12 +12,12 @@ import sys
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
+    MultiHypothesisLaw,
     OutOfReachError,
-    SteeringController,
     SteeringModel,
     SteeringPrior,
 )
-from needle_controller.steering.controller import GuideSetpoint
+from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 from needle_controller.steering.simulation import drawn, GroundTruth, insert
 from needle_dynamics import (
@@ -189,7 +189,7 @@ def _run(options: argparse.Namespace) -> int:
     model = SteeringModel(needle, steering, depths, belief)
     limits = options.limit, options.turns, options.load_limit
     try:
-        controller = SteeringController(model, aim, *limits)
+        controller = MultiHypothesisLaw(model, aim, *limits)
     except OutOfReachError as error:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
