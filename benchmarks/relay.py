@@ -289,7 +289,7 @@ def insert(
         def ready() -> bool:
             seen = steering.diagnose()[2]
             taken = [str(seen.get(f'input {one.name}', ' 0 taken')) for one in _STATES[::2]]
-            heard = {'controller', 'plant'} <= {*steering._loop._monitor._receivers}
+            heard = {'controller', 'plant'} <= {*steering._loop._motions.monitor._receivers}
             known = 'steering' in operator.states
             return known and heard and not any(' 0 taken' in one for one in taken)
 

@@ -29,6 +29,14 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
 DEFAULT_LAW: Final = 'multi_hypothesis'
 
 
+#: Names in the status of the values of a law.
+STATUS_NAMES: Final[Mapping[str, str]] = {
+    'turns_left': 'turns left',
+    'hit_probability': 'chance to come within 1 mm',
+    'bending_length_ratio': 'bending length over the believed one',
+}
+
+
 class SteeringFaultError(JobError):
     """The tip measurement is implausible, frozen or missing, or the law has failed."""
 
@@ -116,7 +124,7 @@ class SteeringLaw(Protocol):
         """Return the predicted position of the tip at the last depth, None without prediction."""
 
     def status(self) -> Mapping[str, float]:
-        """Return values for the status, by name."""
+        """Return values for the status by name: a key of `STATUS_NAMES`, or another name."""
 
 
 class LawClass(Protocol):

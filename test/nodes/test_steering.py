@@ -292,7 +292,7 @@ def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
     bench.until(lambda: ' 0 taken' not in bench.taken('tip_deflection'), 'the sensors')
     bench.send(TARGET)
     bench.until(lambda: bench.steering.diagnose()[2]['phase'] == 'planning', 'the plan')
-    job, before = bench.steering._loop._job, bench.taken('joint_states')
+    job, before = bench.steering._loop._planner.job, bench.taken('joint_states')
     bench.until(lambda: bench.taken('joint_states') != before, 'measurements')
     answer = bench.stop.call_async(Trigger.Request())
     bench.until(answer.done, 'the answer')

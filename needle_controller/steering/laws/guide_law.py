@@ -95,4 +95,4 @@ class GuideLaw:
 
     def status(self) -> Mapping[str, float]:
         """Return values for the status, by name."""
-        return {'turns left': self.turns}
+        return {'turns_left': self.turns}

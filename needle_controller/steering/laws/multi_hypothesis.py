@@ -283,9 +283,9 @@ class MultiHypothesisLaw:
     def status(self) -> Mapping[str, float]:
         """Return values for the status, by name."""
         return {
-            'turns left': self.turns,
-            'chance to come within 1 mm': self.chance,
-            'bending length over the believed one': self.bending,
+            'turns_left': self.turns,
+            'hit_probability': self.chance,
+            'bending_length_ratio': self.bending,
         }
 
     @property
