@@ -55,7 +55,6 @@ from needle_controller.steering.law import (
     SteeringLaw,
     TipEstimate,
 )
-from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
@@ -83,7 +82,6 @@ __all__ = [
     'ExecutiveSettings',
     'ForceCommand',
     'Guard',
-    'GuideLaw',
     'GuideSetpoint',
     'HardwareSettings',
     'InputMonitor',

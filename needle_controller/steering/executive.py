@@ -102,8 +102,7 @@ class SteeringExecutive:
         self._joint_stream = InputMonitor(JOINT_STATES.name, timeout, jumps=_JUMPS)
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self._streams = self._joint_stream, self._tip_stream
-        self.fault = ''
-        self._noise = belief.noise
+        self.fault, self._noise = '', belief.noise
         self._planner = InsertionPlanner(needle, steering, belief, settings, start, law)
         self._motions = MotionControl(settings, self.journal)
         #: The latest insertion.
@@ -457,9 +456,16 @@ class SteeringExecutive:
         return values, law.warning if self.steers else ''
 
     def diagnose(self, now: int) -> tuple[Severity, str, dict[str, object]]:
-        """Return severity, the state in one line, and values by name, at a time now [ns]."""
-        values, warning = self._describe_control()
-        insertion = self._insertion
+        """
+        Return severity, the state in one line, and values by name.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        """
+        (values, warning), insertion = self._describe_control(), self._insertion
         if insertion is not None and insertion.law.seen is not None:
             seen, noise = insertion.law.seen, self._noise
             values['readings of the last look'] = seen.readings

@@ -149,7 +149,8 @@ class GuardedLaw:
         """Plan the next step, and log a new warning."""
         settings, k = self._settings, self.step
         with _guarded():
-            to, self.expected, warning = self.law.plan(), self.law.expected(), self.law.warning
+            to = GuideSetpoint(*map(float, self.law.plan()))
+            self.expected, warning = self.law.expected(), self.law.warning
         most = settings.guide_limit + _ROUNDING
         # False for nan.
         if not (abs(to.x) <= most and abs(to.z) <= most and isfinite(to.roll)):

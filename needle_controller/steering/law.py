@@ -101,20 +101,40 @@ class SteeringLaw(Protocol):
 
     def aim(self, target: ArrayLike) -> None:
         """
-        Continue to another target at the same depth, x and z [m].
+        Continue to another target at the same depth.
 
-        Raises a `NeedleError` and keeps the target if the new one is not possible.
+        Parameters
+        ----------
+        target : array_like, shape (2,)
+            Target position of the tip at the last depth, x and z [m].
+
+        Raises
+        ------
+        NeedleError
+            If the target is not possible. The target is then unchanged.
+
         """
 
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
         """
-        Process an averaged tip measurement, x and z in the frame of the sensor [m], or None.
+        Process an averaged tip measurement.
 
-        ``at`` is the number of its depth: the present or, if the needle does not rest, the one
-        before. ``noise`` is its standard deviation along each axis, if above the configured one
-        [m]. Raises `SteeringFaultError` if the needle must stop.
+        Parameters
+        ----------
+        tip : array_like of shape (2,) or None
+            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
+        at : int
+            Number of its depth: the present or, if the needle does not rest, the one before.
+        noise : float
+            Standard deviation of the measurement along each axis, if above the configured one [m].
+
+        Raises
+        ------
+        SteeringFaultError
+            If the needle must stop.
+
         """
 
     def plan(self) -> GuideSetpoint:
@@ -141,15 +161,7 @@ class LawClass(Protocol):
         roll: float,
         step_limit: float,
     ) -> SteeringLaw:
-        """
-        Create a law.
-
-        ``model`` has the nominal needle, the depths of the measurements and the responses of the
-        tip; ``target`` is x and z [m]. ``position_limit`` and ``step_limit`` are the largest
-        position of the guide and its largest change per step, along each axis [m]; ``load_limit``
-        is its largest planned force [N], ``turns`` the allowed number of turns of the needle, and
-        ``roll`` its roll at the start [rad].
-        """
+        """Create a law; parameters as for `build_law`."""
 
 
 def find_law(name: str) -> LawClass:
@@ -181,7 +193,41 @@ def build_law(
     roll: float = 0.0,
     step_limit: float = inf,
 ) -> SteeringLaw:
-    """Construct a steering law by name; see `find_law` and `LawClass`."""
+    """
+    Construct a steering law by name.
+
+    Parameters
+    ----------
+    name : str
+        A key of `STEERING_LAWS`, or a class outside the package as ``module:Class``.
+    model : SteeringModel
+        Nominal needle, depths of the measurements, and responses of the tip.
+    target : array_like, shape (2,)
+        Target position of the tip at the last depth, x and z [m].
+    position_limit : float
+        Largest position of the guide along x and along z [m].
+    turns : int
+        Allowed number of turns of the needle.
+    load_limit : float
+        Largest planned force of the guide along x and along z [N].
+    roll : float
+        Roll of the needle at the start [rad].
+    step_limit : float
+        Largest change of the guide from one step to the next along x and along z [m].
+
+    Returns
+    -------
+    SteeringLaw
+        The law.
+
+    Raises
+    ------
+    ParameterError
+        If there is no such law, or its class cannot be constructed.
+    OutOfReachError
+        If the law detects that the target is out of reach.
+
+    """
     of_class = find_law(name)
     try:
         law = of_class(

@@ -11,7 +11,6 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import (
-    GuideLaw,
     GuideSetpoint,
     MultiHypothesisLaw,
     OutOfReachError,
@@ -20,6 +19,7 @@ from needle_controller import (
     SteeringPrior,
 )
 from needle_controller.steering.laws.broyden import BroydenLaw
+from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
