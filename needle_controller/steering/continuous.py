@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy, Phase, STILL
+from needle_controller.steering.insertion import InsertionStrategy, Phase
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl
+from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_ros.timing import NANOSECONDS

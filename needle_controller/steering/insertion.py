@@ -9,15 +9,12 @@ from typing import Final
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.motion_control import MotionControl
+from needle_controller.steering.motion_control import MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics.arrays import FloatArray
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-
-#: Largest displacement of a needle at rest [m].
-STILL: Final = 1e-4
 
 
 class Phase(Enum):

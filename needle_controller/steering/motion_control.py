@@ -26,7 +26,7 @@ LAGGING: Final = 5.0
 _STOP_AGAIN, _STOPS = 0.5, 4
 
 #: Largest displacement of a needle at rest [m].
-_STILL: Final = 1e-4
+STILL: Final = 1e-4
 
 #: Tolerance of equal positions [m, rad].
 _SAME: Final = 1e-6
@@ -207,7 +207,7 @@ class MotionControl:
         if self._halt is None or stamp - since < _STOP_AGAIN * NANOSECONDS:
             return None
         self._halted = stamp, depth
-        if abs(depth - before) < _STILL:
+        if abs(depth - before) < STILL:
             self._halt = None
             return None
         if not self._stops:

@@ -1,4 +1,4 @@
-"""Outer loop with a simulated robot, needle and tracker, in simulated time."""
+"""Steering executive with a simulated robot, needle and tracker, in simulated time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CONTINUOUS = replace(SETTINGS, continuous=True)
 
 
 class Robot:
-    """Outer loop, robot and needle in tissue softer than the prior."""
+    """Executive, robot and needle in tissue softer than the prior."""
 
     def __init__(
         self,
