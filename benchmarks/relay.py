@@ -289,7 +289,7 @@ def insert(
         def ready() -> bool:
             inputs = steering.diagnose().status.input
             accepted = [inputs[one.name].accepted for one in _STATES[::2] if one.name in inputs]
-            heard = {'controller', 'plant'} <= {*steering._loop._monitor._receivers}
+            heard = {'controller', 'plant'} <= {*steering._loop._motions.monitor._receivers}
             known = 'steering' in operator.states
             return known and heard and len(accepted) == len(_STATES[::2]) and all(accepted)
 

@@ -1,4 +1,4 @@
-"""Controllers that steer the tip to a target, compared on the same needles."""
+"""Laws that steer the tip to a target, compared on the same needles."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from typing import Final, NamedTuple
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from needle_controller.steering import simulation
-from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
-from needle_controller.steering.controller import (
-    GuideSetpoint,
-    OutOfReachError,
-    SteeringController,
-    SteeringFaultError,
-)
+from needle_controller.steering.law import GuideSetpoint, SteeringFaultError, SteeringLaw
+from needle_controller.steering.laws.broyden import BroydenLaw
+from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
+from needle_controller.steering.laws.open_loop import OpenLoopLaw
+from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
+from needle_controller.steering.laws.springs import SpringsLaw
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import drawn
@@ -153,7 +152,7 @@ def _model(
     return SteeringModel(*believed(medium, bevel), STEP * np.arange(steps + 1), belief)
 
 
-class MeanPlan(SteeringController):
+class MeanPlan(MultiHypothesisLaw):
     """Our controller with a different plan: a quadratic program for the mean of the hypotheses."""
 
     def _choose(self) -> complex:
@@ -187,16 +186,17 @@ class _Trial:
         truth, known = self.truth, SteeringPrior(spread=0.0)
         return SteeringModel(truth.needle, truth.steering, self.depths, known)
 
-    def end(self, controller: SteeringController | OpenLoop) -> tuple[FloatArray, End]:
+    def end(self, law: SteeringLaw) -> tuple[FloatArray, End]:
         """Return the final tip position and the end of the insertion."""
         times, said = list[float](), list[str]()
 
         def follow(tip: FloatArray | None) -> GuideSetpoint:
             begin = perf_counter()
-            to = controller.next(tip)
+            law.update(tip, law.step)
+            to = law.plan()
             times.append(perf_counter() - begin)
-            if isinstance(controller, SteeringController) and controller.step < len(self.depths):
-                said.append(controller.warning)
+            if law.step < len(self.depths):
+                said.append(law.warning)
             return to
 
         look = _look(self._sensor, self._seed)
@@ -240,7 +240,7 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     the needle, its target and all noise.
     """
     medium, one = _drawn(spread, sensor, seed)
-    (needle, steering), truth = believed(medium), one.truth
+    truth = one.truth
     depths, target = one.depths, one.target
     alone = one.known()
     causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
@@ -249,9 +249,9 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     ends: dict[str, End] = {}
     warned = held = refused = False
     look = inf
+    model = _model(medium, len(depths) - 1, sensor, spread)
     try:
-        model = _model(medium, len(depths) - 1, sensor, spread)
-        ours = SteeringController(model, target, LIMIT)
+        ours = MultiHypothesisLaw(model, target, LIMIT)
     except OutOfReachError:
         refused = True
     else:
@@ -261,12 +261,12 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
         warned, look = bool(one.said), one.look
         held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
         ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMIT))[1]
-    others: Mapping[str, OpenLoop] = {
-        'springs': Springs(needle, steering, depths, target, LIMIT),
-        'Broyden': Broyden(needle, steering, depths, target, LIMIT),
-        'open loop': OpenLoop(depths, target, LIMIT),
+    others: Mapping[str, SteeringLaw] = {
+        'springs': SpringsLaw(model, target, LIMIT),
+        'Broyden': BroydenLaw(model, target, LIMIT),
+        'open loop': OpenLoopLaw(model, target, LIMIT),
     }
-    ends |= {name: one.end(controller)[1] for name, controller in others.items()}
+    ends |= {name: one.end(law)[1] for name, law in others.items()}
     reachable = bool((np.abs(target - drift) <= could).all())
     return SteeringOutcome(medium, reachable, ends, refused, warned, held, look)
 
@@ -283,17 +283,17 @@ def turn(seed: int) -> SteeringOutcome:
     causes = np.array([np.zeros(2), truth.frame, truth.tilt])
     drift = alone.causes[0, -1, :3] @ causes
     model = _model(medium, len(depths) - 1, sensor, spread, BEVEL)
-    controllers: dict[str, SteeringController | OpenLoop] = {
-        TURNING[2]: RollTowards(depths, one.target),
-        TURNING[3]: OpenLoop(depths, one.target),
+    laws: dict[str, SteeringLaw] = {
+        TURNING[2]: RollToTargetLaw(model, one.target, turns=len(depths)),
+        TURNING[3]: OpenLoopLaw(model, one.target),
     }
     refused = False
     try:
-        controllers[TURNING[0]] = SteeringController(model, one.target, LIMIT, TURNS)
-        controllers[TURNING[1]] = SteeringController(model, one.target, 0.0, TURNS)
+        laws[TURNING[0]] = MultiHypothesisLaw(model, one.target, LIMIT, TURNS)
+        laws[TURNING[1]] = MultiHypothesisLaw(model, one.target, 0.0, TURNS)
     except OutOfReachError:
         refused = True
-    ends = {name: one.end(controller)[1] for name, controller in controllers.items()}
+    ends = {name: one.end(law)[1] for name, law in laws.items()}
     reachable = bool(np.hypot(*(one.target - drift)) <= WITHIN * could)
     return SteeringOutcome(medium, reachable, ends, refused, False, False, one.look)
 

@@ -46,14 +46,16 @@ from needle_controller.stability import (
     stability_limit,
     transition_matrix,
 )
-from needle_controller.steering.controller import (
+from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.law import (
+    build_law,
     GuideSetpoint,
-    OutOfReachError,
-    SteeringController,
+    STEERING_LAWS,
     SteeringFaultError,
+    SteeringLaw,
     TipEstimate,
 )
-from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
@@ -64,6 +66,7 @@ __all__ = [
     'DEFAULT_GAINS',
     'LAWS',
     'REFERENCES',
+    'STEERING_LAWS',
     'Adaptive',
     'AdaptiveGains',
     'Admittance',
@@ -90,6 +93,7 @@ __all__ = [
     'LoopRun',
     'Measurement',
     'MinimumJerk',
+    'MultiHypothesisLaw',
     'Observer',
     'ObserverSettings',
     'OutOfReachError',
@@ -102,15 +106,16 @@ __all__ = [
     'SafetyLimits',
     'SampledLoop',
     'Setpoint',
-    'SteeringController',
     'SteeringExecutive',
     'SteeringFaultError',
+    'SteeringLaw',
     'SteeringModel',
     'SteeringPrior',
     'Supervisor',
     'TipEstimate',
     'Trapezoid',
     'Uncertainty',
+    'build_law',
     'check_stability',
     'no_memory',
     'run_batch',

@@ -10,8 +10,8 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from needle_controller.steering.controller import TipEstimate
 from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.prior import SteeringPrior
@@ -62,12 +62,13 @@ class SteeringNode(CompiledNode):
     guide follows its depth. A robot follows all joints; where a controller moves the needle, with
     its parameter ``steered``, it follows the insertion. ``joint_states`` must have these joints.
 
-    The nominal model of needle and tissue is ``model.*`` and ``steering.*``, its uncertainty
-    ``belief.*``. The plan is computed in a thread: messages and ``~/stop`` do not wait for it. A
-    target out of reach is rejected with the reachable range. Each motion is sent again until the
-    robot follows it. The needle stops when the tip measurement freezes, is missing, slips or is
-    implausible, when a node rejects a motion, when a joint does not arrive, and by ``~/stop``.
-    ``tip_expected`` is the expected position of the tip at the target depth.
+    The steering law is ``law``, see `build_law`. The nominal model of needle and tissue is
+    ``model.*`` and ``steering.*``, its uncertainty ``belief.*``. The plan is computed in a thread:
+    messages and ``~/stop`` do not wait for it. A target out of reach is rejected with the
+    reachable range. Each motion is sent again until the robot follows it. The needle stops when
+    the tip measurement freezes, is missing, slips or is implausible, when a node rejects a motion,
+    when a joint does not arrive, and by ``~/stop``. ``tip_expected`` is the
+    expected position of the tip at the target depth, if the law predicts it.
 
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
@@ -78,6 +79,13 @@ class SteeringNode(CompiledNode):
         super().__init__('steering', **node_options)
         self.declare_settings('', ExecutiveSettings())
         self.declare_settings('belief.', SteeringPrior())
+        self.declare_parameter(
+            'law',
+            DEFAULT_LAW,
+            ParameterDescriptor(
+                description=f'steering law: one of {", ".join(STEERING_LAWS)}, or module:Class'
+            ),
+        )
         # Fixed at start: it determines the other defaults.
         self.declare_parameter(
             'model.preset',
@@ -127,7 +135,11 @@ class SteeringNode(CompiledNode):
         # Load or compile the functions before any motion; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
         settings = self.settings('', ExecutiveSettings)
-        self._loop = SteeringExecutive(needle, steering, belief, settings, start=ThreadJob)
+        law = self.text('law')
+        find_law(law)
+        self._loop = SteeringExecutive(
+            needle, steering, belief, settings, start=ThreadJob, law=law
+        )
 
     def cleanup(self) -> None:
         """Discard the steering executive."""
@@ -152,10 +164,10 @@ class SteeringNode(CompiledNode):
         """Name constants, steps and topics."""
         values = self.values()
         return (
-            f'preset {values["model.preset"]}, steps of {1e3 * values["step_length"]:g} mm; takes '
-            f'{contract.TARGET.name}, {contract.JOINT_STATES.name} and '
-            f'{contract.TIP_DEFLECTION.name}, publishes {contract.JOINT_TRAJECTORY.name} and '
-            f'{contract.TIP_EXPECTED.name}'
+            f'law {values["law"]}, preset {values["model.preset"]}, steps of '
+            f'{1e3 * values["step_length"]:g} mm; takes {contract.TARGET.name}, '
+            f'{contract.JOINT_STATES.name} and {contract.TIP_DEFLECTION.name}, publishes '
+            f'{contract.JOINT_TRAJECTORY.name} and {contract.TIP_EXPECTED.name}'
         )
 
     # Inputs.

@@ -312,7 +312,7 @@ class RecorderNode(BaseNode):
 
 
 def is_hidden(topic: str) -> bool:
-    """Return whether a topic (full name) of the middleware or of a tool is excluded from *."""
+    """Return whether the selection of all topics excludes a topic (full name) as internal."""
     return '/_' in topic or topic in _NOT_FOR_ALL
 
 

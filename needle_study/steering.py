@@ -1,4 +1,4 @@
-"""Insert sampled needles to a target, steered by a controller or in open loop."""
+"""Insert sampled needles to a target, steered by a law or in open loop."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from functools import cached_property
 from math import nan
 from typing import Any, Final
 
-from needle_controller import (
-    OutOfReachError,
-    SteeringController,
-    SteeringModel,
-    SteeringPrior,
+from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller.steering.law import (
+    build_law,
+    DEFAULT_LAW,
+    find_law,
+    GuideSetpoint,
+    SteeringFaultError,
+    SteeringLaw,
 )
-from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
-from needle_controller.steering.controller import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.simulation import GroundTruth, insert
 from needle_dynamics import (
     FloatArray,
@@ -34,12 +35,8 @@ from needle_study.reading import check_names, mapping, one_of
 from needle_study.scenario import MeasuredRun, Metric, Variable
 import numpy as np
 
-OURS: Final = 'ours'
-BROYDEN: Final = 'Broyden'
-OPEN_LOOP: Final = 'open loop'
-
-#: Controllers of the guide.
-CONTROLLERS: Final = (OURS, 'springs', BROYDEN, 'roll towards the target', OPEN_LOOP)
+#: Law of a guide at rest, for which a batch is simulated without a law.
+_OPEN_LOOP: Final = 'open_loop'
 
 #: Largest miss of a hit [m].
 HIT: Final = 1e-3
@@ -64,7 +61,7 @@ _MOST: Final = 1000
 _TOGETHER: Final = 256
 
 #: Settings that are mappings or words.
-_PARTS: Final = ('needle', 'constants', 'belief', 'controller')
+_PARTS: Final = ('needle', 'constants', 'belief', 'law')
 
 FIGURES: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
@@ -75,11 +72,11 @@ FIGURES: Final[Mapping[str, Metric]] = {
     'turns': Metric('1', 'number of needle rotations'),
     'load': Metric('N', 'largest lateral force on the guide after its motions'),
     'refused': Metric('', 'the target was rejected as outside the reachable set'),
-    'stopped': Metric('', 'the controller stopped before the target depth'),
+    'stopped': Metric('', 'the law stopped the insertion before the target depth'),
     'warned': Metric('', 'a warning before the target depth: target outside the reachable set'),
-    'said_x': Metric('m', 'expected final tip position of the controller'),
-    'said_z': Metric('m', 'expected final tip position of the controller'),
-    'held': Metric('', 'the tip is in the 95 % ellipse of the controller'),
+    'said_x': Metric('m', 'expected final tip position of the law'),
+    'said_z': Metric('m', 'expected final tip position of the law'),
+    'held': Metric('', 'the tip is in the 95 % ellipse of the law'),
 }
 
 
@@ -107,7 +104,7 @@ class SteeringProtocol:
     Steer needles that differ from the nominal model to a target.
 
     `settings` holds ``needle``, a preset; nominal ``constants``; ``belief``, the prior
-    uncertainty; ``controller``, one of `CONTROLLERS`; and the fields of `SteeringStudy`. Raises
+    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`. Raises
     `ParameterError` if a setting is not valid.
     """
 
@@ -121,9 +118,8 @@ class SteeringProtocol:
         needle, steering, _ = STEERING_PRESETS[
             one_of('settings: needle', preset, STEERING_PRESETS)
         ]
-        self._controller = one_of(
-            'settings: controller', settings.get('controller', OURS), CONTROLLERS
-        )
+        self._law = str(settings.get('law', DEFAULT_LAW))
+        find_law(self._law)
         given = dict(mapping('settings: constants', settings.get('constants')))
         of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
         self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
@@ -141,10 +137,15 @@ class SteeringProtocol:
             raise ParameterError(
                 f'settings: depth over step must be <= {_MOST} steps, got {ways:.3g}'
             )
-        moves = {OURS: numbers.guide_limit or numbers.turns, BROYDEN: numbers.guide_limit}
-        if not moves.get(self._controller, True):
+        moves = {
+            DEFAULT_LAW: numbers.guide_limit or numbers.turns,
+            'broyden': numbers.guide_limit,
+            'roll_to_target': numbers.turns,
+        }
+        if not moves.get(self._law, True):
             raise ParameterError(
-                f'settings: controller {self._controller} with guide_limit 0 has no actuation'
+                f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
+                f'{numbers.turns:g} has no actuation'
             )
         steps = max(1, round(ways))
         self._depths = np.linspace(0.0, numbers.depth, steps + 1)
@@ -210,7 +211,7 @@ class SteeringProtocol:
             for values in zip(*(values.tolist() for values in each.values()), strict=True)
         ]
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
-        if self._controller == OPEN_LOOP:
+        if self._law == _OPEN_LOOP:
             self._open(truths, found)
             return
         for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
@@ -285,10 +286,10 @@ class SteeringProtocol:
         rng: np.random.Generator,
         watch: Callable[[SteeredNeedle], object] | None = None,
     ) -> dict[str, float]:
-        """Simulate one insertion under a controller."""
+        """Simulate one insertion under the law."""
         target, said = (row['target_x'], row['target_z']), list[str]()
         try:
-            controller = self._made(target)
+            law = self._made(target)
         except OutOfReachError:
             return {'refused': 1.0}
 
@@ -297,9 +298,10 @@ class SteeringProtocol:
             return None if lost else np.asarray(tip + row['look_noise'] * noise)
 
         def follow(tip: FloatArray | None) -> GuideSetpoint:
-            to = controller.next(tip)
-            if isinstance(controller, SteeringController) and controller.step < len(self._depths):
-                said.append(controller.warning)
+            law.update(tip, law.step)
+            to = law.plan()
+            if law.step < len(self._depths):
+                said.append(law.warning)
             return to
 
         figures = {'refused': 0.0, 'stopped': 0.0}
@@ -312,8 +314,8 @@ class SteeringProtocol:
             'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.way,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
-        if isinstance(controller, SteeringController):
-            there = controller.expected()
+        there = law.expected()
+        if there is not None:
             off = tip - there.mean
             figures |= {
                 'said_x': float(there.mean[0]),
@@ -323,19 +325,15 @@ class SteeringProtocol:
             }
         return figures
 
-    def _made(self, target: tuple[float, float]) -> SteeringController | OpenLoop:
-        """Return the controller of a target."""
-        numbers, believed = self._numbers, (self._needle, self._steering, self._depths)
-        match self._controller:
-            case 'springs':
-                return Springs(*believed, target, numbers.guide_limit)
-            case 'Broyden':
-                return Broyden(*believed, target, numbers.guide_limit)
-            case 'roll towards the target':
-                return RollTowards(self._depths, target, numbers.guide_limit)
-            case 'open loop':
-                return OpenLoop(self._depths, target)
-        return SteeringController(
-            self._model, target, numbers.guide_limit, int(numbers.turns), numbers.load_limit,
+    def _made(self, target: tuple[float, float]) -> SteeringLaw:
+        """Return the law of a target."""
+        numbers = self._numbers
+        return build_law(
+            self._law,
+            self._model,
+            target,
+            position_limit=numbers.guide_limit,
+            turns=int(numbers.turns),
+            load_limit=numbers.load_limit,
             step_limit=numbers.guide_step,
-        )  # fmt: skip
+        )

@@ -27,11 +27,11 @@ PRINTED = {
 #: Optional dependency of a script, which is skipped without it.
 NEEDS = {'inference': 'sbi'}
 
-#: Scripts run by `test_hardware.py`.
-WITH_ROS = {'robot_driver'}
+#: Scripts run by `test_hardware.py` and `test_own_law.py`.
+ELSEWHERE = {'robot_driver', 'steering_law'}
 
 
-@pytest.mark.parametrize('name', sorted({path.stem for path in EXAMPLES.glob('*.py')} - WITH_ROS))
+@pytest.mark.parametrize('name', sorted({path.stem for path in EXAMPLES.glob('*.py')} - ELSEWHERE))
 def test_example_runs(
     name: str,
     tmp_path: Path,

@@ -1,5 +1,5 @@
 r"""
-Measurement update and plan of the steering controller; see `SteeringController`.
+Measurement update and plan of the steering controller; see `MultiHypothesisLaw`.
 
 By hypothesis the tip at a depth is :math:`z = a \cdot b + x \cdot \theta` with the positions b of
 the guide, x + i z, and unknown constants :math:`\theta` with mean :math:`\bar\theta` and

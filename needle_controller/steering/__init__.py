@@ -1,1 +1,1 @@
-"""Steering: controllers that move the guide so that the tip hits its target, and baselines."""
+"""Steering: laws that move the guide so that the tip hits its target, and their executive."""

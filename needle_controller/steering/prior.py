@@ -1,4 +1,4 @@
-"""Prior uncertainty of needle, tissue, path and sensor for a steering controller."""
+"""Prior uncertainty of needle, tissue, path and sensor for a steering law."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class SteeringModel:
     ----------
     depths : ndarray, shape (n + 1,)
         The depths [m].
-    belief : SteeringPrior
+    needle, steering, belief : NeedleParameters, SteeringParameters, SteeringPrior
         As given.
     lengths, skins : ndarray, shape (h,)
         Bending length and skin stiffness of each hypothesis, relative to the nominal values.
@@ -142,6 +142,7 @@ class SteeringModel:
                 f'depths must be in [0, {reach:g}] m, the length of the needle without its free '
                 f'length, got {at[0]:g} to {at[-1]:g} m'
             )
+        self.needle, self.steering = needle, steering
         self.depths, self.belief = at, belief or SteeringPrior()
         self._together = together
         width = _BEYOND * self.belief.spread

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import hypot
 from typing import NamedTuple
 
-from needle_controller.steering.controller import GuideSetpoint
+from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters

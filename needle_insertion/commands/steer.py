@@ -11,13 +11,15 @@ from pathlib import Path
 import sys
 from typing import Any, Final, NamedTuple
 
-from needle_controller import (
-    OutOfReachError,
-    SteeringController,
-    SteeringModel,
-    SteeringPrior,
+from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller.steering.law import (
+    build_law,
+    DEFAULT_LAW,
+    find_law,
+    GuideSetpoint,
+    STEERING_LAWS,
+    TipEstimate,
 )
-from needle_controller.steering.controller import GuideSetpoint
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 from needle_controller.steering.simulation import drawn, GroundTruth, insert
 from needle_dynamics import (
@@ -70,6 +72,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(STEERING_PRESETS),
         default='bending_35mm',
         help='nominal model of needle and tissue (default bending_35mm)',
+    )
+    parser.add_argument(
+        '--law',
+        default=DEFAULT_LAW,
+        metavar='NAME',
+        help=f'steering law, one of {", ".join(STEERING_LAWS)}, or module:Class of your own '
+        f'(default {DEFAULT_LAW})',
     )
     parser.add_argument(
         '--set',
@@ -150,6 +159,7 @@ def _task(options: argparse.Namespace) -> _Task:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
         check_file(options.output)
+    find_law(options.law)
     if options.seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {options.seed}')
     target = _target(options.target)
@@ -182,14 +192,27 @@ def _truth(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
+def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
+    """Return the expected tip and the half width of its interval; None without prediction."""
+    mean = None if there is None else there.mean.tolist()
+    half = None if there is None else (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist()
+    return {'expected tip [m]': mean, 'its interval of 95 % [m]': half}
+
+
 def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print the final tip positions of both needles."""
     target, needle, steering, belief, depths = _task(options)
     aim = target[[0, 2]]
     model = SteeringModel(needle, steering, depths, belief)
-    limits = options.limit, options.turns, options.load_limit
     try:
-        controller = SteeringController(model, aim, *limits)
+        law = build_law(
+            options.law,
+            model,
+            aim,
+            position_limit=options.limit,
+            turns=options.turns,
+            load_limit=options.load_limit,
+        )
     except OutOfReachError as error:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
@@ -202,28 +225,29 @@ def _run(options: argparse.Namespace) -> int:
         return np.asarray(tip + belief.noise * noise.standard_normal(2))
 
     def follow(tip: FloatArray | None) -> GuideSetpoint:
-        depth, to = depths[controller.step], controller.next(tip)
-        if controller.warning and not warnings and depth < target[1]:
-            warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {controller.warning}')
+        depth = depths[law.step]
+        law.update(tip, law.step)
+        to = law.plan()
+        if law.warning and not warnings and depth < target[1]:
+            warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {law.warning}')
         return to
 
     done = insert(truth, depths, look, follow, lambda one: shapes.append(_line(one.shape)))
     ours = done.needle
     alone = truth.start()
     alone.move(depth=float(target[1]))
-    tip, other, there = truth.tip(ours), truth.tip(alone), controller.expected()
+    tip, other = truth.tip(ours), truth.tip(alone)
     found: dict[str, Any] = {
         'target [m]': aim.tolist(),
         'tip [m]': tip.tolist(),
         'tip open loop [m]': other.tolist(),
-        'expected tip [m]': there.mean.tolist(),
-        'its interval of 95 % [m]': (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist(),
+        **_expected(law.expected()),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
         'way of the guide [m]': done.way,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
-        'bending length over the believed one': controller.bending,
+        'bending length over the believed one': law.status().get('bending_length_ratio'),
         'warnings': warnings,
     }
     for words in warnings:
@@ -251,16 +275,18 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _text(found: Mapping[str, Any]) -> str:
-    """Return the final tip positions as a table."""
+    """Return the final tip positions as a table, without values that the law does not have."""
     rows = [
         (name, f'{1e3 * x:.3f}', f'{1e3 * z:.3f}', '' if miss is None else f'{1e3 * miss:.3f}')
-        for name, (x, z), miss in (
+        for name, at, miss in (
             ('target', found['target [m]'], None),
             ('tip', found['tip [m]'], found['miss [m]']),
             ('expected tip', found['expected tip [m]'], None),
             ('± (95 %)', found['its interval of 95 % [m]'], None),
             ('open loop', found['tip open loop [m]'], found['miss open loop [m]']),
         )
+        if at is not None
+        for x, z in (at,)
     ]
     return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
 

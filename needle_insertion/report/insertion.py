@@ -16,7 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     # Take half a second each to import; only pictures need them.
     from matplotlib.figure import Figure
-    from needle_controller.steering.controller import Reach
+    from needle_controller.steering.laws.multi_hypothesis import Reach
 
 #: Columns of the CSV, with the names that friction and steering identification expect.
 COLUMNS: Final = (

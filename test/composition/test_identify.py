@@ -196,7 +196,8 @@ def test_friction_page_shows_the_results(
         one = found['statistics'][name]
         assert re.search(rf'\b{one["mean"]:.3f}'[:-1], seen.text)
     for words in (
-        'Coulomb friction', 'Table 1', '0.56 ± 0.0374', 'could not be used', 'missing', 'Lost or corrected',
+        'Coulomb friction', 'Table 1', '0.56 ± 0.0374', 'could not be used', 'missing',
+        'Lost or corrected',
         found['recordings'][0]['files'][0][1], str(file), 'ros2 param set', *BAGS,
     ):  # fmt: skip
         assert words in seen.text

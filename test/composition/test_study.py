@@ -41,7 +41,7 @@ SMALL: dict[str, Any] = {
     'protocol': 'steering',
     'samples': 40,
     'seed': 3,
-    'settings': {'depth': 0.05, 'step': 0.01, 'controller': 'springs'},
+    'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
     'population': {
         'target_x': {'uniform': [-0.002, 0.002]},
         'bending_length': {'lognormal': [1.0, 0.1], 'within': [0.6, 1.6]},
@@ -83,10 +83,10 @@ def test_samples_are_independent_of_chunks(design: str) -> None:
             assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
 
 
-@pytest.mark.parametrize(('controller', 'count'), [('ours', 5), ('open loop', 300)])
-def test_samples_are_independent_of_their_batch(controller: str, count: int) -> None:
+@pytest.mark.parametrize(('law', 'count'), [('multi_hypothesis', 5), ('open_loop', 300)])
+def test_samples_are_independent_of_their_batch(law: str, count: int) -> None:
     """Bit-identical; open-loop samples are computed in batches of some hundreds."""
-    study = made({**SMALL, 'settings': {**SMALL['settings'], 'controller': controller}})
+    study = made({**SMALL, 'settings': {**SMALL['settings'], 'law': law}})
     whole = study.rows(0, count)
     assert np.isfinite(whole['miss']).all()
     for number in (0, count // 2, count - 1):
@@ -286,7 +286,7 @@ def test_pages_limit_the_number_of_samples(
 
 def test_open_loop_equals_a_guide_at_rest(tmp_path: Path) -> None:
     """The batch gives the same tips as single insertions."""
-    free = {**SMALL, 'settings': {**SMALL['settings'], 'controller': 'open loop'}}
+    free = {**SMALL, 'settings': {**SMALL['settings'], 'law': 'open_loop'}}
     rows = made(free).rows(0, 20)
     still = {**SMALL, 'settings': {**SMALL['settings'], 'guide_limit': 0.0}}
     same = made(still).rows(0, 20)
@@ -453,8 +453,8 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
         ({'settings': {'step': 1e-9}}, 'depth over step must be <= 1000 steps, got 1e+08'),
         ({'settings': {'turns': 0.7}}, 'settings.turns must be a whole number, got 0.7'),
-        ({'settings': {'guide_limit': 0}}, 'controller ours with guide_limit 0 has no actuat'),
-        ({'settings': {'guide_limit': 0, 'controller': 'Broyden'}}, 'controller Broyden with'),
+        ({'settings': {'guide_limit': 0}}, 'law multi_hypothesis with guide_limit 0'),
+        ({'settings': {'guide_limit': 0, 'law': 'broyden'}}, 'law broyden with'),
         ({'correlations': [['skin', 'tilt', 0.5]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 2]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 0.9], ['tilt_z', 'target_x', 0.9],
@@ -462,9 +462,9 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'settings': {'deep': 1}}, "settings: unknown parameter 'deep'; did you mean 'depth'?"),
         ({'settings': {'depth': -1}}, 'settings.depth must be finite, > 0 m, got -1'),
         ({'settings': {'needle': 'bone'}}, 'settings: needle must be one of'),
-        ({'settings': {'controller': 'me'}}, 'settings: controller must be one of ours'),
+        ({'settings': {'law': 'me'}}, 'law must be one of multi_hypothesis'),
         ({'settings': {'needle': [1]}}, 'settings: needle must be one of'),
-        ({'settings': {'controller': [1]}}, 'settings: controller must be one of ours'),
+        ({'settings': {'law': [1]}}, 'law must be one of multi_hypothesis'),
         ({'settings': {'constants': 1}}, 'settings: constants must be names with values, got 1'),
         ({'settings': {'constants': {1: 1}}}, "unknown parameter '1'"),
         ({'settings': {'belief': 1}}, 'settings: belief must be names with values, got 1'),

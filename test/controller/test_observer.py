@@ -1031,7 +1031,7 @@ def test_invalid_encoder_samples_do_not_change_the_estimate() -> None:
             observer.update(ns(0.05), *bad)
     for method in (observer.update, observer.add_wrench):
         with pytest.raises(ParameterError, match=r'must be an integer \[ns\], got 0.05'):
-            method(0.05, 0.1, 0.0)
+            method(0.05, 0.1, 0.0)  # type: ignore[arg-type]
     for depth in (0.0005, 0.21, -1.0):
         with pytest.raises(InsertionDepthError, match='the estimate is held'):
             observer.update(ns(0.05), depth, 0.0)

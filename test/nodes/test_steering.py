@@ -169,6 +169,20 @@ def test_tip_reaches_its_target(ros_graph: RosGraph) -> None:
     }
 
 
+def test_law_outside_the_package_steers(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within 1 mm; a law without prediction publishes no expected tip."""
+    monkeypatch.syspath_prepend(ROOT / 'examples')
+    bench = Bench(ros_graph, law='steering_law:NominalLaw')
+    bench.aim()
+    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.said == 'done: the needle is at the target depth'
+    # A fixed guide misses by 2 mm.
+    assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 1e-3
+    assert not bench.expected
+
+
 def test_robot_topics_may_be_remapped(ros_graph: RosGraph) -> None:
     """Each trajectory has all joints of the robot and ends at rest."""
     bench = Bench(ros_graph, prefix='arm/')
@@ -301,7 +315,7 @@ def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.accepted('tip_deflection'), 'the sensors')
     bench.send(TARGET)
     bench.until(lambda: bench.status.phase is SteeringPhase.PLANNING, 'the plan')
-    job, before = bench.steering._loop._job, bench.accepted('joint_states')
+    job, before = bench.steering._loop._planner.job, bench.accepted('joint_states')
     bench.until(lambda: bench.accepted('joint_states') != before, 'measurements')
     answer = bench.stop.call_async(Trigger.Request())
     bench.until(answer.done, 'the answer')
@@ -365,6 +379,7 @@ def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> Non
         ('steering.path_noise', 0.1, "unknown parameter 'steering.path_noise'"),
         ('turns', 0.5, 'turns must be a whole number, got 0.5'),
         ('model.preset', 'bone', 'model.preset must be one of paper_si'),
+        ('law', 'mine', "or module:Class, got 'mine'"),
     ):
         node = ros_graph.add(SteeringNode, start=False, parameters={name: value})
         assert not node.start()

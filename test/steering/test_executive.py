@@ -420,7 +420,7 @@ def test_needle_must_be_straight_at_the_start() -> None:
     assert robot.aim() == ''
     robot.tick(55)
     assert_allclose(robot.at, 0.0, atol=1e-12)
-    assert robot.loop.control.step == 0
+    assert robot.loop.law.step == 0
 
     robot = Robot()
     robot.ways[:2] = [(np.zeros(1), np.array([at])) for at in (0.02, 3e-3)]
@@ -436,7 +436,7 @@ def test_target_may_move_laterally_but_not_in_depth() -> None:
     assert robot.loop.steers
     assert 'the insertion is to a depth of 60.00 mm, got 70.00 mm' in robot.aim((0.0, 0.07, 0.0))
     assert 'out of reach' in robot.aim((0.06, 0.06, 0.0))
-    assert_allclose(robot.loop.control.target, 0.0)
+    assert_allclose(robot.loop.law.target, 0.0)
     assert robot.aim() == ''
     while robot.loop.steers:
         robot.tick()
@@ -545,6 +545,7 @@ def test_motion_of_rounding_size_is_not_sent() -> None:
     robot.aim()
     loop = robot.loop
     for way, sent in ((1e-15, False), (5e-7, False), (2e-6, True)):
-        move = loop._send(Phase.GUIDING, loop._goal + np.array([0.0, way, 0.0]), robot.now)
+        motions = loop._motions
+        move = motions.send(motions.goal + np.array([0.0, way, 0.0]), robot.now)
         assert (move is not None) == sent
         assert move is None or (np.diff(move.times) > 1e-5).all()

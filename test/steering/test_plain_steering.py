@@ -6,7 +6,7 @@ from dataclasses import replace
 from math import inf, sqrt, tau
 from typing import Any
 
-from needle_controller import GuideSetpoint, SteeringController, SteeringModel, SteeringPrior
+from needle_controller import GuideSetpoint, MultiHypothesisLaw, SteeringModel, SteeringPrior
 from needle_controller.steering.simulation import drawn, insert
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
@@ -207,14 +207,14 @@ def test_a_hundred_insertions_equal_the_plain_formulas(
         steering = replace(truth.steering, bevel_load=(float(np.hypot(*bevel)),))
         truth = replace(truth, bevel=bevel, steering=steering)
         target = (4e-3 if turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
-        ours = SteeringController(model, target, limit, turns, load_limit, step_limit=step_limit)
+        ours = MultiHypothesisLaw(model, target, limit, turns, load_limit, step_limit=step_limit)
         plain = Plain(model, target, limit, turns, load_limit, step_limit)
 
         def look(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
             return np.asarray(tip + 4e-5 * rng.standard_normal(2))
 
         def both(
-            tip: FloatArray | None, ours: SteeringController = ours, plain: Plain = plain
+            tip: FloatArray | None, ours: MultiHypothesisLaw = ours, plain: Plain = plain
         ) -> GuideSetpoint:
             assert tip is not None
             to = ours.next(tip)

@@ -9,6 +9,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from needle_controller import SteeringPrior
 from needle_controller.steering.executive import SteeringExecutive
 from needle_controller.steering.planning import (
     CancelledError,
@@ -247,7 +248,7 @@ class Planning(Robot):
         super().__init__()
         Manual.made = []
         self.loop = SteeringExecutive(
-            NEEDLE, STEERING, self.loop._belief, SETTINGS, lambda: self.seconds, Manual
+            NEEDLE, STEERING, SteeringPrior(), SETTINGS, lambda: self.seconds, Manual
         )
         self.tick(20)
 

@@ -1,4 +1,4 @@
-"""The steering controller: predictions, accuracy, and rejected inputs."""
+"""The steering laws: predictions, accuracy, and rejected inputs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import (
     GuideSetpoint,
+    MultiHypothesisLaw,
     OutOfReachError,
-    SteeringController,
     SteeringFaultError,
     SteeringModel,
     SteeringPrior,
 )
-from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
+from needle_controller.steering.laws.broyden import BroydenLaw
+from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.laws.open_loop import OpenLoopLaw
+from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
+from needle_controller.steering.laws.springs import SpringsLaw
 from needle_dynamics import (
     FloatArray,
     JobError,
@@ -50,7 +54,7 @@ def other(length: float, skin: float = 1.0) -> tuple[NeedleParameters, SteeringP
 
 
 def steer(
-    controller: SteeringController | OpenLoop,
+    controller: MultiHypothesisLaw | GuideLaw,
     needle: SteeredNeedle,
     noise: float = 1e-7,
     seed: int = 0,
@@ -113,7 +117,7 @@ def test_target_is_hit_within_the_prior_uncertainty(
     """With almost no noise within 0.2 mm; open loop misses by millimeters."""
     needle, steering = other(length, skin)
     one = SteeredNeedle(needle, replace(steering, bevel_load=(bevel,)), tilt=tilt, roll=roll)
-    controller = SteeringController(MODEL, target)
+    controller = MultiHypothesisLaw(MODEL, target)
     tip = steer(controller, one)
     # Half the distance of the compared positions, and the remaining uncertainty.
     assert np.hypot(*(tip - target)) < 2e-4
@@ -125,10 +129,10 @@ def test_target_is_hit_within_the_prior_uncertainty(
 @pytest.mark.parametrize('again', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])  # noqa: S301
 def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
     """Of needle and controller, half way in; they end at the same tip as the originals."""
-    one, controller = SteeredNeedle(*other(0.9)), SteeringController(MODEL, (2e-3, 1e-3))
+    one, controller = SteeredNeedle(*other(0.9)), MultiHypothesisLaw(MODEL, (2e-3, 1e-3))
     to, copies = (
         GuideSetpoint(0.0, 0.0),
-        list[tuple[SteeredNeedle, SteeringController, GuideSetpoint]](),
+        list[tuple[SteeredNeedle, MultiHypothesisLaw, GuideSetpoint]](),
     )
     rng = np.random.default_rng(3)
     for k, look in enumerate(1e-6 * rng.standard_normal((21, 2))):
@@ -157,7 +161,7 @@ def test_both_planes_are_equivalent() -> None:
     }
     for name, turn in turns.items():
         one = SteeredNeedle(*other(0.9), tilt=turn((0.01, -0.02)))
-        tips[name] = turn(steer(SteeringController(MODEL, turn((2e-3, 1e-3))), one).tolist())
+        tips[name] = turn(steer(MultiHypothesisLaw(MODEL, turn((2e-3, 1e-3))), one).tolist())
     # The effect of the noise.
     assert_allclose(tips['swapped'], tips['as it is'], atol=2e-5)
     assert_allclose(tips['mirrored'], tips['as it is'], atol=2e-5)
@@ -165,7 +169,7 @@ def test_both_planes_are_equivalent() -> None:
 
 def test_bending_length_is_identified() -> None:
     """The remaining hypotheses are near the truth, and weights are a distribution."""
-    controller = SteeringController(MODEL, (3e-3, -2e-3))
+    controller = MultiHypothesisLaw(MODEL, (3e-3, -2e-3))
     assert_allclose(controller.weights, 1.0 / len(MODEL.lengths))
     steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
     weights = controller.weights
@@ -178,26 +182,26 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
     """The same measurement with four times its noise; a future depth is rejected."""
     left = []
     for noise in (0.0, 1.6e-4):
-        controller = SteeringController(MODEL, (0.0, 0.0))
-        controller.see((1e-4, 0.0), 0, noise)
+        controller = MultiHypothesisLaw(MODEL, (0.0, 0.0))
+        controller.update((1e-4, 0.0), 0, noise)
         left.append(controller.expected(0).covariance[0, 0])
     assert left[1] > 8.0 * left[0]
     with pytest.raises(ParameterError, match=r'at must be in \[0, 0\], got 1'):
-        controller.see((0.0, 0.0), 1)
+        controller.update((0.0, 0.0), 1)
 
 
 def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
     with pytest.raises(
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
     ):
-        SteeringController(MODEL, (0.04, 0.0))
-    with pytest.raises(OutOfReachError, match=r'a tip at x = 0\.00 ± \d'):
-        SteeringController(MODEL, (8e-3, 0.0), position_limit=1e-4)
+        MultiHypothesisLaw(MODEL, (0.04, 0.0))
+    with pytest.raises(OutOfReachError, match=r'reachable are x = 0\.00 ± \d'):
+        MultiHypothesisLaw(MODEL, (8e-3, 0.0), position_limit=1e-4)
 
 
 def test_warning_when_the_target_leaves_the_reachable_set() -> None:
     """A stuck guide leaves the needle to its drift; the warning is before the end."""
-    controller = SteeringController(MODEL, (0.0, 4e-3))
+    controller = MultiHypothesisLaw(MODEL, (0.0, 4e-3))
     assert controller.warning == ''
     one = SteeredNeedle(*other(1.0), tilt=(0.0, -0.05))
     first = None
@@ -216,9 +220,9 @@ def test_warning_when_the_target_leaves_the_reachable_set() -> None:
     assert first < 16
 
 
-def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
+def faulty(change: dict[int, Any]) -> tuple[MultiHypothesisLaw, SteeredNeedle]:
     """Steer with some measurements replaced; a number is the offset of a measurement in x [m]."""
-    controller, one = SteeringController(MODEL, (2e-3, 1e-3)), SteeredNeedle(*other(0.9))
+    controller, one = MultiHypothesisLaw(MODEL, (2e-3, 1e-3)), SteeredNeedle(*other(0.9))
     guide, rng = (0.0, 0.0), np.random.default_rng(4)
     before: Any = None
     for k, depth in enumerate(DEPTHS.tolist()):
@@ -279,7 +283,7 @@ def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
     tilt = (0.02 * rng.standard_normal(2)).tolist()
     one = SteeredNeedle(*other(1.0 + 0.25 * rng.uniform(-1.0, 1.0)), tilt=tilt)
     turn = np.array([[np.cos(0.1745), -np.sin(0.1745)], [np.sin(0.1745), np.cos(0.1745)]])
-    controller, guide = SteeringController(MODEL, target), (0.0, 0.0)
+    controller, guide = MultiHypothesisLaw(MODEL, target), (0.0, 0.0)
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
             one.move(guide=guide)
@@ -305,41 +309,41 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ParameterError, match=r'depths must be in \[0, 0\.16\] m'):
         SteeringModel(NEEDLE, STEERING, [0.0, 0.17])
     with pytest.raises(ShapeError, match=r'target must be x and z, got shape \(3,\)'):
-        SteeringController(MODEL, (0.0, 0.1, 0.0))
+        MultiHypothesisLaw(MODEL, (0.0, 0.1, 0.0))
     with pytest.raises(ParameterError, match='target must be finite'):
-        SteeringController(MODEL, (0.0, np.inf))
+        MultiHypothesisLaw(MODEL, (0.0, np.inf))
     with pytest.raises(ParameterError, match='position_limit must be finite and >= 0'):
-        SteeringController(MODEL, (0.0, 0.0), position_limit=-1.0)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), position_limit=-1.0)
     with pytest.raises(ParameterError, match='position_limit and turns cannot both be 0'):
-        SteeringController(MODEL, (0.0, 0.0), position_limit=0.0)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), position_limit=0.0)
     with pytest.raises(ParameterError, match='step_limit must be > 0'):
-        SteeringController(MODEL, (0.0, 0.0), step_limit=0.0)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), step_limit=0.0)
     with pytest.raises(ParameterError, match='turns must be a whole number >= 0, got -1'):
-        SteeringController(MODEL, (0.0, 0.0), turns=-1)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), turns=-1)
     with pytest.raises(ParameterError, match='roll must be finite'):
-        SteeringController(MODEL, (0.0, 0.0), roll=np.nan)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), roll=np.nan)
     with pytest.raises(ParameterError, match='load_limit must be > 0'):
-        SteeringController(MODEL, (0.0, 0.0), load_limit=0.0)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), load_limit=0.0)
     with pytest.raises(ParameterError, match='spread must be finite'):
         SteeringPrior(spread=-0.1)
-    controller = SteeringController(MODEL, (0.0, 0.0))
+    controller = MultiHypothesisLaw(MODEL, (0.0, 0.0))
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.next([0.0, 0.0, 0.0])
-    done = SteeringController(MODEL, (0.0, 0.0))
+    done = MultiHypothesisLaw(MODEL, (0.0, 0.0))
     steer(done, SteeredNeedle(*other(1.0)))
     with pytest.raises(JobError, match='all 20 steps are done'):
         done.next([0.0, 0.0])
 
 
-def test_baselines_behave_as_published() -> None:
+def test_published_laws_behave_as_published() -> None:
     """Open loop rests; the others reduce the miss, and keep the limit."""
     target = (3e-3, -2e-3)
     miss = {}
-    controllers: Mapping[str, SteeringController | OpenLoop] = {
-        'open': OpenLoop(DEPTHS, target),
-        'springs': Springs(NEEDLE, STEERING, DEPTHS, target),
-        'Broyden': Broyden(NEEDLE, STEERING, DEPTHS, target),
-        'ours': SteeringController(MODEL, target),
+    controllers: Mapping[str, MultiHypothesisLaw | GuideLaw] = {
+        'open': OpenLoopLaw(MODEL, target),
+        'springs': SpringsLaw(MODEL, target),
+        'Broyden': BroydenLaw(MODEL, target),
+        'ours': MultiHypothesisLaw(MODEL, target),
     }
     for name, controller in controllers.items():
         one = SteeredNeedle(*other(0.9), tilt=(0.02, 0.01))
@@ -349,7 +353,7 @@ def test_baselines_behave_as_published() -> None:
     assert miss['ours'] < 1e-4 < miss['springs'] < miss['open']
     assert miss['Broyden'] < miss['open']
     # A missing measurement causes no motion.
-    rests = Broyden(NEEDLE, STEERING, DEPTHS, target)
+    rests = BroydenLaw(MODEL, target)
     assert rests.next(None) == GuideSetpoint(0.0, 0.0)
 
 
@@ -395,15 +399,15 @@ def test_bevel_is_turned_towards_the_target(
     needle, steering = other(1.0 + 0.2 * rng.uniform(-1.0, 1.0))
     steering = replace(steering, bevel_load=(0.8 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0)),))
     miss = {}
-    controllers: dict[str, SteeringController | OpenLoop] = {
-        'ours': SteeringController(BEVEL_MODEL, target, limit, turns),
-        'towards': RollTowards(DEPTHS, target),
-        'rests': OpenLoop(DEPTHS, target),
+    controllers: dict[str, MultiHypothesisLaw | GuideLaw] = {
+        'ours': MultiHypothesisLaw(BEVEL_MODEL, target, limit, turns),
+        'towards': RollToTargetLaw(BEVEL_MODEL, target, turns=len(DEPTHS)),
+        'rests': OpenLoopLaw(BEVEL_MODEL, target),
     }
     for name, controller in controllers.items():
         one = SteeredNeedle(needle, steering, tilt=(5e-3, -5e-3))
         miss[name] = float(np.hypot(*(steer(controller, one, noise=4e-5, seed=seed) - target)))
-        if isinstance(controller, SteeringController):
+        if isinstance(controller, MultiHypothesisLaw):
             assert 0 <= controller.turns <= turns
             assert np.abs(one.guide).max() <= limit
     assert miss['ours'] < within
@@ -412,7 +416,7 @@ def test_bevel_is_turned_towards_the_target(
 
 def test_guide_with_limited_steps_hits_the_target() -> None:
     """A third of its range per step; targets out of reach are rejected."""
-    controller = SteeringController(MODEL, (3e-3, 2e-3), step_limit=2e-3)
+    controller = MultiHypothesisLaw(MODEL, (3e-3, 2e-3), step_limit=2e-3)
     one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), GuideSetpoint(0.0, 0.0), [0.0]
     rng = np.random.default_rng(1)
     for k, depth in enumerate(DEPTHS.tolist()):
@@ -425,14 +429,14 @@ def test_guide_with_limited_steps_hits_the_target() -> None:
     assert max(ways) <= 2e-3 * (1.0 + 1e-12)
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 3e-4
     with pytest.raises(OutOfReachError):
-        SteeringController(MODEL, (0.02, 0.0), step_limit=1e-4)
+        MultiHypothesisLaw(MODEL, (0.02, 0.0), step_limit=1e-4)
 
 
 def test_guide_load_stays_within_its_limit() -> None:
     """Without a limit the guide load is twice as large; the target is still hit."""
     target, loads, miss = (3e-3, 2e-3), {}, {}
     for limit in (np.inf, 2.0):
-        controller = SteeringController(MODEL, target, load_limit=limit)
+        controller = MultiHypothesisLaw(MODEL, target, load_limit=limit)
         one, to, felt = (
             SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)),
             GuideSetpoint(0.0, 0.0),

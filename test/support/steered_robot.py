@@ -1,4 +1,4 @@
-"""Outer loop with a simulated robot, needle and tracker, in simulated time."""
+"""Steering executive with a simulated robot, needle and tracker, in simulated time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any
 
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
+from needle_controller.steering.law import DEFAULT_LAW
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 from needle_ros.contract import JOINT_TRAJECTORY
@@ -27,14 +28,17 @@ CONTINUOUS = replace(SETTINGS, continuous=True)
 
 
 class Robot:
-    """Outer loop, robot and needle in tissue softer than the prior."""
+    """Executive, robot and needle in tissue softer than the prior."""
 
     def __init__(
-        self, own: ExecutiveSettings = SETTINGS, belief: SteeringPrior | None = None
+        self,
+        own: ExecutiveSettings = SETTINGS,
+        belief: SteeringPrior | None = None,
+        law: str = DEFAULT_LAW,
     ) -> None:
         self.seconds = 0.0
         self.loop = SteeringExecutive(
-            NEEDLE, STEERING, belief or SteeringPrior(), own, steady=lambda: self.seconds
+            NEEDLE, STEERING, belief or SteeringPrior(), own, steady=lambda: self.seconds, law=law
         )
         softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))

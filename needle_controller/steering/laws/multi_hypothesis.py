@@ -1,5 +1,5 @@
 r"""
-Steering controller: bring the tip to a target by guide and roll, one step at a time.
+Steering law for all hypotheses: bring the tip to a target by guide and roll, one step at a time.
 
 **Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its
 constants by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses
@@ -20,9 +20,8 @@ turn is left, the later load of the bevel may have any direction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from math import cos, inf, isfinite, nan, sin
+from collections.abc import Mapping, Sequence
+from math import cos, inf, nan, sin
 from typing import NamedTuple
 
 from needle_controller.compiled.steering import (
@@ -41,6 +40,13 @@ from needle_controller.compiled.steering import (
     STEP,
     TURNS,
     weights,
+)
+from needle_controller.steering.law import (
+    check_limits,
+    checked_target,
+    GuideSetpoint,
+    SteeringFaultError,
+    TipEstimate,
 )
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
@@ -91,47 +97,7 @@ class OutOfReachError(JobError):
         self.reach = reach
 
 
-class SteeringFaultError(JobError):
-    """The tip measurement is implausible, frozen or missing."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TipEstimate:
-    """
-    Estimated or predicted position of the tip.
-
-    Attributes
-    ----------
-    mean : ndarray, shape (2,)
-        Position in x and z in the frame of the sensor [m].
-    covariance : ndarray, shape (2, 2)
-        Its covariance [m^2].
-
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-
-
-class GuideSetpoint(NamedTuple):
-    """
-    Guide setpoint for the next step: guide and roll move while the tip rests.
-
-    Attributes
-    ----------
-    x, z : float
-        Position of the guide [m].
-    roll : float
-        Roll of the needle [rad].
-
-    """
-
-    x: float
-    z: float
-    roll: float = 0.0
-
-
-class SteeringController:
+class MultiHypothesisLaw:
     """
     Steer the tip to a target: one tip measurement and one guide setpoint for each step.
 
@@ -176,12 +142,11 @@ class SteeringController:
 
     >>> from dataclasses import replace
     >>> import numpy as np
-    >>> from needle_controller.steering.controller import SteeringController
-    >>> from needle_controller.steering.responses import SteeringModel
+    >>> from needle_controller import MultiHypothesisLaw, SteeringModel
     >>> from needle_dynamics import SteeredNeedle, STEERING_PRESETS
     >>> nominal, steering, _ = STEERING_PRESETS['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
-    >>> control = SteeringController(SteeringModel(nominal, steering, depths), (2e-3, -1e-3))
+    >>> control = MultiHypothesisLaw(SteeringModel(nominal, steering, depths), (2e-3, -1e-3))
     >>> softer = replace(nominal, tissue_stiffness=0.8 * nominal.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
@@ -204,18 +169,7 @@ class SteeringController:
         roll: float = 0.0,
         step_limit: float = inf,
     ) -> None:
-        if not 0.0 <= position_limit < inf:
-            raise ParameterError(
-                f'position_limit must be finite and >= 0, got {position_limit!r} m'
-            )
-        if not load_limit > 0.0:
-            raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
-        if not step_limit > 0.0:
-            raise ParameterError(f'step_limit must be > 0, got {step_limit!r} m')
-        if isinstance(turns, float) or turns < 0:
-            raise ParameterError(f'turns must be a whole number >= 0, got {turns!r}')
-        if not isfinite(roll):
-            raise ParameterError(f'roll must be finite, got {roll!r} rad')
+        check_limits(position_limit, turns, load_limit, roll, step_limit)
         if position_limit == 0.0 and turns == 0:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
         from needle_dynamics.compiled.boxed import Boxed
@@ -261,11 +215,7 @@ class SteeringController:
             If the target is out of reach. The target is then unchanged.
 
         """
-        new = np.array(target, dtype=np.float64)
-        if new.shape != (2,):
-            raise ShapeError(f'target must be x and z, got shape {new.shape}')
-        if not np.isfinite(new).all():
-            raise ParameterError(f'target must be finite, got {new.tolist()} m')
+        new = checked_target(target)
         before = self.target
         self._now.target[:] = new
         if self.chance < _REFUSED:
@@ -330,6 +280,14 @@ class SteeringController:
         middles, sizes, _ = reach(self._held)
         return Reach(middles, sizes, self.weights)
 
+    def status(self) -> Mapping[str, float]:
+        """Return values for the status, by name."""
+        return {
+            'turns_left': self.turns,
+            'hit_probability': self.chance,
+            'bending_length_ratio': self.bending,
+        }
+
     @property
     def warning(self) -> str:
         """Warning if the target is probably out of reach, '' otherwise."""
@@ -372,10 +330,12 @@ class SteeringController:
             needle must then stop.
 
         """
-        self.see(tip, self.step)
+        self.update(tip, self.step)
         return self.plan()
 
-    def see(self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0) -> None:
+    def update(
+        self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
+    ) -> None:
         """
         Update the hypotheses by a tip measurement at the present or an earlier depth.
 

@@ -1,0 +1,56 @@
+"""
+Steering law outside the package: bring the tip to a line to the target, four steps ahead.
+
+PYTHONPATH=examples needle steer --law steering_law:NominalLaw
+"""
+
+from needle_controller import GuideSetpoint, SteeringModel
+from needle_dynamics import FloatArray
+import numpy as np
+
+
+class NominalLaw:
+    """Predict the tip by the nominal model, plus its measured deviation from this model."""
+
+    warning = ''
+
+    def __init__(
+        self,
+        model: SteeringModel,
+        target: FloatArray,
+        *,
+        position_limit: float,
+        step_limit: float,
+        **_limits: float,
+    ) -> None:
+        nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - 1.0))
+        self.responses, self.depths = model.guide[nominal], model.depths
+        self.position_limit, self.step_limit = position_limit, step_limit
+        self.guide = np.zeros((len(self.depths) - 1, 2))
+        self.deviation, self.step = np.zeros(2), 0
+        self.aim(target)
+
+    def aim(self, target: FloatArray) -> None:
+        self.target = np.array(target)
+
+    def update(self, tip: FloatArray | None, at: int, noise: float = 0.0) -> None:
+        if tip is not None:
+            self.deviation = tip - self.responses[at] @ self.guide
+
+    def plan(self) -> GuideSetpoint:
+        k, self.step = self.step, self.step + 1
+        if k < len(self.guide):
+            past = self.guide[k - 1] if k else np.zeros(2)
+            ahead = min(k + 4, len(self.guide))
+            wanted = self.target * self.depths[ahead] / self.depths[-1] - self.deviation
+            wanted -= self.responses[ahead] @ self.guide
+            wanted /= self.responses[ahead, k:].sum()
+            wanted = np.clip(wanted, past - self.step_limit, past + self.step_limit)
+            self.guide[k] = np.clip(wanted, -self.position_limit, self.position_limit)
+        return GuideSetpoint(*self.guide[min(k, len(self.guide) - 1)])
+
+    def expected(self) -> None:
+        return None
+
+    def status(self) -> dict[str, float]:
+        return {}

@@ -1,0 +1,145 @@
+"""Continuous insertion: the needle moves without rest, and the guide follows its depth."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
+from needle_controller.steering.motion import JointMotion
+from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl, STILL
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.tip_measurement import TipMeasurements
+from needle_ros.status import SteeringPhase as Phase
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: Time over which the insertion speed is measured [s].
+_SPAN: Final = 0.05
+
+
+class ContinuousInsertion(InsertionStrategy):
+    """
+    Insert a needle without rests; the guide follows the measured insertion depth.
+
+    The tip is measured during the motion through each depth, and at rest at the first and last
+    one. Parameters as for `InsertionStrategy`.
+    """
+
+    def __init__(
+        self, law: GuardedLaw, motions: MotionControl, settings: ExecutiveSettings
+    ) -> None:
+        super().__init__(law, motions, settings)
+        #: Measurements at the depths, and the last depth that was passed.
+        self._passing: dict[int, TipMeasurements] = {}
+        self._passed = 0
+        #: Positions of the guide before and after the next depth [m].
+        self._between = np.zeros((2, 2))
+        #: Time of the last guide motion [ns].
+        self._sent = 0
+        #: An earlier stamp [ns] and insertion depth [m], and insertion speed [m/s].
+        self._before: tuple[int, float] | None = None
+        self._speed = 0.0
+
+    def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
+        """Begin the insertion to the last depth."""
+        self._between = np.array([[0.0, 0.0], [to.x, to.z]])
+        self.phase, self._rest = Phase.INSERTING, None
+        return self._insert(now, float(self.law.depths[0]))
+
+    def _insert(self, now: int, begin: float, *, again: bool = False) -> JointMotion:
+        """Send the needle to the target depth."""
+        motions, depths = self._motions, self.law.depths
+        motions.origin = np.array([depths[0], *self._between[0]])
+        motions.goal = np.array([depths[-1], *self._between[1]])
+        motions.again = lambda later: self._insert(later, self._depth_now, again=True)
+        return motions.insert(begin, self._between[0], now, again=again)
+
+    @property
+    def _depth_now(self) -> float:
+        """Insertion depth now, within the motion [m]."""
+        motions = self._motions
+        return min(max(float(motions.at[0]), float(motions.origin[0])), float(motions.goal[0]))
+
+    def follow(self, stamp: int, now: int) -> JointMotion | None:
+        """Send the guide with the needle, and plan at each passed depth."""
+        if self.phase is not Phase.INSERTING:
+            return self._wait(stamp, now)
+        motions, depths, settings = self._motions, self.law.depths, self._settings
+        depth, last = float(motions.at[0]), self.law.steps
+        if self._before is None:
+            if depth < depths[0] + STILL:
+                return None
+            self._before = stamp, depth
+        since = (stamp - self._before[0]) / NANOSECONDS
+        if since >= _SPAN:
+            self._speed, self._before = (depth - self._before[1]) / since, (stamp, depth)
+        while self._passed < last - 1 and depth >= depths[self._passed + 1]:
+            self._passed += 1
+            self._pass()
+        if self._passed == last:
+            return self._wait(stamp, now)
+        if depth >= depths[last] - settings.depth_tolerance:
+            self._passed, motions.due = last, stamp
+            return self._end_guide(now)
+        if stamp > motions.due + settings.patience * NANOSECONDS:
+            # The guide is at its setpoint of this depth.
+            motions.goal[1:] = motions.at[1:]
+            return self._wait(stamp, now)
+        interval = 1.0 / settings.rate
+        if stamp - self._sent < interval * NANOSECONDS:
+            return None
+        self._sent = stamp
+        low, high = depths[self._passed : self._passed + 2].tolist()
+        begin, end = self._between
+        part = min(max((depth + self._speed * interval - low) / (high - low), 0.0), 1.0)
+        way = end - begin
+        rate = way * self._speed / (high - low)
+        move = motions.guide_to(begin + part * way, rate, interval, now)
+        motions.monitor.stream(move)
+        return move
+
+    def _end_guide(self, now: int, *, again: bool = False) -> JointMotion:
+        """Send the guide to the end of the last step, with a check of its arrival."""
+        motions = self._motions
+        motions.again = lambda later: self._end_guide(later, again=True)
+        move = motions.guide_to(self._between[1], np.zeros(2), BRAKING, now)
+        motions.monitor.begin(move, motions.at, again=again, arrives=True)
+        return move
+
+    def _pass(self) -> None:
+        """Process the measurement of the depth before, and plan."""
+        k, at, there = self._passed, self._motions.at, self._between[1]
+        if np.abs(at[1:3] - there).max() > LAGGING * self._settings.guide_tolerance:
+            x, z = 1e3 * at[1:3]
+            raise SteeringFaultError(
+                f'the guide is at x = {x:.3f} mm, z = {z:.3f} mm at a depth of '
+                f'{1e3 * at[0]:.2f} mm, not at {1e3 * there[0]:.3f} mm, {1e3 * there[1]:.3f} mm'
+            )
+        if k > 1:
+            self.law.update(self._passing.pop(k - 1, TipMeasurements()), k - 1)
+        to = self.law.plan()
+        self._between = np.array([there, [to.x, to.z]])
+        self._motions.origin[1:], self._motions.goal[1:] = there, self._between[1]
+
+    def _end_measurement(self, now: int) -> JointMotion | None:
+        """Pass the measurement in motion before it to the law as well."""
+        k = self.law.step - 1
+        look = self._passing.pop(k, None)
+        if look is not None:
+            self.law.update(look, k)
+        return super()._end_measurement(now)
+
+    def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
+        """Process a reading of the tip, x, y, z [m], at rest or in motion."""
+        if self.phase is not Phase.INSERTING:
+            return super().tip(stamp, tip, now)
+        # Insertion depth at the time of the reading.
+        depths = self.law.depths
+        depth = float(self._motions.at[0]) - self._speed * (now - stamp) / NANOSECONDS
+        at = int(np.searchsorted(depths, depth))
+        if 0 < at < len(depths):
+            look = self._passing.setdefault(at, TipMeasurements())
+            look.take(tip, float(depths[at]) - depth)
+        return None

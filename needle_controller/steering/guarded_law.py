@@ -1,0 +1,197 @@
+"""Steering law with checked measurements and checked setpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import isfinite, sqrt
+from typing import Final
+
+from needle_controller.steering.law import (
+    GuideSetpoint,
+    SteeringFaultError,
+    SteeringLaw,
+    TipEstimate,
+)
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.tip_measurement import AveragedTipMeasurement, TipMeasurements
+from needle_dynamics.arrays import FloatArray
+from needle_ros.errors import NeedleError
+from needle_ros.event_log import EventLog, Severity
+import numpy as np
+
+#: Largest number of successive missing tip measurements, and of identical ones.
+_MOST_MISSING, _MOST_SAME = 6, 2
+
+#: Tolerance of a setpoint beyond its limit [m].
+_ROUNDING: Final = 1e-6
+
+#: Half of an interval of 95 % over the standard deviation.
+NORMAL: Final = 1.96
+
+
+class GuardedLaw:
+    """
+    Pass averaged tip measurements to a steering law, and check its setpoints.
+
+    Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
+    the law raise a `NeedleError`, whichever law steers.
+
+    Parameters
+    ----------
+    law : SteeringLaw
+        The law.
+    depths : ndarray, shape (n + 1,)
+        Depths of the tip measurements [m].
+    noise : float
+        Configured standard deviation of a tip measurement [m].
+    settings : ExecutiveSettings
+        Limits.
+    journal : EventLog
+        Lines for the log.
+
+    Attributes
+    ----------
+    law, depths
+        As given.
+    step : int
+        Number of plans so far: the number of the present depth.
+    expected : TipEstimate or None
+        Expected position of the tip at the target depth; a new one after each plan.
+    seen : AveragedTipMeasurement or None
+        The last measurement.
+
+    """
+
+    def __init__(
+        self,
+        law: SteeringLaw,
+        depths: FloatArray,
+        noise: float,
+        settings: ExecutiveSettings,
+        journal: EventLog,
+    ) -> None:
+        self.law, self.depths = law, depths
+        self._noise, self._settings, self._journal = noise, settings, journal
+        self.step = 0
+        self.expected: TipEstimate | None = None
+        self.seen: AveragedTipMeasurement | None = None
+        #: Largest deviation of a reading of the tip so far [m].
+        self._scatter = 0.0
+        #: Depth of the tip less the insertion depth, at the first measurement [m].
+        self._ahead: float | None = None
+        #: Successive missing and identical measurements, and the last measurement [m].
+        self._missing = self._same = 0
+        self._last: tuple[float, float] | None = None
+        self._setpoint = GuideSetpoint(0.0, 0.0)
+        self._warned = False
+
+    @property
+    def steps(self) -> int:
+        """Number of steps n."""
+        return len(self.depths) - 1
+
+    def aim(self, target: FloatArray) -> None:
+        """Change the target, x and z [m]."""
+        with _guarded():
+            self.law.aim(target)
+        self._warned = False
+
+    def update(self, look: TipMeasurements, at: int, depth: float | None = None) -> None:
+        """Pass a measurement at a depth number to the law; it may have no readings."""
+        self.seen = seen = look.seen(self._noise)
+        if seen is None:
+            self._check_sensor(None)
+            with _guarded():
+                self.law.update(None, at)
+            return
+        self._check_slip(seen, float(self.depths[at]) if depth is None else depth)
+        x, _, z = seen.tip.tolist()
+        self._check_sensor((x, z))
+        self._scatter = max(self._scatter, seen.error * sqrt(seen.readings))
+        noise = max(seen.error, self._scatter / sqrt(seen.readings))
+        with _guarded():
+            self.law.update(seen.tip[[0, 2]], at, noise)
+
+    def _check_slip(self, seen: AveragedTipMeasurement, depth: float) -> None:
+        """Compare the depth of the tip with the insertion depth [m]."""
+        ahead = float(seen.tip[1]) - depth
+        if self._ahead is None:
+            self._ahead = ahead
+        slipped = ahead - self._ahead
+        if abs(slipped) <= self._settings.slip_tolerance:
+            return
+        if seen.frozen:
+            raise SteeringFaultError(
+                f'the tip sensor is frozen: {seen.readings} identical readings'
+            )
+        raise SteeringFaultError(
+            f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
+            'than the needle was inserted: it slips, or the sensor measures another needle'
+        )
+
+    def _check_sensor(self, tip: tuple[float, float] | None) -> None:
+        """Count missing and identical measurements."""
+        if tip is None:
+            self._missing += 1
+            if self._missing > _MOST_MISSING:
+                raise SteeringFaultError(f'{self._missing} tip measurements are missing')
+            return
+        self._missing = 0
+        self._same = self._same + 1 if tip == self._last else 0
+        self._last = tip
+        if self._same >= _MOST_SAME:
+            raise SteeringFaultError(
+                f'the tip sensor is frozen: {self._same + 1} identical measurements'
+            )
+
+    def plan(self) -> GuideSetpoint:
+        """Plan the next step, and log a new warning."""
+        settings, k = self._settings, self.step
+        with _guarded():
+            to = GuideSetpoint(*map(float, self.law.plan()))
+            self.expected, warning = self.law.expected(), self.law.warning
+        most = settings.guide_limit + _ROUNDING
+        # False for nan.
+        if not (abs(to.x) <= most and abs(to.z) <= most and isfinite(to.roll)):
+            raise SteeringFaultError(
+                f'the steering law requests the guide at x = {1e3 * to.x:.3f} mm, z = '
+                f'{1e3 * to.z:.3f} mm and a roll of {to.roll:.3f} rad; the limit is '
+                f'{1e3 * settings.guide_limit:g} mm'
+            )
+        widest = settings.farthest(float(np.diff(self.depths).max())) + _ROUNDING
+        change = max(abs(to.x - self._setpoint.x), abs(to.z - self._setpoint.z))
+        if change > widest:
+            raise SteeringFaultError(
+                f'the steering law requests a guide motion of {1e3 * change:.3f} mm in a step, at '
+                f'most {1e3 * widest:.3f} mm are possible'
+            )
+        self._setpoint, self.step = to, k + 1
+        if k < self.steps and warning and not self._warned:
+            self._warned = True
+            depth = 1e3 * self.depths[k]
+            self._journal.say(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
+        return to
+
+    def outcome(self) -> str:
+        """Describe the estimate of the tip at the end."""
+        there = self.expected
+        if there is None:
+            return 'the needle is at the target depth'
+        half = NORMAL * np.sqrt(np.diag(there.covariance))
+        (x, z), off = there.mean, float(np.hypot(*(there.mean - self.law.target)))
+        return (
+            f'the tip is at x = {1e3 * x:.2f} ± {1e3 * half[0]:.2f} mm, z = {1e3 * z:.2f} ± '
+            f'{1e3 * half[1]:.2f} mm (95 %), {1e3 * off:.2f} mm from the target'
+        )
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """Convert any exception of a law to a fault: a law may be code of the user."""
+    try:
+        yield
+    except NeedleError:
+        raise
+    except Exception as error:
+        raise SteeringFaultError(f'the steering law has failed: {error!r}') from error

@@ -1,0 +1,140 @@
+"""Common part of stepped and continuous insertions: motions, rest, and measurement of the tip."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Final
+
+from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
+from needle_controller.steering.motion import JointMotion
+from needle_controller.steering.motion_control import MotionControl, STILL
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.tip_measurement import TipMeasurements
+from needle_dynamics.arrays import FloatArray
+from needle_ros.status import SteeringPhase as Phase
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: Descriptions of the phases for the user.
+DESCRIPTIONS: Final = {
+    Phase.IDLE: 'waits for a target',
+    Phase.PLANNING: 'computes the plan',
+    Phase.GUIDING: 'the guide moves',
+    Phase.INSERTING: 'the needle is inserted',
+    Phase.MEASURING: 'measures the tip',
+}
+
+
+class InsertionStrategy(ABC):
+    """
+    Insert a needle under a steering law: straighten the guide, measure, plan, move.
+
+    Every event is a method that returns a motion to send, as in `SteeringExecutive`. A fault is
+    raised as a `NeedleError`, after which the executive stops the insertion.
+
+    Parameters
+    ----------
+    law : GuardedLaw
+        Steering law, with the depths of the measurements.
+    motions : MotionControl
+        Motions of the joints.
+    settings : ExecutiveSettings
+        Steps, tip measurements and limits.
+
+    Attributes
+    ----------
+    phase : Phase
+        GUIDING, INSERTING, MEASURING or DONE.
+
+    """
+
+    def __init__(
+        self, law: GuardedLaw, motions: MotionControl, settings: ExecutiveSettings
+    ) -> None:
+        self.law, self._motions, self._settings = law, motions, settings
+        self.phase = Phase.GUIDING
+        #: Stamp [ns] and insertion depth [m] at the start of rest.
+        self._rest: tuple[int, float] | None = None
+        self._look: TipMeasurements | None = None
+        #: Stamps between which readings belong to a measurement at rest [ns].
+        self._span = 0, 0
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the last measurement is not done yet."""
+        return self.phase is not Phase.DONE
+
+    def begin(self, at: FloatArray, now: int) -> JointMotion | None:
+        """Send the guide to its zero, from positions of the joints [m, rad]."""
+        self._motions.goal = np.array([self.law.depths[0], *at[1:]])
+        straight = self._motions.goal.copy()
+        straight[1:3] = 0.0
+        return self._send(Phase.GUIDING, straight, now)
+
+    def _send(self, phase: Phase, goal: FloatArray, now: int) -> JointMotion | None:
+        """Send needle and guide to positions, from their last goal."""
+        self.phase, self._rest = phase, None
+        return self._motions.send(goal, now)
+
+    def follow(self, stamp: int, now: int) -> JointMotion | None:
+        """Process new positions of the joints during a motion."""
+        return self._wait(stamp, now)
+
+    def _wait(self, stamp: int, now: int) -> JointMotion | None:
+        """Wait until needle and guide rest at their goal."""
+        motions = self._motions
+        if stamp < motions.due:
+            return None
+        missed = motions.missed()
+        if not missed:
+            return self._arrive(stamp, now)
+        self._rest = None
+        late = (stamp - motions.due) / NANOSECONDS
+        if late > self._settings.patience:
+            raise SteeringFaultError(f'{missed}, {late:.1f} s late')
+        return None
+
+    def _arrive(self, stamp: int, _now: int) -> JointMotion | None:
+        """Wait for rest at the goal, then begin a measurement."""
+        depth = float(self._motions.at[0])
+        if self._rest is None or abs(depth - self._rest[1]) > STILL:
+            self._rest = stamp, depth
+        elif stamp - self._rest[0] >= self._settings.settle_time * NANOSECONDS:
+            self.phase = Phase.MEASURING
+            self._look = TipMeasurements()
+            self._span = stamp, stamp + round(self._settings.look_time * NANOSECONDS)
+        return None
+
+    def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
+        """Process a reading of the tip, x, y, z [m]."""
+        if self._look is None:
+            return None
+        since, until = self._span
+        if since < stamp <= until:
+            self._look.take(tip)
+        return self._end_measurement(now) if stamp >= until else None
+
+    def watch(self, now: int) -> JointMotion | None:
+        """End a measurement whose last readings do not arrive."""
+        timeout = self._settings.measurement_timeout
+        if self._look is not None and now > self._span[1] + timeout * NANOSECONDS:
+            return self._end_measurement(now)
+        return None
+
+    def _end_measurement(self, now: int) -> JointMotion | None:
+        """End a measurement of the tip, and begin the next step."""
+        look, self._look = self._look, None
+        if look is None:
+            return None
+        k = self.law.step
+        self.law.update(look, k, float(self._motions.at[0]))
+        to = self.law.plan()
+        if k == self.law.steps:
+            self.phase = Phase.DONE
+            return None
+        return self._begin_step(to, now)
+
+    @abstractmethod
+    def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
+        """Begin the step after a measurement at rest."""

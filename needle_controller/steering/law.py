@@ -1,0 +1,273 @@
+"""Steering law: interface to the executive and the simulation, and construction by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from math import inf, isfinite
+from typing import Final, NamedTuple, Protocol
+
+from needle_controller.steering.responses import SteeringModel
+from needle_dynamics.arrays import FloatArray
+from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
+import numpy as np
+from numpy.typing import ArrayLike
+
+_LAWS: Final = 'needle_controller.steering.laws'
+
+#: Steering laws by name: module and class.
+STEERING_LAWS: Final[Mapping[str, str]] = {
+    'multi_hypothesis': f'{_LAWS}.multi_hypothesis:MultiHypothesisLaw',
+    'springs': f'{_LAWS}.springs:SpringsLaw',
+    'broyden': f'{_LAWS}.broyden:BroydenLaw',
+    'roll_to_target': f'{_LAWS}.roll_to_target:RollToTargetLaw',
+    'open_loop': f'{_LAWS}.open_loop:OpenLoopLaw',
+}
+
+#: Law of the node, of `needle steer` and of studies, unless another one is set.
+DEFAULT_LAW: Final = 'multi_hypothesis'
+
+
+class SteeringFaultError(JobError):
+    """The tip measurement is implausible, frozen or missing, or the law has failed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TipEstimate:
+    """
+    Estimated or predicted position of the tip.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (2,)
+        Position in x and z in the frame of the sensor [m].
+    covariance : ndarray, shape (2, 2)
+        Its covariance [m^2].
+
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+class GuideSetpoint(NamedTuple):
+    """
+    Guide setpoint for the next step: guide and roll move while the tip rests.
+
+    Attributes
+    ----------
+    x, z : float
+        Position of the guide [m].
+    roll : float
+        Roll of the needle [rad].
+
+    """
+
+    x: float
+    z: float
+    roll: float = 0.0
+
+
+class SteeringLaw(Protocol):
+    """
+    Compute a guide setpoint for each step from the tip measurements.
+
+    The steps end at the depths of a `SteeringModel`. At each depth, `update` is called for every
+    measurement that has become available, then `plan` once. A law is constructed by `build_law`,
+    with the arguments of `LawClass`. It needs no base class; `GuideLaw` is one for laws that
+    compute the guide from the newest measurement.
+    """
+
+    @property
+    def target(self) -> FloatArray:
+        """Target position of the tip at the last depth, x and z [m], shape (2,)."""
+
+    @property
+    def step(self) -> int:
+        """Number of plans so far: the number of the present depth."""
+
+    @property
+    def warning(self) -> str:
+        """Warning for the user, '' without a warning."""
+
+    def aim(self, target: ArrayLike) -> None:
+        """
+        Continue to another target at the same depth.
+
+        Parameters
+        ----------
+        target : array_like, shape (2,)
+            Target position of the tip at the last depth, x and z [m].
+
+        Raises
+        ------
+        NeedleError
+            If the target is not possible. The target is then unchanged.
+
+        """
+
+    def update(
+        self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
+    ) -> None:
+        """
+        Process an averaged tip measurement.
+
+        Parameters
+        ----------
+        tip : array_like of shape (2,) or None
+            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
+        at : int
+            Number of its depth: the present or, if the needle does not rest, the one before.
+        noise : float
+            Standard deviation of the measurement along each axis, if above the configured one [m].
+
+        Raises
+        ------
+        SteeringFaultError
+            If the needle must stop.
+
+        """
+
+    def plan(self) -> GuideSetpoint:
+        """Return guide and roll for the next step, and advance to it; unchanged at the end."""
+
+    def expected(self) -> TipEstimate | None:
+        """Return the predicted position of the tip at the last depth, None without prediction."""
+
+    def status(self) -> Mapping[str, float]:
+        """Return values for the status by name: turns_left, hit_probability, or others."""
+
+
+class LawClass(Protocol):
+    """Constructor of a steering law."""
+
+    def __call__(
+        self,
+        model: SteeringModel,
+        target: ArrayLike,
+        *,
+        position_limit: float,
+        turns: int,
+        load_limit: float,
+        roll: float,
+        step_limit: float,
+    ) -> SteeringLaw:
+        """Create a law; parameters as for `build_law`."""
+
+
+def find_law(name: str) -> LawClass:
+    """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
+    module, _, of_class = STEERING_LAWS.get(name, name).partition(':')
+    if not module or not of_class:
+        raise ParameterError(
+            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class, got {name!r}'
+        )
+    try:
+        found: LawClass = getattr(import_module(module), of_class)
+    # The module is any code of the user.
+    except Exception as error:
+        raise ParameterError(
+            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class; {name!r} cannot be '
+            f'imported: {error}'
+        ) from error
+    return found
+
+
+def build_law(
+    name: str,
+    model: SteeringModel,
+    target: ArrayLike,
+    *,
+    position_limit: float = 6e-3,
+    turns: int = 0,
+    load_limit: float = inf,
+    roll: float = 0.0,
+    step_limit: float = inf,
+) -> SteeringLaw:
+    """
+    Construct a steering law by name.
+
+    Parameters
+    ----------
+    name : str
+        A key of `STEERING_LAWS`, or a class outside the package as ``module:Class``.
+    model : SteeringModel
+        Nominal needle, depths of the measurements, and responses of the tip.
+    target : array_like, shape (2,)
+        Target position of the tip at the last depth, x and z [m].
+    position_limit : float
+        Largest position of the guide along x and along z [m].
+    turns : int
+        Allowed number of turns of the needle.
+    load_limit : float
+        Largest planned force of the guide along x and along z [N].
+    roll : float
+        Roll of the needle at the start [rad].
+    step_limit : float
+        Largest change of the guide from one step to the next along x and along z [m].
+
+    Returns
+    -------
+    SteeringLaw
+        The law.
+
+    Raises
+    ------
+    ParameterError
+        If there is no such law, or its class cannot be constructed.
+    OutOfReachError
+        If the law detects that the target is out of reach.
+
+    """
+    of_class = find_law(name)
+    try:
+        law = of_class(
+            model,
+            target,
+            position_limit=position_limit,
+            turns=turns,
+            load_limit=load_limit,
+            roll=roll,
+            step_limit=step_limit,
+        )
+    except NeedleError:
+        raise
+    # The constructor is any code of the user.
+    except Exception as error:
+        raise ParameterError(f'law {name!r} cannot be constructed: {error}') from error
+    missing = [one for one in _MEMBERS if not hasattr(law, one)]
+    if missing:
+        raise ParameterError(f'law {name!r} has no {", ".join(missing)}')
+    return law
+
+
+_MEMBERS: Final = (
+    'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status',
+)  # fmt: skip
+
+
+def check_limits(
+    position_limit: float, turns: int, load_limit: float, roll: float, step_limit: float
+) -> None:
+    """Check the limits of a law; see `LawClass`."""
+    if not 0.0 <= position_limit < inf:
+        raise ParameterError(f'position_limit must be finite and >= 0, got {position_limit!r} m')
+    if not load_limit > 0.0:
+        raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
+    if not step_limit > 0.0:
+        raise ParameterError(f'step_limit must be > 0, got {step_limit!r} m')
+    if isinstance(turns, float) or turns < 0:
+        raise ParameterError(f'turns must be a whole number >= 0, got {turns!r}')
+    if not isfinite(roll):
+        raise ParameterError(f'roll must be finite, got {roll!r} rad')
+
+
+def checked_target(target: ArrayLike) -> FloatArray:
+    """Return a target x, z [m] as an array, if it is two finite numbers."""
+    found = np.array(target, dtype=np.float64)
+    if found.shape != (2,):
+        raise ShapeError(f'target must be x and z, got shape {found.shape}')
+    if not np.isfinite(found).all():
+        raise ParameterError(f'target must be finite, got {found.tolist()} m')
+    return found

@@ -1,0 +1,1 @@
+"""Steering laws: four methods of the literature, and our law for all hypotheses."""

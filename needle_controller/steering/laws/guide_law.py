@@ -1,0 +1,98 @@
+"""Base class of laws that compute the guide from the newest tip measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import inf
+
+from needle_controller.steering.law import check_limits, checked_target, GuideSetpoint, TipEstimate
+from needle_controller.steering.responses import SteeringModel
+from needle_dynamics.arrays import FloatArray
+from needle_ros.errors import ShapeError
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class GuideLaw:
+    """
+    Steering law that computes the guide from the newest tip measurement.
+
+    A derived class implements `choose`, and may implement `prepare`. Position and change of the
+    guide are clipped to their limits; ``load_limit`` has no effect. Parameters as for `LawClass`.
+    """
+
+    warning = ''
+
+    def __init__(
+        self,
+        model: SteeringModel,
+        target: ArrayLike,
+        position_limit: float = 6e-3,
+        turns: int = 0,
+        load_limit: float = inf,
+        roll: float = 0.0,
+        step_limit: float = inf,
+    ) -> None:
+        check_limits(position_limit, turns, load_limit, roll, step_limit)
+        self.depths = model.depths
+        self.limit, self.turns, self.roll = position_limit, turns, roll
+        self.step = 0
+        #: Position of the guide at each depth so far [m]; the last one is the present setpoint.
+        self.guides = [np.zeros(2)]
+        self._step_limit = step_limit
+        self._newest: tuple[FloatArray, int] | None = None
+        self.aim(target)
+        self.prepare(model)
+
+    def prepare(self, model: SteeringModel) -> None:
+        """Compute constants before the first step."""
+
+    def aim(self, target: ArrayLike) -> None:
+        """Continue to another target at the same depth, x and z [m]."""
+        self.target = checked_target(target)
+
+    def update(
+        self,
+        tip: Sequence[float] | FloatArray | None,
+        at: int,
+        noise: float = 0.0,  # noqa: ARG002
+    ) -> None:
+        """Process a tip measurement, x and z [m], or None; see `SteeringLaw`."""
+        if tip is None:
+            return
+        found = np.array(tip, dtype=np.float64)
+        if found.shape != (2,):
+            raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
+        if np.isfinite(found).all():
+            self._newest = found, at
+
+    def plan(self) -> GuideSetpoint:
+        """Return guide and roll for the next step, and advance to it; unchanged at the end."""
+        guide = self.guides[-1]
+        if self._newest is not None and self.step < len(self.depths) - 1:
+            wanted = np.clip(
+                self.choose(*self._newest), guide - self._step_limit, guide + self._step_limit
+            )
+            guide = np.clip(wanted, -self.limit, self.limit)
+        self._newest = None
+        self.guides.append(guide)
+        self.step += 1
+        x, z = guide.tolist()
+        return GuideSetpoint(x, z, self.roll)
+
+    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
+        """Process a tip measurement at the present depth, and plan the next step."""
+        self.update(tip, self.step)
+        return self.plan()
+
+    def choose(self, tip: FloatArray, at: int) -> FloatArray:
+        """Return the guide for the next step [m] from a tip [m] measured at depth number at."""
+        raise NotImplementedError
+
+    def expected(self) -> TipEstimate | None:
+        """Return None: there is no prediction."""
+        return None
+
+    def status(self) -> Mapping[str, float]:
+        """Return values for the status, by name."""
+        return {'turns_left': self.turns}

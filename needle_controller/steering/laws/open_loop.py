@@ -1,0 +1,14 @@
+"""Steering law with a fixed guide, for comparison."""
+
+from __future__ import annotations
+
+from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_dynamics.arrays import FloatArray
+
+
+class OpenLoopLaw(GuideLaw):
+    """A fixed guide."""
+
+    def choose(self, _tip: FloatArray, _at: int) -> FloatArray:
+        """Return the present position of the guide."""
+        return self.guides[-1]

@@ -1,0 +1,48 @@
+"""
+Steering law of Glozman and Shoham: the inverse of a beam on springs that pull it to the axis.
+
+Written from the publication [Glozman2007]_, without the code of its authors.
+
+References
+----------
+.. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
+   Transactions on Robotics 23, 2007.
+
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.responses import SteeringModel
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.steering.reference_models import springs
+import numpy as np
+
+#: Least response of the springs that is inverted.
+_LEAST: Final = 1e-3
+
+
+class SpringsLaw(GuideLaw):
+    """
+    The inverse of a beam on springs, along a straight line to the target.
+
+    Parameters as for `GuideLaw`.
+    """
+
+    def prepare(self, model: SteeringModel) -> None:
+        """Compute the response of the springs at each depth."""
+        self._responses = [
+            float(springs(model.needle, model.steering, float(depth))[0][0, 0])
+            for depth in self.depths
+        ]
+
+    def choose(self, tip: FloatArray, at: int) -> FloatArray:
+        """Return the position of the guide for the next point of the line."""
+        now, then = self._responses[at], self._responses[self.step + 1]
+        if abs(then) < _LEAST:
+            return self.guides[-1]
+        wanted = self.target * self.depths[self.step + 1] / self.depths[-1]
+        # The unmodeled deflection is assumed constant.
+        return np.asarray((wanted - (tip - now * self.guides[at])) / then)

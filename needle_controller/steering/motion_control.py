@@ -1,0 +1,220 @@
+"""Motion control of an insertion: motions of needle and guide, their repetition, and the stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from needle_controller.steering.law import SteeringFaultError
+from needle_controller.steering.monitor import MotionMonitor
+from needle_controller.steering.motion import duration_of, JointMotion, smooth
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_ros.contract import ROLL
+from needle_ros.event_log import EventLog, Severity
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: Time in which needle and guide brake to rest after a stop [s].
+BRAKING: Final = 0.2
+
+#: Tolerance of a moving joint, as a multiple of its tolerance at rest.
+LAGGING: Final = 5.0
+
+#: Time after which a stop is sent again to a needle that still moves [s], and number of times that
+#: it is sent.
+_STOP_AGAIN, _STOPS = 0.5, 4
+
+#: Largest displacement of a needle at rest [m].
+STILL: Final = 1e-4
+
+#: Tolerance of equal positions [m, rad].
+_SAME: Final = 1e-6
+
+
+class MotionControl:
+    """
+    Create the motions of needle and guide, check that they are followed, and stop them.
+
+    Parameters
+    ----------
+    settings : ExecutiveSettings
+        Joints, speeds and tolerances.
+    journal : EventLog
+        Lines for the log.
+
+    Attributes
+    ----------
+    monitor : MotionMonitor
+        Compares the last motion with the positions, and with the answers to it.
+    at : ndarray, shape (joints,)
+        Measured positions [m, rad]; nan before the first measurement.
+    origin, goal : ndarray, shape (joints,)
+        Positions at the start and at the end of the motion [m, rad].
+    due : int
+        Time at which the motion should end [ns].
+    again : callable
+        Creates the motion again at a time [ns], from the present positions.
+
+    """
+
+    def __init__(self, settings: ExecutiveSettings, journal: EventLog) -> None:
+        self._settings, self._journal = settings, journal
+        self.monitor = MotionMonitor(settings.joints, settings.tolerances)
+        self.at = np.full(len(settings.joints), np.nan)
+        self.origin = self.goal = np.zeros(len(settings.joints))
+        self.due = 0
+        self.again: Callable[[int], JointMotion | None] = lambda _now: None
+        #: Stamp of the newest motion [ns], unique for each motion.
+        self._stamp = 0
+        #: Positions of the stop, stamp [ns] and insertion depth [m] of the last check for rest,
+        #: and number of stops left to send.
+        self._halt: FloatArray | None = None
+        self._halted: tuple[int, float] | None = None
+        self._stops = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether the positions have been measured."""
+        return bool(np.isfinite(self.at).all())
+
+    def restart(self) -> None:
+        """Accept earlier times, after a clock was set back."""
+        self._stamp = 0
+
+    # Motions.
+
+    def send(self, goal: FloatArray, now: int) -> JointMotion | None:
+        """Send needle and guide to positions [m, rad], from their last goal."""
+        self.origin, self.goal = self.goal, goal
+        return self._move(now, self.origin)
+
+    def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> JointMotion | None:
+        duration = duration_of(self.goal - begin, self._settings)
+        self.due = now + round(duration * NANOSECONDS)
+        if np.abs(self.goal - begin).max() < _SAME:
+            # Too short: the times of the points would be equal.
+            self.monitor.forget()
+            return None
+        # Repeated from the present positions, without a jump.
+        self.again = lambda later: self._move(later, self.at, again=True)
+        move = self._stamped(smooth(self._settings.joints, begin, self.goal, duration), now)
+        self.monitor.begin(move, begin, again=again)
+        return move
+
+    def insert(
+        self, begin: float, guide: FloatArray, now: int, *, again: bool = False
+    ) -> JointMotion:
+        """Send the needle alone to its goal, from a depth [m] and a guide at x, z [m]."""
+        end = self.goal[:1].copy()
+        duration = duration_of(np.array([end[0] - begin, 0.0, 0.0]), self._settings)
+        self.due = now + round(duration * NANOSECONDS)
+        joints = self._settings.joints[:1]
+        move = self._stamped(smooth(joints, np.array([begin]), end, duration), now)
+        self.monitor.begin(move, np.array([begin, *guide]), again=again)
+        return move
+
+    def guide_to(
+        self, position: FloatArray, velocity: FloatArray, duration: float, now: int
+    ) -> JointMotion:
+        """Send the guide to a position [m] with a velocity [m/s] in a duration [s]."""
+        move = JointMotion(
+            self._settings.joints[1:3],
+            np.array([duration]),
+            position[np.newaxis],
+            velocity[np.newaxis],
+        )
+        return self._stamped(move, now)
+
+    def _stamped(self, move: JointMotion, now: int) -> JointMotion:
+        """Return a motion with a unique stamp: simulated time may stand still."""
+        self._stamp = max(now, self._stamp + 1)
+        return move._replace(stamp=self._stamp)
+
+    # Checks.
+
+    def extend_if_paused(self, elapsed: int) -> None:
+        """Extend the deadlines by a time [ns], if a user has paused the motion."""
+        if self.monitor.paused:
+            self.due += elapsed
+            self.monitor.wait(elapsed)
+
+    def repeat(self, now: int) -> JointMotion | None:
+        """Send the motion again: the message may have been lost."""
+        failure = f'{self.missed(self.monitor.pending)}: {self.monitor.failure()}'
+        if self.monitor.exhausted:
+            raise SteeringFaultError(failure)
+        self._journal.say(Severity.WARNING, f'{failure}; sent again')
+        return self.again(now)
+
+    def astray(self) -> str:
+        """Describe the first joint outside its motion, '' if none is."""
+        low, high = np.minimum(self.origin, self.goal), np.maximum(self.origin, self.goal)
+        room = LAGGING * self._settings.tolerances
+        for k, name in enumerate(self._settings.joints[:3]):
+            if not low[k] - room[k] <= self.at[k] <= high[k] + room[k]:
+                return (
+                    f'{name} is at {1e3 * self.at[k]:.3f} mm, outside its motion from '
+                    f'{1e3 * self.origin[k]:.3f} to {1e3 * self.goal[k]:.3f} mm'
+                )
+        return ''
+
+    def missed(self, which: BoolArray | None = None) -> str:
+        """Describe the joints (or given joints) that are not at their goal, '' if all are."""
+        far = np.abs(self.at - self.goal) > self._settings.tolerances
+        far = far if which is None else which
+        missed = []
+        for k, name in enumerate(self._settings.joints):
+            scale, unit = (1.0, 'rad') if name == ROLL else (1e3, 'mm')
+            if far[k]:
+                missed.append(
+                    f'{name} is at {scale * self.at[k]:.3f} {unit}, not at '
+                    f'{scale * self.goal[k]:.3f} {unit}'
+                )
+        return ' and '.join(missed)
+
+    # Stops.
+
+    def stop(self, now: int, silence: float = 0.0) -> JointMotion:
+        """Brake needle and guide to rest at their positions, measured ``silence`` [s] ago."""
+        end, limit = self.at.copy(), self._settings.guide_limit
+        # Includes the braking distance; clipped, because the positions may be implausible.
+        end[0] += (0.5 * BRAKING + silence) * self._settings.speed
+        end[0] = min(max(end[0], self.origin[0]), self.goal[0])
+        end[1:3] = np.clip(end[1:3], -limit, limit)
+        self._halted, self._stops = None, _STOPS
+        return self._send_stop(end, now)
+
+    def discard_stop(self) -> None:
+        """Do not send the last stop again."""
+        self._halt = None
+
+    def _send_stop(self, end: FloatArray, now: int) -> JointMotion:
+        self._halt = end
+        joints, rest = self._settings.joints, np.zeros((1, len(end)))
+        self._stops -= 1
+        halt = self._stamped(JointMotion(joints, np.array([BRAKING]), end[np.newaxis], rest), now)
+        self.monitor.forget()
+        self.monitor.stream(halt)
+        return halt
+
+    def stop_again(self, stamp: int, now: int) -> JointMotion | None:
+        """Send the stop again to a needle that still moves."""
+        depth = float(self.at[0])
+        if self._halted is None:
+            self._halted = stamp, depth
+        since, before = self._halted
+        if self._halt is None or stamp - since < _STOP_AGAIN * NANOSECONDS:
+            return None
+        self._halted = stamp, depth
+        if abs(depth - before) < STILL:
+            self._halt = None
+            return None
+        if not self._stops:
+            self._halt = None
+            self._journal.say(Severity.ERROR, f'the needle still moves after {_STOPS} stops')
+            return None
+        self._journal.say(
+            Severity.ERROR, 'the needle still moves after the stop; stop command sent again'
+        )
+        return self._send_stop(self._halt, now)

@@ -1,0 +1,139 @@
+"""A steering law in a file outside the package: in the executive, `needle steer` and a study."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from needle_controller import build_law, GuideSetpoint, SteeringModel
+from needle_insertion.cli import main
+from needle_ros.errors import ParameterError
+from needle_study.study import made
+import numpy as np
+import pytest
+from support.steered_robot import CONTINUOUS, NEEDLE, Robot, SETTINGS, STEERING
+
+EXAMPLES = Path(__file__).parents[2] / 'examples'
+OWN = 'steering_law:NominalLaw'
+
+
+@pytest.fixture(autouse=True)
+def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+
+class FaultyLaw:
+    """A law whose plan is an error or outside the limits, at a step."""
+
+    warning = ''
+    plans: Any = None
+
+    def __init__(self, _model: SteeringModel, target: Any, **_limits: Any) -> None:
+        self.step, self.target = 0, np.array(target)
+
+    def aim(self, target: Any) -> None:
+        self.target = np.array(target)
+
+    def update(self, tip: Any, at: int, noise: float = 0.0) -> None:
+        pass
+
+    def plan(self) -> GuideSetpoint:
+        self.step += 1
+        return FaultyLaw.plans(self.step)
+
+    def expected(self) -> None:
+        return None
+
+    def status(self) -> dict[str, float]:
+        return {}
+
+
+@pytest.mark.parametrize('own', [SETTINGS, CONTINUOUS], ids=['stepped', 'continuous'])
+def test_own_law_steers_the_needle_of_a_robot(own: Any) -> None:
+    """Within 0.5 mm, a sixth of the drift without steering."""
+    miss = {}
+    for law in (OWN, 'open_loop'):
+        robot = Robot(own, law=law)
+        robot.steer()
+        assert robot.loop.fault == ''
+        miss[law] = robot.miss
+        assert robot.loop.diagnose(robot.now)[1] == 'done: the needle is at the target depth'
+    assert miss[OWN] < 5e-4 < 3e-3 < miss['open_loop']
+
+
+def test_own_law_steers_in_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['steer', '--json', '--law', OWN]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['miss [m]'] < 5e-4 < 5e-3 < found['miss open loop [m]']
+    assert found['expected tip [m]'] is None
+
+
+def test_own_law_steers_in_a_study() -> None:
+    """Bit-identical to the same needles inserted alone."""
+    study = made({
+        'protocol': 'steering', 'samples': 8, 'seed': 3, 'settings': {'law': OWN},
+        'population': {'target_x': {'uniform': [-0.002, 0.002]}, 'tilt_z': {'normal': [0, 0.01]}},
+    })  # fmt: skip
+    found = study.rows(0, 8)
+    assert found['miss'].max() < 1e-3
+    assert found['refused'].sum() == found['stopped'].sum() == 0.0
+    assert study.rows(5, 1)['miss'] == found['miss'][5]
+
+
+@pytest.mark.parametrize(
+    ('name', 'complaint'),
+    [
+        ('mine', r"law must be one of multi_hypothesis, springs, .* module:Class, got 'mine'$"),
+        ('steering_law:Other', "'steering_law:Other' cannot be imported: .* 'Other'$"),
+        ('no_such_module:Law', "'no_such_module:Law' cannot be imported: No module named"),
+        ('needle_controller:SteeringPrior', "'needle_controller:SteeringPrior' cannot be constr"),
+        ('types:SimpleNamespace', 'cannot be constructed: '),
+    ],
+)
+def test_invalid_law_is_rejected_in_one_line(
+    name: str, complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ParameterError, match=complaint):
+        build_law(name, SteeringModel(NEEDLE, STEERING, [0.0, 0.01]), (0.0, 0.0))
+    assert main(['steer', '--law', name]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith('error: law ')
+    assert said.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('plan', 'fault'),
+    [
+        (lambda _: GuideSetpoint(7e-3, 0.0), 'requests the guide at x = 7.000 mm'),
+        (lambda _: GuideSetpoint(0.0, np.nan), 'requests the guide at x = 0.000 mm, z = nan mm'),
+        (lambda _: GuideSetpoint(0.0, 3e-3), 'requests a guide motion of 3.000 mm in a step'),
+        (lambda step: GuideSetpoint(0.0, 1e-3 / (3 - step)), 'ZeroDivisionError'),
+        (lambda _: None, 'the steering law has failed'),
+    ],
+)
+def test_fault_of_a_law_stops_the_insertion(plan: Any, fault: str) -> None:
+    """A setpoint outside the limits and an exception; the guide receives no such motion."""
+    FaultyLaw.plans = plan
+    robot = Robot(law=f'{__name__}:FaultyLaw')
+    robot.steer()
+    assert fault in robot.loop.fault
+    assert np.abs(np.array(robot.tracked)[:, 1:]).max() < 2e-3
+
+
+@pytest.mark.parametrize('law', ['springs', 'open_loop'])
+@pytest.mark.parametrize(
+    ('sees', 'fault'),
+    [
+        (lambda _tip: None, '7 tip measurements are missing'),
+        (lambda tip: np.array([1e-3, tip[1], 0.0]), 'frozen: 3 identical measurements'),
+    ],
+)
+def test_fault_of_the_sensor_stops_any_law(law: str, sees: Any, fault: str) -> None:
+    robot = Robot(law=law)
+    robot.tick(20)
+    assert robot.aim() == ''
+    robot.tick(300)
+    robot.sees = sees
+    robot.tick(4000)
+    assert fault in robot.loop.fault
