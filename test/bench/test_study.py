@@ -18,7 +18,7 @@ SMALL = {
     'protocol': 'steering',
     'samples': 1,
     'seed': 3,
-    'settings': {'depth': 0.05, 'step': 0.01, 'controller': 'springs'},
+    'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
     'population': {'bending_length': {'uniform': [0.8, 1.2]}},
 }
 
