@@ -59,10 +59,10 @@ def test_friction_mismatch_is_learned() -> None:
     loop = SampledLoop(law(), 0, 20.0)
     drive(loop, truth, 8.0)
     expected = {
-        'learned dry friction, insertion [N]': 0.7 - 0.56,
-        'learned viscous friction, insertion [N s/m]': 240.0 - 300.0,
-        'learned dry friction, withdrawal [N]': 0.8 * 0.7 - 0.56,
-        'learned viscous friction, withdrawal [N s/m]': 0.8 * 240.0 - 300.0,
+        'dry friction, insertion [N]': 0.7 - 0.56,
+        'viscous friction, insertion [N s/m]': 240.0 - 300.0,
+        'dry friction, withdrawal [N]': 0.8 * 0.7 - 0.56,
+        'viscous friction, withdrawal [N s/m]': 0.8 * 240.0 - 300.0,
     }
     for name, value in expected.items():
         found, error = loop.learned[name]
@@ -104,7 +104,7 @@ def test_frozen_learning_keeps_its_estimate() -> None:
     learned = loop.memory[LEARNED:].copy()
     drive(loop, replace(PHANTOM, coulomb=0.3), 2.0)
     assert_array_equal(loop.memory[LEARNED:], learned)
-    assert loop.learned['learned dry friction, insertion [N]'][0] > 0.1
+    assert loop.learned['dry friction, insertion [N]'][0] > 0.1
 
 
 def test_estimate_survives_a_stop_but_not_other_constants() -> None:
@@ -181,7 +181,7 @@ def test_controller_reports_learned_friction() -> None:
         position, speed = truth.propagate(position, speed, force, PERIOD)
         force = coming
     names = list(controller.learned)
-    assert names[0] == 'learned dry friction, insertion [N]'
+    assert names[0] == 'dry friction, insertion [N]'
     assert len(names) == 3
     controller.change(law='inverse_dynamics')
     assert controller.learned == {}
