@@ -113,7 +113,7 @@ def list_fields(
                 f'``{item.name}``',
                 f'``{item.default!r}``',
                 item.metadata.get('unit', ''),
-                _range(item.metadata) if 'unit' in item.metadata else '',
+                _range(item.metadata) if 'low' in item.metadata else '',
                 item.metadata['description'],
             )
             for item in described

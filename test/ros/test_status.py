@@ -171,7 +171,11 @@ def test_readers_use_the_dataclasses() -> None:
     assert lookups("values['target [m]'], values.get('phase')") == ['target [m]', 'phase']
     folders = ('needle_*', 'benchmarks', 'examples', 'test')
     paths = [one for folder in folders for one in sorted(ROOT.glob(f'{folder}/**/*.py'))]
-    readers = [one for one in paths if re.search('diagnos|read_status', one.read_text('utf-8'))]
+    readers = [
+        one
+        for one in paths
+        if re.search('DiagnosticArray|needle_ros.status', one.read_text('utf-8'))
+    ]
     assert len(readers) > 20
     broken = [
         f'{path.relative_to(ROOT)}: {key!r}'
