@@ -111,6 +111,9 @@ class Bystander:
     def __init__(self, graph: Graph) -> None:
         self._graph, self.depths = graph, list[float]()
         self._health: list[DiagnosticArray] = []
+        #: Statuses of the messages parsed so far, and number of these messages.
+        self._reports: list[NodeStatus] = []
+        self._parsed = 0
         probe = graph.node('bystander')
         probe.create_subscription(JointState, 'ground_truth', self._on_truth, SENSOR)
         probe.create_subscription(DiagnosticArray, '/diagnostics', self._health.append, 10)
@@ -171,9 +174,14 @@ class Bystander:
 
     @property
     def _statuses(self) -> list[NodeStatus]:
-        statuses = (status for one in self._health for status in one.status)
-        found = (read_status({one.key: one.value for one in status.values}) for status in statuses)
-        return [status for status in found if status is not None]
+        # Each message is parsed once: conditions are evaluated at every message of any topic.
+        new = self._health[self._parsed :]
+        self._parsed += len(new)
+        values = (
+            {one.key: one.value for one in part.values} for one in new for part in one.status
+        )
+        self._reports += [one for one in map(read_status, values) if one is not None]
+        return self._reports
 
     def reported(self, condition: Callable[[NodeStatus], bool]) -> bool:
         """Return whether any status met a condition."""
