@@ -109,11 +109,11 @@ class Study:
 
 
 @lru_cache(maxsize=64)
-def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.int64]:
+def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
     """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
     # The generators of samples have two numbers in their key, this generator has three.
     key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
-    return np.random.default_rng(key).permutation(count)
+    return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))
 
 
 def read_study(path: Path) -> Study:

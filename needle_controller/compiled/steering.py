@@ -67,10 +67,10 @@ _AWAY, _MOTION = 1e-5, 1e-2
 _IMPOSSIBLE, _MOST_IMPOSSIBLE = 30.0, 2
 
 #: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
-_FROZEN: Final = 2
+MOST_SAME: Final = 2
 
 #: Largest number of successive missing tip measurements.
-_MOST_MISSING: Final = 6
+MOST_MISSING: Final = 6
 
 #: Distance from the target that counts as a hit [m].
 _REACHED: Final = 1e-3
@@ -336,13 +336,13 @@ def _judge(
     counts = c.counts
     if not (isfinite(x) and isfinite(z)):
         counts[MISSING] += 1
-        return (LOST if counts[MISSING] > _MOST_MISSING else FINE), False
+        return (LOST if counts[MISSING] > MOST_MISSING else FINE), False
     counts[MISSING] = 0
     same = x == c.last[0] and z == c.last[1]
     counts[SAME] = counts[SAME] + 1 if same else 0
     c.last[0], c.last[1] = x, z
     if same:
-        return (FROZEN if counts[SAME] >= _FROZEN else FINE), False
+        return (FROZEN if counts[SAME] >= MOST_SAME else FINE), False
     xx, xz, zz = there.xx + variance, there.xz, there.zz + variance
     distance = zz * off_x**2 - 2.0 * xz * off_x * off_z + xx * off_z**2
     # False for an infinite distance and for nan.

@@ -13,7 +13,7 @@ from dataclasses import replace
 from time import monotonic
 from typing import Final
 
-from needle_controller.safety.input_monitor import InputMonitor
+from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw, NORMAL
 from needle_controller.steering.insertion import DESCRIPTIONS, InsertionStrategy
@@ -333,8 +333,7 @@ class SteeringExecutive:
         at = [found[name] for name in joints]
         refusal = self._joint_stream.check(reading.stamp, now, values=at)
         if refusal is not None:
-            if not refusal.harmless:
-                self.journal.refuse(f'joint_states refused: {refusal.line}')
+            self._refuse(self._joint_stream, refusal)
             return None
         motions, stamp = self._motions, reading.stamp
         motions.at = np.array(at)
@@ -384,10 +383,13 @@ class SteeringExecutive:
         tip = reading.values[0]
         refusal = self._tip_stream.check(reading.stamp, now, reading.frame, tip)
         if refusal is not None:
-            if not refusal.harmless:
-                self.journal.refuse(f'tip_deflection refused: {refusal.line}')
+            self._refuse(self._tip_stream, refusal)
             return None
         return self._run(lambda insertion: insertion.tip(reading.stamp, tip, now), now)
+
+    def _refuse(self, stream: InputMonitor, refusal: Refusal) -> None:
+        if not refusal.harmless:
+            self.journal.refuse(f'{stream.name} refused: {refusal.line}')
 
     def watch(self, now: int) -> JointMotion | None:
         """

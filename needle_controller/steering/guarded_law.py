@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from math import isfinite, sqrt
 from typing import Final
 
+from needle_controller.compiled.steering import MOST_MISSING, MOST_SAME
 from needle_controller.steering.law import (
     GuideSetpoint,
     SteeringFaultError,
@@ -20,9 +21,6 @@ from needle_ros.errors import NeedleError
 from needle_ros.event_log import EventLog, Severity
 import numpy as np
 
-#: Largest number of successive missing tip measurements, and of identical ones.
-_MOST_MISSING, _MOST_SAME = 6, 2
-
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
 
@@ -35,7 +33,7 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`, whichever law steers.
+    the law raise a `NeedleError`, for every law.
 
     Parameters
     ----------
@@ -134,13 +132,13 @@ class GuardedLaw:
         """Count missing and identical measurements."""
         if tip is None:
             self._missing += 1
-            if self._missing > _MOST_MISSING:
+            if self._missing > MOST_MISSING:
                 raise SteeringFaultError(f'{self._missing} tip measurements are missing')
             return
         self._missing = 0
         self._same = self._same + 1 if tip == self._last else 0
         self._last = tip
-        if self._same >= _MOST_SAME:
+        if self._same >= MOST_SAME:
             raise SteeringFaultError(
                 f'the tip sensor is frozen: {self._same + 1} identical measurements'
             )

@@ -75,8 +75,8 @@ class SteeringLaw(Protocol):
 
     The steps end at the depths of a `SteeringModel`. At each depth, `update` is called for every
     measurement that has become available, then `plan` once. A law is constructed by `build_law`,
-    with the arguments of `LawClass`. It needs no base class; `GuideLaw` is one for laws that
-    compute the guide from the newest measurement.
+    with the arguments of `LawClass`. It needs no base class; `GuideLaw` is a base class for
+    laws that compute the guide from the newest measurement.
     """
 
     @property

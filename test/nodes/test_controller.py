@@ -932,6 +932,7 @@ def test_diagnostics_report_rates_and_saturation(ros_graph: RosGraph) -> None:
         return seen and bench.status.saturated_fraction == 1.0
 
     ros_graph.spin_until(saturated, 'a second at the limit')
-    # One message each 5 ms, plus repeated measurements.
+    # One message each 5 ms of simulated time: a window of a second has one more or less at its
+    # ends. Measurements that are repeated until their answer count as messages, too.
     assert bench.status.command_rate == pytest.approx(200.0, abs=1.0)
     assert bench.input('joint_states').rate == pytest.approx(200.0, abs=5.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from math import inf
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-class GuideLaw:
+class GuideLaw(ABC):
     """
     Steering law that computes the guide from the newest tip measurement.
 
@@ -44,8 +45,8 @@ class GuideLaw:
         self.aim(target)
         self.prepare(model)
 
-    def prepare(self, model: SteeringModel) -> None:
-        """Compute constants before the first step."""
+    def prepare(self, model: SteeringModel) -> None:  # noqa: B027
+        """Compute constants before the first step; there are none by default."""
 
     def aim(self, target: ArrayLike) -> None:
         """Continue to another target at the same depth, x and z [m]."""
@@ -85,9 +86,9 @@ class GuideLaw:
         self.update(tip, self.step)
         return self.plan()
 
+    @abstractmethod
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
         """Return the guide for the next step [m] from a tip [m] measured at depth number at."""
-        raise NotImplementedError
 
     def expected(self) -> TipEstimate | None:
         """Return None: there is no prediction."""
