@@ -216,8 +216,9 @@ class Graph:
         Spin the nodes of this process until a condition holds.
 
         The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
-        condition is checked after each event, which costs more CPU time. Raises `GraphError` with
-        the name `what` on a timeout, and if a process of the graph has ended.
+        condition is checked after each event, which costs more CPU time. Raises `GraphError` on a
+        timeout, with the name `what` and the last log line of each process, and if a process of
+        the graph has ended.
         """
         deadline, seen = time.monotonic() + timeout, sign()
         while not condition():
@@ -228,7 +229,9 @@ class Graph:
                 if started.process.poll() not in (None, 0) and not started.killed:
                     started.check()
             if time.monotonic() > deadline:
-                raise GraphError(f'timeout after {timeout:g} s: waiting for {what}')
+                lines = [f'{one.name}: {one.last_line}' for one in self._processes]
+                waiting = f'timeout after {timeout:g} s: waiting for {what}'
+                raise GraphError('; '.join([waiting, *lines]))
             if period:
                 self.executor.spin_until_future_complete(Future(), timeout_sec=period)
             else:

@@ -33,7 +33,10 @@ IMPORT = re.compile(r'import time:\s+\d+ \|\s+(\d+) \|\s*(\S+)')
 #: Minimum number of sequential requests answered by a compiling node.
 RESPONSES = 10
 
-STEERED = {'model.preset': 'bending_35mm', 'steered': True, 'depth': 0.001, 'rate': 200.0}
+#: Rate of the nodes [Hz]: other tests load the machine, and a late measurement stops the needle.
+RATE = {'rate': 200.0}
+
+STEERED = {'model.preset': 'bending_35mm', 'steered': True, 'depth': 0.001, **RATE}
 STEERING = {
     'step_length': 0.01,
     'speed': 0.05,
@@ -136,7 +139,7 @@ def rig(ros_graph: RosGraph, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
 @pytest.mark.parametrize('feedback', ['observer', 'ground_truth', 'none'])
 def test_controller_preloads_all_laws(rig: Callable[..., Rig], feedback: str) -> None:
     """Targets, trajectories, pauses, retraction, stops, and live changes of law and gains."""
-    one = rig(plant={}, controller={'deflection_feedback': feedback})
+    one = rig(plant=RATE, controller={'deflection_feedback': feedback, **RATE})
     one.go(0.025)
     for law in LAWS[::-1]:
         one.done(one.operator.set('controller', 'law', law))
@@ -154,7 +157,7 @@ def test_controller_preloads_all_laws(rig: Callable[..., Rig], feedback: str) ->
 @pytest.mark.parametrize('reference', [*REFERENCES])
 def test_controller_preloads_all_references(rig: Callable[..., Rig], reference: str) -> None:
     """Each reference type reaches a target, also during a motion."""
-    one = rig(plant={}, controller={'reference.kind': reference})
+    one = rig(plant=RATE, controller={'reference.kind': reference, **RATE})
     # A step is a tracking error: above `safety.tracking_error` it causes a stop.
     way = 5e-4 if reference == 'step' else 0.01
     one.go(0.02 + way)
@@ -165,9 +168,9 @@ def test_controller_preloads_all_references(rig: Callable[..., Rig], reference: 
 @pytest.mark.parametrize(
     'plant',
     [
-        {'mode': 'robot'},
-        {'mode': 'robot', 'fault.kind': 'bias'},
-        {'mode': 'robot', 'sensor.filter': 3},
+        {'mode': 'robot', **RATE},
+        {'mode': 'robot', 'fault.kind': 'bias', **RATE},
+        {'mode': 'robot', 'sensor.filter': 3, **RATE},
         {'mode': 'robot', **STEERED},
     ],
     ids=str,
@@ -187,7 +190,7 @@ def test_steering_preloads_an_insertion(
     nodes = {'plant': {'mode': mode, **STEERED}, 'steering': {**STEERING, **options}}
     if mode == 'simulation':
         nodes['controller'] = {
-            'model.preset': 'bending_35mm', 'steered': True, 'rate': 200.0,
+            'model.preset': 'bending_35mm', 'steered': True, **RATE,
             'deflection_feedback': 'none', 'reference.speed': 0.05,
         }  # fmt: skip
     one = rig(**nodes)
