@@ -202,17 +202,17 @@ def study(
     `width` is the largest relative deviation of mu_s, mu_v and k_a, `delay` the periods from
     measurement to effect, and `carriage` a mass unknown to the law [kg].
     """
-    believed = NeedleParameters.preset(_PRESET)
+    nominal = NeedleParameters.preset(_PRESET)
     factors = np.random.default_rng(2014).uniform(1.0 - width, 1.0 + width, (needles, 3))
     # The corners first, which often contain the worst case.
     corners = 1.0 + width * np.array(np.meshgrid(*3 * [(-1.0, 1.0)])).reshape(3, -1).T
     factors[: len(corners)] = corners[:needles]
     plants = [
         replace(
-            believed,
-            coulomb_friction=float(dry * believed.coulomb_friction),
-            viscous_friction=float(viscous * believed.viscous_friction),
-            tissue_stiffness=float(stiff * believed.tissue_stiffness),
+            nominal,
+            coulomb_friction=float(dry * nominal.coulomb_friction),
+            viscous_friction=float(viscous * nominal.viscous_friction),
+            tissue_stiffness=float(stiff * nominal.tissue_stiffness),
             carriage_mass=carriage,
         )
         for dry, viscous, stiff in factors
@@ -221,7 +221,7 @@ def study(
     batch = run_batch(
         law,
         plants,
-        NeedleModel(believed).state_at(situation.start, _DEFLECTION),
+        NeedleModel(nominal).state_at(situation.start, _DEFLECTION),
         situation.reference,
         delay=delay,
         limit=_LIMIT,

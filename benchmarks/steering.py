@@ -127,7 +127,7 @@ class SteeringOutcome(NamedTuple):
 
 
 @lru_cache
-def believed(medium: str, bevel: float = 0.0) -> tuple[NeedleParameters, SteeringParameters]:
+def nominal(medium: str, bevel: float = 0.0) -> tuple[NeedleParameters, SteeringParameters]:
     """Return the nominal parameters in a medium, with the load of a bevel [N]."""
     needle = NEEDLES['phantom']
     (_, first), *others = MEDIA[medium]
@@ -148,8 +148,8 @@ def _model(
 ) -> SteeringModel:
     sigma, count, lost = SENSORS[sensor]
     noise = sigma / sqrt(count * (1.0 - lost))
-    belief = SteeringPrior(spread=spread, path_noise=PATH_NOISE, noise=noise)
-    return SteeringModel(*believed(medium, bevel), STEP * np.arange(steps + 1), belief)
+    prior = SteeringPrior(spread=spread, path_noise=PATH_NOISE, noise=noise)
+    return SteeringModel(*nominal(medium, bevel), STEP * np.arange(steps + 1), prior)
 
 
 class MeanPlan(MultiHypothesisLaw):
@@ -217,7 +217,7 @@ def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[s
     rng = np.random.default_rng(seed)
     medium = list(MEDIA)[seed % len(MEDIA)]
     steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
-    truth = drawn(*believed(medium), replace(TRUE, spread=spread), rng, seed)
+    truth = drawn(*nominal(medium), replace(TRUE, spread=spread), rng, seed)
     aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
     if bevel:
         load = bevel * (1.0 + spread * rng.uniform(-1.0, 1.0))

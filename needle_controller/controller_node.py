@@ -251,12 +251,12 @@ class ControllerNode(ModelNode):
             law = self.text('law', LAWS, changes)
             self._supervisor.change(parameters, law, self._gains(changes))
         except ParameterError as error:
-            self._supervisor.journal.refuse(f'parameters: {error}')
-            self.tell(self._supervisor.journal)
+            self._supervisor.events.reject(f'parameters: {error}')
+            self.tell(self._supervisor.events)
             raise
         self._supervisor.retract_depth = depth
         if self._driver is not None:
-            self._driver.robot.believe(parameters)
+            self._driver.robot.set_model(parameters)
 
     def cleanup(self) -> None:
         """Discard the controller, the load estimate and its source."""
@@ -362,8 +362,8 @@ class ControllerNode(ModelNode):
         missing = driver.missing() if self._looks > _PATIENCE else ''
         if missing != self._missing:
             self._missing = missing
-            self._supervisor.journal.say(Severity.WARNING, missing)
-            self.tell(self._supervisor.journal)
+            self._supervisor.events.add(Severity.WARNING, missing)
+            self.tell(self._supervisor.events)
 
     # Outputs.
 
@@ -382,7 +382,7 @@ class ControllerNode(ModelNode):
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
-        self.tell(self._supervisor.journal)
+        self.tell(self._supervisor.events)
         if self._supervisor.requests.due():
             self.publish_diagnostics()
 

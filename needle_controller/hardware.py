@@ -281,7 +281,7 @@ class Robot:
             depths=controller.settings.depths(controller.parameters),
         )
 
-    def believe(self, parameters: NeedleParameters) -> None:
+    def set_model(self, parameters: NeedleParameters) -> None:
         """
         Continue with another nominal friction.
 

@@ -63,7 +63,7 @@ class SteeringNode(CompiledNode):
     its parameter ``steered``, it follows the insertion. ``joint_states`` must have these joints.
 
     The steering law is ``law``, see `build_law`. The nominal model of needle and tissue is
-    ``model.*`` and ``steering.*``, its uncertainty ``belief.*``. The plan is computed in a thread:
+    ``model.*`` and ``steering.*``, its uncertainty ``prior.*``. The plan is computed in a thread:
     messages and ``~/stop`` do not wait for it. A target out of reach is rejected with the
     reachable range. Each motion is sent again until the robot follows it. The needle stops when
     the tip measurement freezes, is missing, slips or is implausible, when a node rejects a motion,
@@ -78,7 +78,7 @@ class SteeringNode(CompiledNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('steering', **node_options)
         self.declare_settings('', ExecutiveSettings())
-        self.declare_settings('belief.', SteeringPrior())
+        self.declare_settings('prior.', SteeringPrior())
         self.declare_parameter(
             'law',
             DEFAULT_LAW,
@@ -131,15 +131,13 @@ class SteeringNode(CompiledNode):
 
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
-        belief = self.settings('belief.', SteeringPrior)
+        prior = self.settings('prior.', SteeringPrior)
         # Load or compile the functions before any motion; and reject invalid constants.
-        SteeringModel(needle, steering, [0.0, 1e-3], belief)
+        SteeringModel(needle, steering, [0.0, 1e-3], prior)
         settings = self.settings('', ExecutiveSettings)
         law = self.text('law')
         find_law(law)
-        self._loop = SteeringExecutive(
-            needle, steering, belief, settings, start=ThreadJob, law=law
-        )
+        self._loop = SteeringExecutive(needle, steering, prior, settings, start=ThreadJob, law=law)
 
     def cleanup(self) -> None:
         """Discard the steering executive."""
@@ -262,7 +260,7 @@ class SteeringNode(CompiledNode):
             self._told = loop.expected
             if loop.expected is not None:
                 self._tell_tip(loop.expected, loop.depth)
-        self.tell(loop.journal)
+        self.tell(loop.events)
         if loop.requests.due():
             self.publish_diagnostics()
 

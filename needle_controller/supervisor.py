@@ -41,7 +41,7 @@ class Supervisor:
     Answer each measurement with a force command, and command zero force on any fault.
 
     Every event is a method: it takes the present time [ns] of the clock that stamps the messages,
-    and returns a command. None leaves the last command unchanged. `journal` contains lines for the
+    and returns a command. None leaves the last command unchanged. `events` contains lines for the
     log. Without a target, during a fault, and from a stop until it is cleared, all forces are
     zero.
 
@@ -52,7 +52,7 @@ class Supervisor:
 
     Attributes
     ----------
-    journal : EventLog
+    events : EventLog
         Lines for the log.
     requests : RequestLog
         Targets and trajectories, and the answers to them.
@@ -71,7 +71,7 @@ class Supervisor:
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
         self._steady = steady
-        self.journal = EventLog(steady)
+        self.events = EventLog(steady)
         self.receive(targets=True)
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
         self.retract_depth = 0.0
@@ -238,7 +238,7 @@ class Supervisor:
         if not back:
             return None
         self._begin(now)
-        return self._let_go(f'clock went back by {back:.3f} s', now)
+        return self._release_for(f'clock went back by {back:.3f} s', now)
 
     # Requests.
 
@@ -284,7 +284,7 @@ class Supervisor:
             controller.set_target(depth)
             if deflection != 0.0 and not self._deflection_ignored:
                 self._deflection_ignored = True
-                self.journal.say(
+                self.events.add(
                     Severity.WARNING,
                     f'target deflection {deflection:g} m is ignored: force and torque at the '
                     'base cannot reach it; the depth is taken',
@@ -342,7 +342,7 @@ class Supervisor:
         known = self.requests.check(topic, stamp, now, frame, (INSERTION,))
         if known is not None:
             if known.verdict is Verdict.REJECTED:
-                self.journal.refuse(f'{topic.name} rejected: {known.reason}')
+                self.events.reject(f'{topic.name} rejected: {known.reason}')
             return answer
         self._drop_due(f'a newer {topic.name} is followed', Verdict.SUPERSEDED)
         # Valid from the first sample after its stamp on, in any order of arrival.
@@ -367,7 +367,7 @@ class Supervisor:
             act(self._active)
         except (JobError, ParameterError) as error:
             verdict, reason = Verdict.REJECTED, str(error)
-            self.journal.refuse(f'{topic.name} rejected: {reason}')
+            self.events.reject(f'{topic.name} rejected: {reason}')
         self.requests.answer(topic, sent, verdict, reason, (INSERTION,))
 
     def _drop_due(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
@@ -411,11 +411,11 @@ class Supervisor:
         reason = self.safety.clear(now)
         if reason is not None:
             message = f'clear_stop refused: {reason}'
-            self.journal.refuse(message)
+            self.events.reject(message)
             return ServiceResult(False, message, answer)
         self.fault = _WAITING
         self.bending.forget()
-        self.journal.say(Severity.INFO, 'the stop is cleared')
+        self.events.add(Severity.INFO, 'the stop is cleared')
         return ServiceResult(True, 'cleared; the motion restarts', answer)
 
     def pause(self, hold: bool) -> ServiceResult:
@@ -437,7 +437,7 @@ class Supervisor:
             return ServiceResult(False, 'pause refused: the controller is not active')
         guide = self._active.guide
         (guide.pause if hold else guide.resume)()
-        self.journal.say(Severity.INFO)
+        self.events.add(Severity.INFO)
         return ServiceResult(True, 'paused' if hold else 'resumed')
 
     def retract(self, now: int) -> ServiceResult:
@@ -486,7 +486,7 @@ class Supervisor:
         if self._active is None:
             return None
         answer, deflection = self._check_clock(now), reading.values[0][2]
-        if self._counts('tip_deflection', reading, [deflection], now):
+        if self._is_valid('tip_deflection', reading, [deflection], now):
             answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
             # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
@@ -511,7 +511,7 @@ class Supervisor:
         if self._active is None:
             return None
         answer, (_, axial, lateral, moment, _, _) = self._check_clock(now), reading.values[0]
-        if self._counts('base_wrench', reading, [lateral, moment, axial], now):
+        if self._is_valid('base_wrench', reading, [lateral, moment, axial], now):
             answer = (
                 self._stop_for(self.safety.guard.wrench(axial, lateral, moment), now) or answer
             )
@@ -541,14 +541,14 @@ class Supervisor:
             return None
         answer, (positions, velocities, _) = self._check_clock(now), reading.values
         state = [*positions, *velocities]
-        if self._counts('ground_truth', reading, state, now):
+        if self._is_valid('ground_truth', reading, state, now):
             try:
                 self.bending.take_truth(state)
             except NeedleError as error:
                 self._warn('ground_truth', f'ground_truth: {error}; ignored')
         return answer
 
-    def _counts(self, name: str, reading: Reading, values: Sequence[float], now: int) -> bool:
+    def _is_valid(self, name: str, reading: Reading, values: Sequence[float], now: int) -> bool:
         """Return whether a measurement is valid; log the reason once a second if not."""
         refusal = self.safety.streams[name].check(reading.stamp, now, reading.frame, values)
         if refusal is not None and not refusal.harmless:
@@ -556,7 +556,7 @@ class Supervisor:
         return refusal is None
 
     def _warn(self, kind: str, line: str) -> None:
-        self.journal.say(Severity.WARNING, line, kind)
+        self.events.add(Severity.WARNING, line, kind)
 
     def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
         """
@@ -581,20 +581,20 @@ class Supervisor:
         if refusal is not None:
             if refusal.kind == REPEATED:
                 return self._again(stamp)
-            return answer if refusal.harmless else self._let_go(refusal.line, now)
+            return answer if refusal.harmless else self._release_for(refusal.line, now)
         self._lateness.add(now, (now - stamp) / NANOSECONDS)
         self._do_due(stamp)
         try:
             measured = self._read(reading)
         except ParameterError as error:
-            return self._let_go(str(error), stamp)
+            return self._release_for(str(error), stamp)
         if measured.is_finite():
             self._stop_for(self.safety.guard.encoders(measured), stamp)
             if self.safety.guard.is_beyond('joint_states'):
                 # A single reading is a sensor fault: neither law nor observer uses it.
                 if self.safety.stop is not None:
                     return self._command(ForceCommand(stamp))
-                return self._let_go('joint_states is beyond a limit', stamp)
+                return self._release_for('joint_states is beyond a limit', stamp)
             try:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
@@ -616,18 +616,18 @@ class Supervisor:
         safety = self.safety
         if safety.stop is not None:
             return self._command(ForceCommand(stamp))
-        if safety.rivals is not None:
-            return self._let_go(safety.rivals, stamp)
+        if safety.duplicate_publishers is not None:
+            return self._release_for(safety.duplicate_publishers, stamp)
         command = controller.command(measured, self.bending.load)
         if command.fault is not None:
-            return self._let_go(command.fault, stamp)
+            return self._release_for(command.fault, stamp)
         if not command.is_finite():
             # The memory of the laws is invalid.
             controller.forget()
             return self._stop_for('the command is not finite', stamp)
         if command.notice is not None:
-            self.journal.last_rejection = command.notice
-            self.journal.say(Severity.ERROR, command.notice)
+            self.events.last_rejection = command.notice
+            self.events.add(Severity.ERROR, command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.speed - measured.speed
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
@@ -640,14 +640,14 @@ class Supervisor:
             controller.guide.wait(lost)
         if lost:
             controller.unwind()
-            self._say_fault(
+            self._log_fault(
                 'the plant does not follow: it reports '
                 f'{measured.force:.3g} N, {self._last.force:.3g} N is commanded',
                 'the reference waits',
             )
         elif self.fault is not None:
             self.fault = None
-            self.journal.say(Severity.INFO, kind='recovery')
+            self.events.add(Severity.INFO, kind='recovery')
         force, torque, limits = command.force, command.torque, controller.settings
         most = euler_loads(controller.parameters, max(measured.depth, 0.0)).pinned
         if force > most:
@@ -681,14 +681,16 @@ class Supervisor:
         safety.count_publishers(publishers)
         timeout = safety.streams['joint_states'].timeout / NANOSECONDS
         silence = safety.streams['joint_states'].silence(now)
-        if safety.rivals is not None:
-            answer = self._let_go(safety.rivals, now)
+        if safety.duplicate_publishers is not None:
+            answer = self._release_for(safety.duplicate_publishers, now)
         elif silence > timeout:
-            answer = self._let_go(f'joint_states is stale: none received for {silence:.3f} s', now)
-        answer = self._stop_for(safety.muddled(now), now) or answer
+            answer = self._release_for(
+                f'joint_states is stale: none received for {silence:.3f} s', now
+            )
+        answer = self._stop_for(safety.mixed_sources(now), now) or answer
         if safety.streams['ground_truth'].silence(now) > timeout:
             self.bending.load = 0.0
-        for line in safety.news(now):
+        for line in safety.new_warnings(now):
             self._warn(line.partition(' ')[0], f'{line}; the observer continues without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
@@ -714,20 +716,20 @@ class Supervisor:
             return None
         self.fault = reason
         self.bending.forget()
-        self.journal.say(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
+        self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
         return self._release(stamp)
 
-    def _let_go(self, fault: str, stamp: int) -> ForceCommand:
+    def _release_for(self, fault: str, stamp: int) -> ForceCommand:
         """Command zero force on a fault, and log its beginning."""
-        self._say_fault(fault, 'no force is commanded')
+        self._log_fault(fault, 'no force is commanded')
         return self._release(stamp)
 
-    def _say_fault(self, fault: str, consequence: str) -> None:
+    def _log_fault(self, fault: str, consequence: str) -> None:
         """Record a fault, and log its beginning."""
         # The first word of the line identifies the kind of fault.
         kind = fault.partition(' ')[0]
         if self.fault is None or not self.fault.startswith(kind):
-            self.journal.say(Severity.ERROR, f'{fault}; {consequence}', kind)
+            self.events.add(Severity.ERROR, f'{fault}; {consequence}', kind)
         self.fault = fault
 
     def _release(self, stamp: int) -> ForceCommand:
@@ -770,14 +772,14 @@ class Supervisor:
             stop=safety.stop or '',
             stops=safety.stops,
             warning=self._warning(now),
-            duplicate_publishers=safety.rivals or '',
+            duplicate_publishers=safety.duplicate_publishers or '',
             observer=self.bending.status(),
             latency=self._lateness.status(),
             command_rate=safety.saturation.rate(now),
             saturated_fraction=safety.saturation.share(now),
             input=safety.inputs(now),
-            rejected=self.journal.rejected,
-            last_rejection=self.journal.last_rejection,
+            rejected=self.events.rejected,
+            last_rejection=self.events.last_rejection,
             requests=self.requests.status(paused=paused),
         )
         if control is None:

@@ -602,7 +602,7 @@ class PlantNode(ModelNode):
         count = self._commanders.count(contract.WRENCH_COMMAND, wrenches)
         count += max(len(drivers), joints)
         if self._run.commands.count_commanders(count):
-            if self._run.commands.rivals:
+            if self._run.commands.duplicates:
                 self.get_logger().error(
                     f'{count} nodes command; no force is applied', throttle_duration_sec=1.0
                 )
@@ -714,7 +714,7 @@ class PlantNode(ModelNode):
             time=clock.stamp / NANOSECONDS,
             real_time_factor=self._sample_rate.rate(now) / plant_run.constants.own.rate,
             command_rate=self._command_rate.rate(now),
-            commanders=given.rivals + 1 if given.rivals else 0,
+            commanders=given.duplicates + 1 if given.duplicates else 0,
             exhausted=given.exhausted,
             computed_later=self._made_up,
             skipped=clock.lost,

@@ -512,12 +512,12 @@ class BaseNode(LifecycleNode):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def tell(self, journal: EventLog) -> None:
+    def tell(self, events: EventLog) -> None:
         """Log the new lines of an event log (`EventLog`), and publish diagnostics on change."""
-        if not journal.changed:
+        if not events.changed:
             return
         log = self.get_logger()
-        for severity, line in journal.take():
+        for severity, line in events.take():
             # rclpy allows only one severity per call site.
             if severity is Severity.ERROR:
                 log.error(line)

@@ -57,7 +57,7 @@ class EventLog:
         self._told: dict[str, float] = {}
         self._left_out: Counter[str] = Counter()
 
-    def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
+    def add(self, severity: Severity, line: str = '', kind: str = '') -> None:
         """
         Add a line, and mark /diagnostics as changed; at most once a second per non-empty `kind`.
 
@@ -76,12 +76,12 @@ class EventLog:
             self._lines.append((severity, printable(line)))
         self.changed = True
 
-    def refuse(self, complaint: str) -> None:
+    def reject(self, reason: str) -> None:
         """Count a rejected input, and add an error line with its name and the reason."""
         self.rejected += 1
-        self.last_rejection = printable(complaint)
+        self.last_rejection = printable(reason)
         # The first word is the topic or service.
-        self.say(Severity.ERROR, complaint, f'refused {complaint.partition(" ")[0]}')
+        self.add(Severity.ERROR, reason, f'refused {reason.partition(" ")[0]}')
 
     def take(self) -> list[tuple[Severity, str]]:
         """Return and clear the collected lines."""

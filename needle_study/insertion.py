@@ -382,13 +382,13 @@ class InsertionProtocol:
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[_Course]:
         """Simulate insertions under a constant force, for the duration of the nominal needle."""
-        numbers, believed = self._numbers, Axis.insertion(self._needle)
+        numbers, nominal = self._numbers, Axis.insertion(self._needle)
         models = [NeedleModel(self._truth(row)) for row in rows]
         commands, noise = [], []
         for row, rng in zip(rows, streams, strict=True):
             way = row['target'] - row['depth']
             force = copysign(numbers.push, way)
-            pushed = round(_time(believed, force, way) * numbers.rate)
+            pushed = round(_time(nominal, force, way) * numbers.rate)
             count = pushed + max(1, round(numbers.wait * numbers.rate))
             commands.append(np.where(np.arange(count) < pushed, force, 0.0))
             noise.append(self._noise(row, rng, count))

@@ -61,7 +61,7 @@ _MOST: Final = 1000
 _TOGETHER: Final = 256
 
 #: Settings that are mappings or words.
-_PARTS: Final = ('needle', 'constants', 'belief', 'law')
+_PARTS: Final = ('needle', 'constants', 'prior', 'law')
 
 FIGURES: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
@@ -103,7 +103,7 @@ class SteeringProtocol:
     """
     Steer needles that differ from the nominal model to a target.
 
-    `settings` holds ``needle``, a preset; nominal ``constants``; ``belief``, the prior
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``prior``, the prior
     uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`. Raises
     `ParameterError` if a setting is not valid.
     """
@@ -124,8 +124,8 @@ class SteeringProtocol:
         of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
         self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
         self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
-        belief = mapping('settings: belief', settings.get('belief'))
-        self._belief = from_values(SteeringPrior, belief, 'settings.belief.')
+        prior = mapping('settings: prior', settings.get('prior'))
+        self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
         reach = self._needle.length - self._steering.free_length
         if numbers.depth > reach:
             raise ParameterError(
@@ -150,7 +150,7 @@ class SteeringProtocol:
         steps = max(1, round(ways))
         self._depths = np.linspace(0.0, numbers.depth, steps + 1)
         bevel = max(self._steering.bevel_load)
-        noise = self._belief.path_noise
+        noise = self._prior.path_noise
         self.quantities: Mapping[str, Variable] = {
             'target_x': Variable(0.0, 'm', 'lateral position of the target'),
             'target_z': Variable(0.0, 'm', 'lateral position of the target'),
@@ -166,7 +166,7 @@ class SteeringProtocol:
             'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
             'look_noise': Variable(
-                self._belief.noise, 'm', 'standard deviation of a tip measurement', 0.0
+                self._prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
             ),
             'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
         }
@@ -174,7 +174,7 @@ class SteeringProtocol:
     @cached_property
     def _model(self) -> SteeringModel:
         """Model of all hypotheses, the same for all samples."""
-        return SteeringModel(self._needle, self._steering, self._depths, self._belief)
+        return SteeringModel(self._needle, self._steering, self._depths, self._prior)
 
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
@@ -227,7 +227,7 @@ class SteeringProtocol:
             steering,
             bevel_load=(float(np.hypot(*bevel)),),
             path_noise=row['path_noise'],
-            path_noise_length=self._belief.path_noise_length,
+            path_noise_length=self._prior.path_noise_length,
         )
         return GroundTruth(
             needle=needle,

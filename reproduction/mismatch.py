@@ -109,14 +109,14 @@ def study(
     progress: Callable[[], object] | None = None,
 ) -> Mismatch:
     """Run all `CASES` on the same plants; ``step`` is the longest integrator step [s]."""
-    believed = NeedleParameters.preset(PRESET)
+    nominal = NeedleParameters.preset(PRESET)
     factors = np.random.default_rng(seed).uniform(1.0 - WIDTH, 1.0 + WIDTH, (runs, len(DRAWN)))
-    means = np.array([getattr(believed, name) for name in DRAWN])
+    means = np.array([getattr(nominal, name) for name in DRAWN])
     drawn: list[dict[str, Any]] = [
         dict(zip(DRAWN, map(float, row), strict=True)) for row in factors * means
     ]
-    plants = [replace(believed, **constants) for constants in drawn]
-    start = NeedleModel(believed).state_at(START, DEFLECTION)
+    plants = [replace(nominal, **constants) for constants in drawn]
+    start = NeedleModel(nominal).state_at(START, DEFLECTION)
     reference = MinimumJerk(Setpoint(START), TARGET, ReferenceLimits())
     settings = ControllerSettings()
 
@@ -133,11 +133,11 @@ def study(
             progress=progress,
         )
 
-    laws = sampled_laws(believed, 1.0 / settings.rate)
+    laws = sampled_laws(nominal, 1.0 / settings.rate)
     return Mismatch(
         factors,
         {case: run(case, plants) for case in CASES},
-        {case: run(case, [believed]) for case in CASES},
+        {case: run(case, [nominal]) for case in CASES},
     )
 
 

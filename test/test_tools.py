@@ -14,7 +14,7 @@ from tools.language import idioms, texts_of_code
     [
         ('What a message says of the needle.', 'Content of a needle message.'),
         (
-            'How far the tip is from the one that is believed.',
+            'How far the tip is from the one that is nominal.',
             'Distance of the tip from the prior.',
         ),
         ('joint_states does not come', 'no joint_states received within 0.5 s'),

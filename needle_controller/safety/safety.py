@@ -22,7 +22,7 @@ _MEASURED: Final = ('joint_states', 'ground_truth', 'base_wrench', 'tip_deflecti
 
 #: Fractions of messages out of order for a warning and for a stop; above this rate [Hz].
 _LATE: Final = 0.5
-_MUDDLED: Final = 0.9
+_MIXED: Final = 0.9
 _FEW: Final = 10.0
 
 
@@ -51,7 +51,7 @@ class Safety:
         Reason of the latched stop; None if there is no stop.
     stops : int
         Number of stops so far.
-    rivals : str or None
+    duplicate_publishers : str or None
         Topics with duplicate publishers of commands or measurements, or None.
     streams : dict of str to InputMonitor
         Inputs by topic.
@@ -73,7 +73,7 @@ class Safety:
         self.limits = limits
         self.stop: str | None = None
         self.stops = 0
-        self.rivals: str | None = None
+        self.duplicate_publishers: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))
         self.saturation = RateCounter()
         noise = noise or {}
@@ -195,9 +195,9 @@ class Safety:
             for name, count in publishers.items()
             if count > 1 and name in _VITAL
         )
-        self.rivals = ', '.join(vital) or None
+        self.duplicate_publishers = ', '.join(vital) or None
 
-    def muddled(self, now: int) -> str | None:
+    def mixed_sources(self, now: int) -> str | None:
         """
         Return a fault if nearly all encoder messages are out of order: several robots or clocks.
 
@@ -214,7 +214,7 @@ class Safety:
         """
         window = self.streams['joint_states'].window
         share = window.share(now)
-        if share <= _MUDDLED or window.rate(now) < _FEW:
+        if share <= _MIXED or window.rate(now) < _FEW:
             return None
         return f'joint_states has {share:.0%} of its messages out of order'
 
@@ -235,7 +235,7 @@ class Safety:
             if silence > self.limits.sensor_timeout
         }
 
-    def news(self, now: int) -> list[str]:
+    def new_warnings(self, now: int) -> list[str]:
         """
         Return a line for each expected topic that has become stale since the last call.
 

@@ -62,7 +62,7 @@ class SteeringExecutive:
         Nominal needle and tissue.
     steering : SteeringParameters
         Their constants for steering.
-    belief : SteeringPrior
+    prior : SteeringPrior
         Prior uncertainty of all constants.
     settings : ExecutiveSettings
         Steps, tip measurements and limits.
@@ -77,7 +77,7 @@ class SteeringExecutive:
     ----------
     settings : ExecutiveSettings
         As given.
-    journal : EventLog
+    events : EventLog
         Lines for the log.
     requests : RequestLog
         Targets, and the answers to them.
@@ -90,22 +90,22 @@ class SteeringExecutive:
         self,
         needle: NeedleParameters,
         steering: SteeringParameters,
-        belief: SteeringPrior,
+        prior: SteeringPrior,
         settings: ExecutiveSettings,
         steady: Callable[[], float] = monotonic,
         start: StartJob = ComputedJob,
         law: str = DEFAULT_LAW,
     ) -> None:
         self.settings = settings
-        self.journal = EventLog(steady)
+        self.events = EventLog(steady)
         self.requests = RequestLog({TARGET: (INSERTION,)}, ('', ENTRY), steady)
         timeout = settings.measurement_timeout
         self._joint_stream = InputMonitor(JOINT_STATES.name, timeout, jumps=_JUMPS)
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self._streams = self._joint_stream, self._tip_stream
-        self.fault, self._noise = '', belief.noise
-        self._planner = InsertionPlanner(needle, steering, belief, settings, start, law)
-        self._motions = MotionControl(settings, self.journal)
+        self.fault, self._noise = '', prior.noise
+        self._planner = InsertionPlanner(needle, steering, prior, settings, start, law)
+        self._motions = MotionControl(settings, self.events)
         #: The latest insertion.
         self._insertion: InsertionStrategy | None = None
         #: Time of the last check, and stamp of the latest joint states [ns].
@@ -173,7 +173,7 @@ class SteeringExecutive:
         known = self.requests.check(TARGET, stamp, now, frame, (INSERTION,))
         if known is not None:
             if known.verdict is Verdict.REJECTED:
-                self.journal.refuse(f'target rejected: {known.reason}')
+                self.events.reject(f'target rejected: {known.reason}')
             return None
         try:
             if not np.isfinite(point).all():
@@ -192,7 +192,7 @@ class SteeringExecutive:
         return self._begin_if_planned(now)
 
     def _reject(self, stamp: int, error: NeedleError) -> None:
-        self.journal.refuse(f'target rejected: {error}')
+        self.events.reject(f'target rejected: {error}')
         self.requests.answer(TARGET, stamp, Verdict.REJECTED, str(error))
 
     def _aim(self, point: tuple[float, float, float]) -> None:
@@ -203,7 +203,7 @@ class SteeringExecutive:
                 f'{1e3 * point[1]:.2f} mm; ~/stop ends it'
             )
         self._insertion.law.aim(np.array([point[0], point[2]]))
-        self.journal.say(Severity.INFO, f'target changed to {_words(point)}')
+        self.events.add(Severity.INFO, f'target changed to {_words(point)}')
 
     def _check_ready(self, now: int) -> FloatArray:
         """Return the positions of the joints, if an insertion can begin."""
@@ -224,7 +224,7 @@ class SteeringExecutive:
         depths = self._planner.depths(point, at, begun)
         self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
         self._planner.start(PlannedInsertion(stamp, point, depths, at))
-        self.journal.say(Severity.INFO, f'planning to {_words(point)} in {len(depths) - 1} steps')
+        self.events.add(Severity.INFO, f'planning to {_words(point)} in {len(depths) - 1} steps')
 
     def _cancel(self, verdict: Verdict, why: str) -> None:
         """Cancel the computation of a plan, if it is under way."""
@@ -232,7 +232,7 @@ class SteeringExecutive:
         if request is None:
             return
         self.requests.answer(TARGET, request.stamp, verdict, why)
-        self.journal.say(Severity.INFO, f'planning cancelled: {why}')
+        self.events.add(Severity.INFO, f'planning cancelled: {why}')
 
     def _begin_if_planned(self, now: int) -> JointMotion | None:
         """Begin the insertion once its plan is computed."""
@@ -250,11 +250,11 @@ class SteeringExecutive:
             self._reject(stamp, error)
             return None
         self.requests.answer(TARGET, stamp, Verdict.ACCEPTED, joints=(INSERTION,))
-        guarded = GuardedLaw(law, depths, self._noise, settings, self.journal)
+        guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
         strategy = ContinuousInsertion if settings.continuous else SteppedInsertion
         self._insertion, self.fault = strategy(guarded, motions, settings), ''
         motions.discard_stop()
-        self.journal.say(
+        self.events.add(
             Severity.INFO, f'insertion to {_words(point)} in {len(depths) - 1} steps begins'
         )
         return self._insertion.begin(at, now)
@@ -279,7 +279,7 @@ class SteeringExecutive:
             return None
         moves, self.fault = self.phase is not Phase.MEASURING, why
         self._motions.monitor.forget()
-        self.journal.say(Severity.ERROR, f'stopped: {why}')
+        self.events.add(Severity.ERROR, f'stopped: {why}')
         return self._motions.stop(now, silence) if moves else None
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
@@ -304,7 +304,7 @@ class SteeringExecutive:
         # Only once: the answer is repeated each second.
         self._motions.monitor.forget()
         if self.phase is Phase.STOPPED:
-            self.journal.say(Severity.ERROR, f'the stop failed: {refusal}')
+            self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
 
     # Measurements.
@@ -326,7 +326,7 @@ class SteeringExecutive:
         joints = self.settings.joints
         missing = [name for name in joints if name not in found]
         if missing:
-            self.journal.refuse(
+            self.events.reject(
                 f'joint_states lacks a position of {", ".join(missing)}, got names {list(names)}'
             )
             return None
@@ -367,7 +367,7 @@ class SteeringExecutive:
         except NeedleError as error:
             return self.stop(str(error), now)
         if insertion.phase is Phase.DONE:
-            self.journal.say(Severity.INFO, f'done: {insertion.law.outcome()}')
+            self.events.add(Severity.INFO, f'done: {insertion.law.outcome()}')
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
@@ -389,7 +389,7 @@ class SteeringExecutive:
 
     def _refuse(self, stream: InputMonitor, refusal: Refusal) -> None:
         if not refusal.harmless:
-            self.journal.refuse(f'{stream.name} refused: {refusal.line}')
+            self.events.reject(f'{stream.name} refused: {refusal.line}')
 
     def watch(self, now: int) -> JointMotion | None:
         """
@@ -486,7 +486,7 @@ class SteeringExecutive:
             if not warning and seen.error > _SCATTERED * noise:
                 warning = (
                     f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
-                    f'configured {1e3 * noise:.2f} mm (belief.noise)'
+                    f'configured {1e3 * noise:.2f} mm (prior.noise)'
                 )
         job, paused = self._planner.job, self._motions.monitor.paused if self.steers else ''
         status = replace(
@@ -497,8 +497,8 @@ class SteeringExecutive:
             paused_by=paused,
             warning=warning,
             input={stream.name: stream.status(now) for stream in self._streams},
-            rejected=self.journal.rejected,
-            last_rejection=self.journal.last_rejection,
+            rejected=self.events.rejected,
+            last_rejection=self.events.last_rejection,
             requests=self.requests.status(),
         )
         if self.phase is Phase.STOPPED:

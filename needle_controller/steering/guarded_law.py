@@ -45,7 +45,7 @@ class GuardedLaw:
         Configured standard deviation of a tip measurement [m].
     settings : ExecutiveSettings
         Limits.
-    journal : EventLog
+    events : EventLog
         Lines for the log.
 
     Attributes
@@ -67,10 +67,10 @@ class GuardedLaw:
         depths: FloatArray,
         noise: float,
         settings: ExecutiveSettings,
-        journal: EventLog,
+        events: EventLog,
     ) -> None:
         self.law, self.depths = law, depths
-        self._noise, self._settings, self._journal = noise, settings, journal
+        self._noise, self._settings, self._events = noise, settings, events
         self.step = 0
         self.expected: TipEstimate | None = None
         self.seen: AveragedTipMeasurement | None = None
@@ -168,7 +168,7 @@ class GuardedLaw:
         if k < self.steps and warning and not self._warned:
             self._warned = True
             depth = 1e3 * self.depths[k]
-            self._journal.say(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
+            self._events.add(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
         return to
 
     def outcome(self) -> str:

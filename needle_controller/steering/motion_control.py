@@ -40,7 +40,7 @@ class MotionControl:
     ----------
     settings : ExecutiveSettings
         Joints, speeds and tolerances.
-    journal : EventLog
+    events : EventLog
         Lines for the log.
 
     Attributes
@@ -58,8 +58,8 @@ class MotionControl:
 
     """
 
-    def __init__(self, settings: ExecutiveSettings, journal: EventLog) -> None:
-        self._settings, self._journal = settings, journal
+    def __init__(self, settings: ExecutiveSettings, events: EventLog) -> None:
+        self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
         self.at = np.full(len(settings.joints), np.nan)
         self.origin = self.goal = np.zeros(len(settings.joints))
@@ -144,7 +144,7 @@ class MotionControl:
         failure = f'{self.missed(self.monitor.pending)}: {self.monitor.failure()}'
         if self.monitor.exhausted:
             raise SteeringFaultError(failure)
-        self._journal.say(Severity.WARNING, f'{failure}; sent again')
+        self._events.add(Severity.WARNING, f'{failure}; sent again')
         return self.again(now)
 
     def astray(self) -> str:
@@ -212,9 +212,9 @@ class MotionControl:
             return None
         if not self._stops:
             self._halt = None
-            self._journal.say(Severity.ERROR, f'the needle still moves after {_STOPS} stops')
+            self._events.add(Severity.ERROR, f'the needle still moves after {_STOPS} stops')
             return None
-        self._journal.say(
+        self._events.add(
             Severity.ERROR, 'the needle still moves after the stop; stop command sent again'
         )
         return self._send_stop(self._halt, now)

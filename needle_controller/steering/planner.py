@@ -55,7 +55,7 @@ class InsertionPlanner:
 
     Parameters
     ----------
-    needle, steering, belief, settings, start, law
+    needle, steering, prior, settings, start, law
         As for `SteeringExecutive`.
 
     Attributes
@@ -71,12 +71,12 @@ class InsertionPlanner:
         self,
         needle: NeedleParameters,
         steering: SteeringParameters,
-        belief: SteeringPrior,
+        prior: SteeringPrior,
         settings: ExecutiveSettings,
         start: StartJob,
         law: str,
     ) -> None:
-        self._needle, self._steering, self.belief = needle, steering, belief
+        self._needle, self._steering, self.prior = needle, steering, prior
         self._settings, self._start, self._law = settings, start, law
         self.job: Job[SteeringLaw] | None = None
         self.request: PlannedInsertion | None = None
@@ -128,7 +128,7 @@ class InsertionPlanner:
                 self._needle,
                 self._steering,
                 depths,
-                self.belief,
+                self.prior,
                 together=settings.continuous,
                 progress=progress,
             )

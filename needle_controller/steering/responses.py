@@ -72,10 +72,10 @@ class SteeringModel:
     needle : NeedleParameters
         Nominal needle and tissue.
     steering : SteeringParameters
-        Nominal constants of steering; path noise and bevel are taken from the belief.
+        Nominal constants of steering; path noise and bevel are taken from the prior.
     depths : array_like, shape (n + 1,)
         Depths of the tip measurements [m], increasing; the needle reaches the first one straight.
-    belief : SteeringPrior, optional
+    prior : SteeringPrior, optional
         Prior uncertainty.
     together : bool
         Whether the guide moves in proportion to the depth and reaches the position of a step at
@@ -89,7 +89,7 @@ class SteeringModel:
     ----------
     depths : ndarray, shape (n + 1,)
         The depths [m].
-    needle, steering, belief : NeedleParameters, SteeringParameters, SteeringPrior
+    needle, steering, prior : NeedleParameters, SteeringParameters, SteeringPrior
         As given.
     lengths, skins : ndarray, shape (h,)
         Bending length and skin stiffness of each hypothesis, relative to the nominal values.
@@ -108,7 +108,7 @@ class SteeringModel:
         Nominal load of the bevel, along z at zero roll [N].
     between : ndarray, shape (2, h, n + 1, n)
         Change of `guide` from one hypothesis to the next in bending length, and in skin.
-    prior : ndarray, shape (7 + n, 7 + n)
+    prior_covariance : ndarray, shape (7 + n, 7 + n)
         Prior covariance of the causes, and of the position between two hypotheses.
     responses : HypothesisResponses
         All responses, as arguments of compiled functions.
@@ -125,7 +125,7 @@ class SteeringModel:
         needle: NeedleParameters,
         steering: SteeringParameters,
         depths: ArrayLike,
-        belief: SteeringPrior | None = None,
+        prior: SteeringPrior | None = None,
         *,
         together: bool = False,
         progress: Callable[[int, int], object] | None = None,
@@ -143,9 +143,9 @@ class SteeringModel:
                 f'length, got {at[0]:g} to {at[-1]:g} m'
             )
         self.needle, self.steering = needle, steering
-        self.depths, self.belief = at, belief or SteeringPrior()
+        self.depths, self.prior = at, prior or SteeringPrior()
         self._together = together
-        width = _BEYOND * self.belief.spread
+        width = _BEYOND * self.prior.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
         skins = np.ones(1)
         if width and steering.skin_stiffness > 0.0:
@@ -177,13 +177,14 @@ class SteeringModel:
                 for axis in (1, 0)
             ]
         )
-        b = self.belief
+        b = self.prior
         size = 7 + self.steps
-        self.prior = np.diag(
+        self.prior_covariance = np.diag(
             np.array([b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (size - 6), _EVEN, _EVEN]) ** 2
         )
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
-        self.prior[4:-2, 4:-2] = b.path_noise / (2.0 * b.path_noise_length) * np.exp(-apart)
+        variance = b.path_noise / (2.0 * b.path_noise_length)
+        self.prior_covariance[4:-2, 4:-2] = variance * np.exp(-apart)
         self.responses = HypothesisResponses(
             self.guide, self.causes, self.bevel, self.elastic,
             self.guide_load, self.causes_load, self.bevel_load, self.between,

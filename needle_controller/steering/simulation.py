@@ -58,25 +58,25 @@ class GroundTruth:
 def drawn(
     needle: NeedleParameters,
     steering: SteeringParameters,
-    belief: SteeringPrior,
+    prior: SteeringPrior,
     rng: np.random.Generator,
     seed: int,
 ) -> GroundTruth:
     """
     Sample a true needle from the prior uncertainty of a nominal needle.
 
-    The spread of ``belief`` is uniform, its standard deviations are normal; it also gives bevel
+    The spread of ``prior`` is uniform, its standard deviations are normal; it also gives bevel
     and path noise. ``seed`` is the seed of the path noise.
     """
-    length, skin = (1.0 + belief.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
-    sizes = belief.tilt, belief.frame, belief.bevel
+    length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
+    sizes = prior.tilt, prior.frame, prior.bevel
     tilt, frame, bevel = (size * rng.standard_normal(2) for size in sizes)
     needle, steering = with_lengths(needle, steering, length, skin)
     steering = replace(
         steering,
         bevel_load=(hypot(*bevel),),
-        path_noise=belief.path_noise,
-        path_noise_length=belief.path_noise_length,
+        path_noise=prior.path_noise,
+        path_noise_length=prior.path_noise_length,
     )
     x, z = tilt.tolist()
     return GroundTruth(

@@ -57,7 +57,7 @@ class Commands:
         Number of commands with a stamp outside the timeout, past or future.
     overtaken : int
         Number of commands that arrived after a newer one (out of order).
-    rivals : int
+    duplicates : int
         Number of nodes that publish commands in addition to the first.
     exhausted : bool
         Whether commands have supplied more than the permitted energy; reset at half of it.
@@ -86,7 +86,7 @@ class Commands:
     def begin(self) -> None:
         """Discard all commands and their senders, as at an activation."""
         self.held = self.newest = AppliedForces()
-        self.rivals = self._number = 0
+        self.duplicates = self._number = 0
         self._quiet = 0
         #: Stamps of the samples to which a command may respond, and whether commands do.
         self._samples: dict[int, None] = {}
@@ -156,7 +156,7 @@ class Commands:
 
     def may_move(self, now: int) -> bool:
         """Return whether commands may act at a time [ns], with a single sender."""
-        return not self.rivals and now >= self._quiet
+        return not self.duplicates and now >= self._quiet
 
     def hush(self, now: int) -> None:
         """Ignore commands for the timeout; a short-lived node may have sent some."""
@@ -171,12 +171,12 @@ class Commands:
         The conflict state changes from one publisher to several or back; then no force acts until
         the next command.
         """
-        rivals = max(0, number - 1)
+        duplicates = max(0, number - 1)
         if number != self._number:
             self._number, self._answers = number, False
-        if rivals == self.rivals:
+        if duplicates == self.duplicates:
             return False
-        self.rivals = rivals
+        self.duplicates = duplicates
         self.newest = AppliedForces(self.newest.stamp)
         return True
 

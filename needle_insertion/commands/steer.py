@@ -43,7 +43,7 @@ import numpy as np
 #: Default target [m], step [m] and limit of the guide [m].
 TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
 
-#: Constants of needle and tissue with an effect here; unknown disturbances are in the belief.
+#: Constants of needle and tissue with an effect here; unknown disturbances are in the prior.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
 
 #: Standard deviation of the sampled disturbances, as a fraction of the prior.
@@ -88,7 +88,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'constant of the nominal model, one of {", ".join(CONSTANTS)}, SI units; repeatable',
     )
     parser.add_argument(
-        '--belief',
+        '--prior',
         action='append',
         default=[],
         metavar='NAME=VALUE',
@@ -149,7 +149,7 @@ class _Task(NamedTuple):
     target: FloatArray
     needle: NeedleParameters
     steering: SteeringParameters
-    belief: SteeringPrior
+    prior: SteeringPrior
     depths: FloatArray
 
 
@@ -171,7 +171,7 @@ def _task(options: argparse.Namespace) -> _Task:
     for name in constants(options.set):
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
-    given = {**asdict(SteeringPrior()), **constants(options.belief)}
+    given = {**asdict(SteeringPrior()), **constants(options.prior)}
     steps = max(1, round(target[1] / options.step))
     return _Task(
         target,
@@ -182,11 +182,11 @@ def _task(options: argparse.Namespace) -> _Task:
 
 
 def _truth(
-    needle: NeedleParameters, steering: SteeringParameters, belief: SteeringPrior, seed: int
+    needle: NeedleParameters, steering: SteeringParameters, prior: SteeringPrior, seed: int
 ) -> GroundTruth:
     """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
-    nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
-    found = drawn(needle, steering, replace(belief, **nearer), np.random.default_rng(seed), seed)
+    nearer = {name: _DRAWN * getattr(prior, name) for name in ('tilt', 'frame', 'bevel')}
+    found = drawn(needle, steering, replace(prior, **nearer), np.random.default_rng(seed), seed)
     bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
     load = float(np.hypot(*bevel))
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
@@ -201,9 +201,9 @@ def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
 
 def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print the final tip positions of both needles."""
-    target, needle, steering, belief, depths = _task(options)
+    target, needle, steering, prior, depths = _task(options)
     aim = target[[0, 2]]
-    model = SteeringModel(needle, steering, depths, belief)
+    model = SteeringModel(needle, steering, depths, prior)
     try:
         law = build_law(
             options.law,
@@ -217,12 +217,12 @@ def _run(options: argparse.Namespace) -> int:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
         raise
-    truth = _truth(needle, steering, belief, options.seed)
+    truth = _truth(needle, steering, prior, options.seed)
     noise = np.random.default_rng([options.seed, 1])
     shapes, warnings = list[FloatArray](), list[str]()
 
     def look(tip: FloatArray) -> FloatArray:
-        return np.asarray(tip + belief.noise * noise.standard_normal(2))
+        return np.asarray(tip + prior.noise * noise.standard_normal(2))
 
     def follow(tip: FloatArray | None) -> GuideSetpoint:
         depth = depths[law.step]
@@ -247,7 +247,7 @@ def _run(options: argparse.Namespace) -> int:
         'way of the guide [m]': done.way,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
-        'bending length over the believed one': law.status().get('bending_length_ratio'),
+        'bending length over the nominal one': law.status().get('bending_length_ratio'),
         'warnings': warnings,
     }
     for words in warnings:

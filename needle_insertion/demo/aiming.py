@@ -60,7 +60,7 @@ STEERING: Final[dict[str, object]] = {
     'guide_speed': 0.02,
     'settle_time': 0.05,
     'look_time': 0.25,
-    'belief.noise': 6e-5,
+    'prior.noise': 6e-5,
 }
 
 #: Node `controller`.

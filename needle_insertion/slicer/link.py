@@ -51,7 +51,7 @@ class Connection:
         Role and address.
     wanted : callable
         Returns whether a message of a type and a device name is wanted.
-    journal : EventLog
+    events : EventLog
         Event log.
     steady : callable
         Returns the time of a monotonic clock [s].
@@ -71,17 +71,17 @@ class Connection:
         self,
         settings: LinkSettings,
         wanted: Callable[[str, str], bool],
-        journal: EventLog,
+        events: EventLog,
         steady: Callable[[], float] = monotonic,
     ) -> None:
         self.peer = self.complaint = ''
         self.left_out = 0
         self._settings, self._wanted = settings, wanted
-        self._journal, self._steady = journal, steady
+        self._events, self._steady = events, steady
         self._listener: socket.socket | None = None
         #: The connection, established or in progress.
         self._socket: socket.socket | None = None
-        self._frames = Frames(wanted, journal.refuse)
+        self._frames = Frames(wanted, events.reject)
         self._out = bytearray()
         #: Times of the last byte that the peer accepted, and of the last attempt to connect.
         self._moved = self._tried = -_RETRY
@@ -116,7 +116,7 @@ class Connection:
             return False
         if len(self._out) + len(message) > _MOST_WAITING:
             self.left_out += 1
-            self._journal.say(
+            self._events.add(
                 Severity.WARNING, f'{self.peer} reads too slowly: messages are left out', 'slow'
             )
             return False
@@ -160,7 +160,7 @@ class Connection:
             self._complain(f'cannot listen on {self.place}: {why}')
             return
         self._listener, self.complaint = listener, ''
-        self._journal.say(Severity.INFO, f'listens on {self.place}')
+        self._events.add(Severity.INFO, f'listens on {self.place}')
 
     def _accept(self) -> None:
         """Accept the first peer and reject all others."""
@@ -175,7 +175,7 @@ class Connection:
                 return
             if self.peer:
                 came.close()
-                self._journal.say(
+                self._events.add(
                     Severity.WARNING,
                     f'{host}:{port} turned away: {self.peer} is connected',
                     'stranger',
@@ -216,7 +216,7 @@ class Connection:
     def _greet(self, connection: socket.socket, peer: str) -> None:
         """Initialize an established connection."""
         self._socket, self.peer = connection, peer
-        self._frames = Frames(self._wanted, self._journal.refuse)
+        self._frames = Frames(self._wanted, self._events.reject)
         # A connection that is already closed is detected by the next read.
         with suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -225,13 +225,13 @@ class Connection:
             connection.setsockopt(
                 socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1e3 * _PATIENCE)
             )
-        self._journal.say(Severity.INFO, f'connected with {peer}', 'connected')
+        self._events.add(Severity.INFO, f'connected with {peer}', 'connected')
 
     def _complain(self, line: str) -> None:
         """Log the reason why no connection is possible, once."""
         if line != self.complaint:
             self.complaint = line
-            self._journal.say(
+            self._events.add(
                 Severity.ERROR, f'{line}; tries again every {_RETRY:g} s', 'no connection'
             )
 
@@ -252,7 +252,7 @@ class Connection:
             except BlockingIOError:
                 break
             except MessageError as error:
-                self._journal.refuse(f'peer {self.peer} refused: {error}')
+                self._events.reject(f'peer {self.peer} refused: {error}')
                 self._lose('it sent invalid data')
             except OSError as error:
                 self._lose(_words(error))
@@ -275,7 +275,7 @@ class Connection:
 
     def _lose(self, why: str) -> None:
         """Log and close a lost connection."""
-        self._journal.say(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
+        self._events.add(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
     def _drop(self) -> None:

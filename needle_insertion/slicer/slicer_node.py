@@ -76,7 +76,7 @@ class SlicerNode(BaseNode):
         self.declare_settings('', TargetSettings())
         self.declare_settings('registration.', Registration())
         self._link: Connection | None = None
-        self._journal, self._view = EventLog(), NeedleView()
+        self._events, self._view = EventLog(), NeedleView()
         self._interpreter: Interpreter | None = None
         self._greeted = ''
         self._shapes = self._targets = 0
@@ -112,7 +112,7 @@ class SlicerNode(BaseNode):
 
         registration = self.settings('registration.', Registration)
         self._interpreter = Interpreter(registration, self.settings('', TargetSettings).reach)
-        self._link = Connection(self.settings('', LinkSettings), is_wanted, self._journal)
+        self._link = Connection(self.settings('', LinkSettings), is_wanted, self._events)
 
     def cleanup(self) -> None:
         """Discard the connection."""
@@ -149,7 +149,7 @@ class SlicerNode(BaseNode):
             _check_frame(frame)
             self._view.take_poses(stamp, points, turn, monotonic())
         except MessageError as error:
-            self._journal.refuse(f'{contract.NEEDLE_POSES.name} refused: {error}')
+            self._events.reject(f'{contract.NEEDLE_POSES.name} refused: {error}')
 
     def _on_joints(self, reading: Reading) -> None:
         found = dict(zip(reading.names, reading.values[0], strict=False))
@@ -160,14 +160,14 @@ class SlicerNode(BaseNode):
         try:
             self._view.take_guide(x, z, monotonic())
         except MessageError as error:
-            self._journal.refuse(f'{contract.JOINT_STATES.name} refused: {error}')
+            self._events.reject(f'{contract.JOINT_STATES.name} refused: {error}')
 
     def _on_tip(self, reading: Reading) -> None:
         try:
             _check_frame(reading.frame)
             self._view.take_tip(reading.stamp, reading.values[0], monotonic())
         except MessageError as error:
-            self._journal.refuse(f'{contract.TIP_DEFLECTION.name} refused: {error}')
+            self._events.reject(f'{contract.TIP_DEFLECTION.name} refused: {error}')
 
     def _on_expected(self, message: PoseWithCovarianceStamped) -> None:
         pose = message.pose.pose
@@ -177,7 +177,7 @@ class SlicerNode(BaseNode):
             _check_frame(frame)
             self._view.take_expected(stamp, at, _quaternion(pose.orientation))
         except MessageError as error:
-            self._journal.refuse(f'{contract.TIP_EXPECTED.name} refused: {error}')
+            self._events.reject(f'{contract.TIP_EXPECTED.name} refused: {error}')
             return
         self._state_changed = monotonic()
 
@@ -220,7 +220,7 @@ class SlicerNode(BaseNode):
                 self._tell_state(link, interpreter, now)
         self._greeted = link.peer
         self._repeat_target()
-        self.tell(self._journal)
+        self.tell(self._events)
 
     def _repeat_target(self) -> None:
         """Publish the target again until it is answered, and report a rejection."""
@@ -231,7 +231,7 @@ class SlicerNode(BaseNode):
             self._sending = None
             accepted, line = pending.outcome
             if not accepted:
-                self._journal.say(Severity.ERROR, line, 'answer')
+                self._events.add(Severity.ERROR, line, 'answer')
         elif pending.repeat():
             self._target.publish(message)
 
@@ -242,11 +242,11 @@ class SlicerNode(BaseNode):
             try:
                 found = interpreter.target(frame)
             except MessageError as error:
-                self._journal.refuse(f'target refused: {error}')
+                self._events.reject(f'target refused: {error}')
                 continue
             newest = newest if found is None else (frame, found.tolist())
         if len(frames) > 2:
-            self._journal.say(
+            self._events.add(
                 Severity.WARNING,
                 f'{len(frames)} messages within {_LOOK:g} s: only the newest target is used',
                 'flood',
@@ -265,7 +265,7 @@ class SlicerNode(BaseNode):
         self._targets += 1
         heard = self._target.get_subscription_count()
         words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))
-        self._journal.say(
+        self._events.add(
             Severity.INFO if heard else Severity.WARNING,
             f'target ({words}) mm in {contract.ENTRY}, by {frame.kind} of {frame.device}'
             + ('' if heard else f': no node subscribes to {contract.TARGET.name}'),
@@ -329,8 +329,8 @@ class SlicerNode(BaseNode):
             shape_rate=self._rate.rate(self._steady_ns()),
             left_out=link.left_out,
             targets=self._targets,
-            rejected=self._journal.rejected,
-            last_rejection=self._journal.last_rejection,
+            rejected=self._events.rejected,
+            last_rejection=self._events.last_rejection,
         )
         severity = Severity.ERROR if link.complaint else Severity.INFO
         return Diagnosis(severity, f'{link.state}; shape: {source}', status)

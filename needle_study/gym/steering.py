@@ -14,7 +14,7 @@ from needle_study.gym.pushed import BOUND
 import numpy as np
 
 #: Default distribution of the unknown disturbances of a needle.
-BELIEF: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
+PRIOR: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
 
 #: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63
@@ -40,7 +40,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         Largest displacement of the guide along x and z [m].
     aside : float
         Largest distance of the target from the axis, along x and z [m].
-    belief : SteeringPrior
+    prior : SteeringPrior
         Distribution of the needles.
     """
 
@@ -54,7 +54,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         step: float = 5e-3,
         guide_limit: float = 6e-3,
         aside: float = 4e-3,
-        belief: SteeringPrior = BELIEF,
+        prior: SteeringPrior = PRIOR,
     ) -> None:
         if needle not in STEERING_PRESETS:
             raise ParameterError(
@@ -70,7 +70,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         if depth > reach:
             raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
         self._depths = np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
-        self._limit, self._aside, self._belief = guide_limit, aside, belief
+        self._limit, self._aside, self._prior = guide_limit, aside, prior
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
         self._truth: GroundTruth | None = None
@@ -82,7 +82,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         super().reset(seed=seed, options=options)
         rng = self.np_random
         self._truth = drawn(
-            self._needle, self._steering, self._belief, rng, int(rng.integers(_SEEDS))
+            self._needle, self._steering, self._prior, rng, int(rng.integers(_SEEDS))
         )
         self._one, self._at = self._truth.start(), 0
         self._target = rng.uniform(-self._aside, self._aside, 2)
@@ -104,7 +104,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         return seen, -1e3 * miss, True, False, {'miss': miss}
 
     def _observe(self, truth: GroundTruth, one: SteeredNeedle) -> FloatArray:
-        seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)
+        seen = truth.tip(one) + self._prior.noise * self.np_random.standard_normal(2)
         depth = one.depth / self._depths[-1]
         lengths = np.concatenate([seen, self._target, one.guide]) / self._limit
         numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)

@@ -28,9 +28,9 @@ def _informed(study: Mismatch) -> Finding:
     """
     model = needle('paper_mm', 'complete')
     friction = 0.99 * model.parameters.coulomb_friction
-    believed = NeedleModel(replace(model.parameters, coulomb_friction=friction))
+    nominal = NeedleModel(replace(model.parameters, coulomb_friction=friction))
     run = run_continuous(
-        paper_law('inverse_dynamics', believed),
+        paper_law('inverse_dynamics', nominal),
         model,
         model.state_at(DEPTH, DEFLECTION),
         np.zeros((3, 4)),

@@ -28,9 +28,9 @@ class Desk:
 
     def __init__(self, role: str = 'server', port: int | None = None) -> None:
         self.port = free_port() if port is None else port
-        self.journal, self.ahead = EventLog(self.clock), 0.0
+        self.events, self.ahead = EventLog(self.clock), 0.0
         settings = LinkSettings(role=role, port=self.port)
-        self.link = Connection(settings, is_wanted, self.journal, self.clock)
+        self.link = Connection(settings, is_wanted, self.events, self.clock)
         self.lines: list[str] = []
         self.frames: list[Any] = []
 
@@ -43,7 +43,7 @@ class Desk:
         self.frames += self.link.poll()
         # No blocking calls; the bound allows for a busy machine.
         assert monotonic() - begin < 5.0
-        self.lines += [line for _, line in self.journal.take()]
+        self.lines += [line for _, line in self.events.take()]
 
     def until(self, condition: Callable[[], Any], what: str = 'it') -> None:
         deadline = monotonic() + 60.0
@@ -146,7 +146,7 @@ def test_other_protocol_closes_connection(
         visitor(desk, stack).sendall(words)
         desk.until(lambda: not desk.link.peer, 'the end')
     assert sum(line in said for said in desk.lines) == 1
-    assert desk.journal.rejected == 5
+    assert desk.events.rejected == 5
     assert '\n' not in ''.join(desk.lines)
 
 

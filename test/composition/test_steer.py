@@ -40,14 +40,14 @@ def test_steering_hits_where_open_loop_misses(
 
 def test_miss_is_smaller_without_noise(capsys: pytest.CaptureFixture[str]) -> None:
     """Without path noise and sensor noise the miss is below 0.06 mm."""
-    exact = ['--belief', 'path_noise=1e-9', '--belief', 'noise=1e-7']
+    exact = ['--prior', 'path_noise=1e-9', '--prior', 'noise=1e-7']
     found, _ = steered(capsys, *exact)
     assert found['miss [m]'] < 6e-5
 
 
 def test_roll_and_load_limits_take_effect(capsys: pytest.CaptureFixture[str]) -> None:
     """Roll alone compensates a bevel; the guide respects its load limit."""
-    bevel = ['--set', 'bevel_load=0.8', '--belief', 'tilt=0.01', '--belief', 'frame=0.01']
+    bevel = ['--set', 'bevel_load=0.8', '--prior', 'tilt=0.01', '--prior', 'frame=0.01']
     near = '--target=0.001,0.1,0.003'
     rolled, _ = steered(capsys, near, *bevel, '--turns', '6', '--limit', '0')
     assert rolled['miss [m]'] < 1.5e-3 < 5e-3 < rolled['miss open loop [m]']
@@ -82,8 +82,8 @@ def test_unreachable_targets_are_rejected_or_warned_of(
         (['--target=0,0.3,0'], r'depths must be in [0, 0.16] m'),
         (['--step', '0'], '--step must be in (0, 0.1] m'),
         (['--limit', '-1'], 'position_limit must be finite and >= 0'),
-        (['--belief', 'spread=2'], 'spread must be finite'),
-        (['--belief', 'sprad=0.1'], 'sprad'),
+        (['--prior', 'spread=2'], 'spread must be finite'),
+        (['--prior', 'sprad=0.1'], 'sprad'),
         (['--set', 'colour=1'], 'colour'),
         (['--set', 'cutting_force=1'], 'cutting_force'),
         (['--turns', '-1'], 'turns must be a whole number >= 0, got -1'),

@@ -14,7 +14,7 @@ import pytest
 PERIOD = 2e-3
 STEP = 2_000_000
 PHANTOM = NeedleParameters.preset('phantom')
-BELIEVED = Axis.insertion(PHANTOM)
+NOMINAL = Axis.insertion(PHANTOM)
 
 FORCES = st.lists(st.floats(-15.0, 15.0), min_size=1, max_size=60)
 AXES = st.builds(
@@ -25,7 +25,7 @@ AXES = st.builds(
 )
 
 
-def base_of(axis: Axis = BELIEVED, **changes: float) -> Admittance:
+def base_of(axis: Axis = NOMINAL, **changes: float) -> Admittance:
     """Return a base that only its speed limits."""
     given_ = {'period': PERIOD, 'speed': 0.05, 'lead': 10.0, **changes}
     return Admittance(axis, **given_, depths=(-10.0, 10.0))
@@ -66,7 +66,7 @@ def test_forces_below_friction_hold_the_position_exactly(forces: list[float]) ->
 @given(forces=st.lists(st.tuples(st.floats(-1e6, 1e6), st.integers(0, 10**9)), min_size=1))
 def test_command_stays_within_its_limits(forces: list[tuple[float, int]]) -> None:
     """Speed and range, for any force; a gap is limited to two periods."""
-    base = Admittance(BELIEVED, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.015, 0.022))
+    base = Admittance(NOMINAL, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.015, 0.022))
     at, now = 0.02, 0
     for force, wait in forces:
         now += wait
@@ -87,7 +87,7 @@ def test_command_stays_within_lead_of_robot(samples: list[tuple[float, float]]) 
 
 def test_base_outside_the_range_does_not_jump() -> None:
     """Outside of the range it moves inward only by a force, and never further out."""
-    base = Admittance(BELIEVED, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.03, 0.1))
+    base = Admittance(NOMINAL, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.03, 0.1))
     assert base.step(0.0, 0.02, 0) == 0.02
     assert base.step(-10.0, 0.02, STEP) == 0.02
     assert 0.02 < base.step(10.0, 0.02, 2 * STEP) < 0.0202
@@ -113,7 +113,7 @@ def follow(
     """Drive a robot that follows with a lag; return overshoot, error and motion at the end [m]."""
     controller = Controller(PHANTOM, law, settings=ControllerSettings(rate=rate))
     period = controller.period
-    base = Admittance(BELIEVED, period=period, speed=0.05, lead=2e-3, depths=(0.0, 0.2))
+    base = Admittance(NOMINAL, period=period, speed=0.05, lead=2e-3, depths=(0.0, 0.2))
     controller.set_target(0.05)
     depth, speed, late = 0.02, 0.0, round(dead * rate)
     sent = deque([depth] * (late + 1), maxlen=late + 1)

@@ -117,17 +117,17 @@ def test_change_of_constants_continues_the_motion() -> None:
     told.change(truth)
     for each in (steering, told):
         each.set_target(0.05)
-    believed, _ = insert(steering, truth, 2.0)
+    nominal, _ = insert(steering, truth, 2.0)
     steering.change(truth)
     assert steering.target == 0.05
-    where = Measurement(time=2.0, depth=believed[-1], speed=0.0)
-    before = steering.command(Measurement(time=1.999, depth=believed[-1], speed=0.0)).setpoint
+    where = Measurement(time=2.0, depth=nominal[-1], speed=0.0)
+    before = steering.command(Measurement(time=1.999, depth=nominal[-1], speed=0.0)).setpoint
     # One period at 0.01 m/s.
     assert steering.command(where).setpoint.position == pytest.approx(before.position, abs=1.1e-5)
     depths, aims = insert(told, truth, 3.5)
     # As with the correct model from the start.
     assert np.abs(depths - aims).max() < 5e-5
-    assert np.abs(believed - aims[:2000]).max() > 1e-4
+    assert np.abs(nominal - aims[:2000]).max() > 1e-4
 
 
 def test_constants_with_unstable_gains_are_rejected() -> None:

@@ -244,7 +244,7 @@ def test_friction_change_applies_at_once() -> None:
     ways = []
     for k, share in enumerate((1.0, 1.0, 2.0)):
         viscous = share * phantom.viscous_friction
-        robot.believe(replace(phantom, coulomb_friction=0.0, viscous_friction=viscous))
+        robot.set_model(replace(phantom, coulomb_friction=0.0, viscous_friction=viscous))
         for n in range(50):
             stamp = SECOND + (50 * k + n) * 1_000_000
             robot.measurement(state(['insertion'], [0.02], [0.0], stamp=stamp))

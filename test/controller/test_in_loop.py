@@ -186,8 +186,8 @@ def test_tips_of_a_batch_equal_single_tips() -> None:
 
 # Sampled loops.
 
-BELIEVED = NeedleParameters.preset('phantom')
-START = NeedleModel(BELIEVED).state_at(0.02, 5e-4)
+NOMINAL = NeedleParameters.preset('phantom')
+START = NeedleModel(NOMINAL).state_at(0.02, 5e-4)
 REFERENCE = MinimumJerk(Setpoint(0.02), 0.024, ReferenceLimits())
 DURATION = 1.5
 
@@ -196,7 +196,7 @@ def plants(count: int) -> list[NeedleParameters]:
     random = np.random.default_rng(5)
     return [
         replace(
-            BELIEVED,
+            NOMINAL,
             coulomb_friction=0.56 * float(random.uniform(0.7, 1.3)),
             viscous_friction=300.0 * float(random.uniform(0.7, 1.3)),
             tissue_stiffness=520.0 * float(random.uniform(0.7, 1.3)),
@@ -209,7 +209,7 @@ def plants(count: int) -> list[NeedleParameters]:
 @pytest.mark.parametrize('delay', [0, 1, 3])
 def test_batch_equals_the_controller_of_the_node(name: str, delay: int) -> None:
     """Every run of a batch equals the run of the controller object, to the bit."""
-    axis = Axis.insertion(BELIEVED)
+    axis = Axis.insertion(NOMINAL)
     inverse, gains = InverseDynamicsGains(kp=400.0, kv=40.0), PidGains(kp=1000.0, ki=3000.0)
     law = (
         Pid(axis=axis, gains=gains, period=PERIOD)
@@ -223,7 +223,7 @@ def test_batch_equals_the_controller_of_the_node(name: str, delay: int) -> None:
     )  # fmt: skip
     for i, plant in enumerate(needles):
         controller = Controller(
-            BELIEVED,
+            NOMINAL,
             name,
             gains={'inverse_dynamics': {'insertion': inverse}, 'pid': {'insertion': gains}},
             settings=ControllerSettings(delay=float(delay), force_limit=2.0),
@@ -266,7 +266,7 @@ class Proportional:
 def test_user_defined_law_runs_in_the_loop() -> None:
     """Its commands act after its delay, on the encoder measurements; the load on request."""
     own = Proportional()
-    run = run_controller(own, BELIEVED, START, duration=0.1)
+    run = run_controller(own, NOMINAL, START, duration=0.1)
     assert len(own.seen) == len(run.time) - 1 == 100
     assert_allclose([m.depth for m in own.seen], run.depth[:-1], rtol=1e-15)
     assert (run.forces[:2, :2] == 0.0).all()
@@ -275,8 +275,8 @@ def test_user_defined_law_runs_in_the_loop() -> None:
     assert not any(own.loads)
     assert run.depth[-1] > run.depth[0]
     told = Proportional()
-    run = run_controller(told, BELIEVED, START, duration=0.02, ground_truth=True)
-    model = NeedleModel(BELIEVED)
+    run = run_controller(told, NOMINAL, START, duration=0.02, ground_truth=True)
+    model = NeedleModel(NOMINAL)
     expected = [-model.bias_forces(x)[0] for x in run.states[:-1]]
     assert_allclose(told.loads, expected, rtol=1e-12)
 
@@ -297,32 +297,32 @@ class Blurred:
 
 def test_batch_noise_is_encoder_noise() -> None:
     """Noise is added to the measurements, not to the needle; the additional force moves it."""
-    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
     count = round(DURATION / PERIOD)
     noise = np.random.default_rng(3).standard_normal((count, 3)) * [2e-6, 2e-4, 0.0]
     options: Any = {'delay': 1, 'limit': 15.0, 'duration': DURATION, 'step': 1e-4, 'record': True}
-    batch = run_batch(law, BELIEVED, START, REFERENCE, noise=noise, **options)
+    batch = run_batch(law, NOMINAL, START, REFERENCE, noise=noise, **options)
     controller = Controller(
-        BELIEVED, 'pid', reference='minimum_jerk', settings=ControllerSettings(rotation=False)
+        NOMINAL, 'pid', reference='minimum_jerk', settings=ControllerSettings(rotation=False)
     )
     # The reference of the batch begins where the needle is.
     controller.set_target(0.024)
     controller.guide.at(0.0, 0.02)
-    run = run_controller(Blurred(controller, noise), BELIEVED, START, duration=DURATION, step=1e-4)
+    run = run_controller(Blurred(controller, noise), NOMINAL, START, duration=DURATION, step=1e-4)
     reached = np.abs(run.states).max(axis=0) + 1e-12
     assert_allclose(batch.courses[0] / reached, run.states / reached, atol=1e-9)
     beside = np.array([0.0, 0.0, 0.1])
-    pushed = run_batch(law, BELIEVED, START, REFERENCE, noise=noise + beside, **options)
-    plain = run_batch(law, BELIEVED, START, REFERENCE, noise=noise, **options)
+    pushed = run_batch(law, NOMINAL, START, REFERENCE, noise=noise + beside, **options)
+    plain = run_batch(law, NOMINAL, START, REFERENCE, noise=noise, **options)
     assert (pushed.commands < plain.commands).mean() > 0.9
     with pytest.raises(ShapeError, match=r'noise must be finite, of shape \(\d+, 3\)'):
-        run_batch(law, BELIEVED, START, REFERENCE, noise=noise[1:], **options)
+        run_batch(law, NOMINAL, START, REFERENCE, noise=noise[1:], **options)
     with pytest.raises(ParameterError, match='delay and late >= 0'):
-        run_batch(law, BELIEVED, START, REFERENCE, late=-1, **options)
+        run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
 
 
 def test_batch_is_independent_of_threads_and_step() -> None:
-    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
     needles = plants(5)
 
     def run(**how: Any) -> LoopBatch:
@@ -336,23 +336,23 @@ def test_batch_is_independent_of_threads_and_step() -> None:
 
 
 def test_runs_that_leave_the_depth_range_are_marked() -> None:
-    shallow = NeedleModel(BELIEVED).state_at(0.0012)
+    shallow = NeedleModel(NOMINAL).state_at(0.0012)
     out = MinimumJerk(Setpoint(0.0012), 0.0, ReferenceLimits())
-    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
-    batch = run_batch(law, BELIEVED, shallow, out, delay=1, limit=15.0, duration=1.0)
+    law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
+    batch = run_batch(law, NOMINAL, shallow, out, delay=1, limit=15.0, duration=1.0)
     assert 0 < batch.completed[0] < 1000
 
 
 def test_batch_rejects_inconsistent_arguments() -> None:
-    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
     options: Any = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
     with pytest.raises(ShapeError, match='same number of runs'):
         run_batch([law, law], plants(3), START, REFERENCE, **options)
     other = Pid(axis=law.axis, gains=PidGains(), period=2e-3)
     with pytest.raises(ParameterError, match='same period'):
-        run_batch([law, other], BELIEVED, START, REFERENCE, **options)
+        run_batch([law, other], NOMINAL, START, REFERENCE, **options)
     with pytest.raises(ParameterError, match='duration must be'):
-        run_batch(law, BELIEVED, START, REFERENCE, delay=1, limit=15.0, duration=0.0)
+        run_batch(law, NOMINAL, START, REFERENCE, delay=1, limit=15.0, duration=0.0)
 
 
 def test_friction_change_during_a_run_equals_another_needle() -> None:

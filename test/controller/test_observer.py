@@ -339,15 +339,15 @@ def test_estimate_is_the_conditional_mean_of_all_measurements(case: str) -> None
     """With late, early, disordered and missing samples it equals a dense batch solution."""
     modes, changes, options = BATCH_CASES[case]
     parameters = phantom(modes, **changes)
-    beliefs = ObserverSettings(
+    settings = ObserverSettings(
         **{'irregularity': 3e-3, 'force_resolution': 0.02, 'torque_resolution': 2e-3, **options}
     )
-    reference = Reference(parameters, beliefs)
+    reference = Reference(parameters, settings)
     count, n = 24, modes
     time = PERIOD * np.arange(count + 1)
     depths = 0.06 + 0.02 * time + 1e-4 * np.sin(300.0 * time)
     speeds = 0.02 + 0.03 * np.cos(300.0 * time)
-    exposure = beliefs.tip_exposure
+    exposure = settings.tip_exposure
     ends = np.array([0.3, 6.0, 11.25, 16.4, 17.0 + 1e3 * exposure, 23.0]) * 1e-3
     ends = ends[ends - exposure >= 0.0]
     windows = [(end - exposure, end) for end in ends]
@@ -378,12 +378,12 @@ def test_estimate_is_the_conditional_mean_of_all_measurements(case: str) -> None
     truth = rng.normal(size=len(units))
     wrench_read = wrenches @ truth
     tip_read = tips @ truth
-    counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
+    counts = np.array([settings.force_resolution, settings.torque_resolution]) / np.sqrt(12.0)
     wrench_read += counts * rng.normal(size=wrench_read.shape)
-    tip_read += beliefs.tip_noise * rng.normal(size=tip_read.shape)
+    tip_read += settings.tip_noise * rng.normal(size=tip_read.shape)
     wrench_read[rng.random(wrench_read.shape) < 0.2] = nan
 
-    observer = Observer(parameters, beliefs, PERIOD)
+    observer = Observer(parameters, settings, PERIOD)
     # Out of order: one wrench before its sample, the first wrench last.
     arrivals = {3: [1], 14: [3, 2], 20: [5, 4], count: [0]} if len(ends) == 6 else {9: [1, 0, 2]}
     for k in range(count + 1):
@@ -397,7 +397,10 @@ def test_estimate_is_the_conditional_mean_of_all_measurements(case: str) -> None
     a = np.vstack([wrenches[known], tips[taken]])
     y = np.concatenate([wrench_read[known], tip_read[taken]])
     r = np.concatenate(
-        [np.broadcast_to(counts**2, known.shape)[known], np.full(len(taken), beliefs.tip_noise**2)]
+        [
+            np.broadcast_to(counts**2, known.shape)[known],
+            np.full(len(taken), settings.tip_noise**2),
+        ]
     )
     innovation = a @ a.T + np.diag(r)
     to_state = reference.present(states[-1], depths, speeds)
@@ -426,15 +429,15 @@ def test_estimate_is_the_conditional_mean_of_all_measurements(case: str) -> None
 
 def test_observer_is_consistent_over_200_runs() -> None:
     """NEES and NIS within their bands of 95 %, with the model and its noise as the truth."""
-    parameters, beliefs = phantom(), ObserverSettings(tip_exposure=5e-3)
-    reference = Reference(parameters, beliefs)
+    parameters, settings = phantom(), ObserverSettings(tip_exposure=5e-3)
+    reference = Reference(parameters, settings)
     cases, count = 200, 100
     rng = np.random.default_rng(3)
     time = PERIOD * np.arange(count + 1)
     speeds = np.full(count + 1, 0.05)
     depths = 0.1 + speeds * time
     ends = np.arange(10, count + 1, 20) * PERIOD
-    windows = [(end - beliefs.tip_exposure, end) for end in ends]
+    windows = [(end - settings.tip_exposure, end) for end in ends]
     drawn = draw(reference, depths[0], count, cases, rng)
     start, memory, kicks, noise, first, steps = drawn
     at_start, loads = reference.loads(first, steps)
@@ -442,15 +445,15 @@ def test_observer_is_consistent_over_200_runs() -> None:
     states, wrench, tips = reference.run(
         start, memory, kicks, noise, depths, speeds, windows, loads
     )
-    counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
+    counts = np.array([settings.force_resolution, settings.torque_resolution]) / np.sqrt(12.0)
     wrench += counts[:, np.newaxis] * rng.normal(size=wrench.shape)
-    tips += beliefs.tip_noise * rng.normal(size=tips.shape)
+    tips += settings.tip_noise * rng.normal(size=tips.shape)
     looks = {20, 60, count}
     nees = dict.fromkeys(looks, 0.0)
     squares, degrees = 0.0, 0
     truth = {k: reference.present(states[k], depths[: k + 1], speeds[: k + 1]) for k in looks}
     for case in range(cases):
-        observer = Observer(parameters, beliefs, PERIOD)
+        observer = Observer(parameters, settings, PERIOD)
         observer.update(ns(0.0), depths[0], speeds[0])
         for k in range(1, count + 1):
             lateral, moment = wrench[k - 1, :, case].tolist()
@@ -468,7 +471,7 @@ def test_observer_is_consistent_over_200_runs() -> None:
 
 
 def under_tip_force(
-    force: float, tip_period: int, late: int, beliefs: ObserverSettings, cases: int, count: int
+    force: float, tip_period: int, late: int, settings: ObserverSettings, cases: int, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """
     Observe needles at 10 cm that begin to bend under a constant force at the tip.
@@ -478,11 +481,11 @@ def under_tip_force(
     case.
     """
     parameters = phantom()
-    reference = Reference(parameters, beliefs)
+    reference = Reference(parameters, settings)
     rng = np.random.default_rng(11)
     depths, speeds = np.full(count + 1, 0.1), np.zeros(count + 1)
     ends = range(tip_period, count + 1, tip_period)
-    windows = [(end * PERIOD - beliefs.tip_exposure, end * PERIOD) for end in ends]
+    windows = [(end * PERIOD - settings.tip_exposure, end * PERIOD) for end in ends]
     start, memory, kicks, noise, first, steps = draw(reference, 0.1, count, cases, rng)
     at_start, loads = reference.loads(first, steps)
     at_start[0], loads[:, 0] = force, force
@@ -490,14 +493,14 @@ def under_tip_force(
     states, wrench, tips = reference.run(
         start, memory, kicks, noise, depths, speeds, windows, loads
     )
-    counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
+    counts = np.array([settings.force_resolution, settings.torque_resolution]) / np.sqrt(12.0)
     wrench += counts[:, np.newaxis] * rng.normal(size=wrench.shape)
-    tips += beliefs.tip_noise * rng.normal(size=tips.shape)
+    tips += settings.tip_noise * rng.normal(size=tips.shape)
     end = reference.present(states[-1], depths, speeds)
     deflection = reference.model.modes.integrals(0.1).value @ end[:2]
     found = np.empty((4, cases))
     for case in range(cases):
-        observer = Observer(parameters, beliefs, PERIOD)
+        observer = Observer(parameters, settings, PERIOD)
         observer.update(ns(0.0), 0.1, 0.0)
         for k in range(1, count + 1):
             lateral, moment = wrench[k - 1, :, case].tolist()
@@ -516,50 +519,50 @@ def under_tip_force(
 def test_constant_tip_force_is_estimated_consistently(force: float, sensor: str) -> None:
     """Bevel force: consistent errors, far smaller than the errors of the sensor."""
     if sensor == '1 kHz':
-        beliefs, (tip_period, late) = ObserverSettings(tip_noise=1e-4), (1, 0)
+        settings, (tip_period, late) = ObserverSettings(tip_noise=1e-4), (1, 0)
     else:
-        beliefs = ObserverSettings(tip_noise=3e-4, tip_exposure=0.02)
+        settings = ObserverSettings(tip_noise=3e-4, tip_exposure=0.02)
         tip_period, late = 40, 50
     cases = 60
-    error, spread, nees, nis = under_tip_force(force, tip_period, late, beliefs, cases, 600)
+    error, spread, nees, nis = under_tip_force(force, tip_period, late, settings, cases, 600)
     # Of 60 cases the root of the mean square has an error of 9 %: two of them.
     assert np.sqrt(np.mean(error**2)) < 1.2 * np.sqrt(np.mean(spread**2))
     assert Consistency.of(float(nees.sum()), 4 * cases).holds
     assert abs(nis.mean() - 1.0) < 0.05
-    assert np.sqrt(np.mean(error**2)) < 0.5 * beliefs.tip_noise
+    assert np.sqrt(np.mean(error**2)) < 0.5 * settings.tip_noise
 
 
 @pytest.mark.parametrize('rate', [30.0, 300.0, 1500.0])
 def test_observer_is_consistent_at_any_sample_rate(rate: float) -> None:
     """Rates that do not divide the rate of the force sensor."""
-    parameters, period, beliefs = phantom(), 1.0 / rate, ObserverSettings(tip_exposure=2e-4)
+    parameters, period, settings = phantom(), 1.0 / rate, ObserverSettings(tip_exposure=2e-4)
     needle = Integrator(parameters, NeedleModel(parameters).state_at(0.1, 1e-3), 1e-4)
-    reference = Reference(parameters, beliefs)
-    observer = Observer(parameters, beliefs, period)
+    reference = Reference(parameters, settings)
+    observer = Observer(parameters, settings, period)
     observer.update(ns(0.0), 0.1, 0.0)
     rng = np.random.default_rng(2)
     memories = [np.zeros((len(reference.sections), 2)) for _ in range(2)]
     errors, spreads, samples = [], [], 1
     for tick in range(1, 8001):
-        seen = needle.advance_moved(1.0 / beliefs.filter_rate, 0.0)
+        seen = needle.advance_moved(1.0 / settings.filter_rate, 0.0)
         wrench = []
         for c, value in enumerate((seen.lateral_force, seen.moment)):
             noisy = np.array([value + reference.noise[c] * rng.normal()])
             read, memories[c] = reference.low_pass(noisy, memories[c])
             wrench.append(float(read[0]))
-        if tick / beliefs.filter_rate < samples * period:
+        if tick / settings.filter_rate < samples * period:
             continue
         # The newest reading, up to an eighth of a millisecond late.
         observer.update(ns(samples * period), 0.1, 0.0, (wrench[0], wrench[1]))
         true = needle.model.tip_deflection(needle.state)
-        observer.add_tip(ns(samples * period), true + beliefs.tip_noise * rng.normal())
+        observer.add_tip(ns(samples * period), true + settings.tip_noise * rng.normal())
         value, spread = observer.tip_deflection
         errors.append(value - true)
         spreads.append(spread)
         samples += 1
     error, said = (np.sqrt(np.mean(np.square(x[len(x) // 2 :]))) for x in (errors, spreads))
     assert error < 2.0 * said
-    assert error < beliefs.tip_noise
+    assert error < settings.tip_noise
     assert observer.refused == 0
 
 
@@ -604,21 +607,21 @@ class Irregular(Integrator):
 
 
 @cache
-def prior(parameters: NeedleParameters, beliefs: ObserverSettings, depth: float) -> FloatArray:
+def prior(parameters: NeedleParameters, settings: ObserverSettings, depth: float) -> FloatArray:
     """Root of the covariance of (q, p) at the start."""
-    return Reference(parameters, beliefs).prior(depth)[0]
+    return Reference(parameters, settings).prior(depth)[0]
 
 
 def plant(
     seed: int,
     parameters: NeedleParameters,
     depth: float,
-    beliefs: ObserverSettings,
+    settings: ObserverSettings,
     irregularity: float = 0.0,
 ) -> tuple[Plant, float]:
     """Return the plant with default sensors, bent by the prior, and a force to move it."""
     rng = np.random.default_rng(seed)
-    root, model, n = prior(parameters, beliefs, depth), NeedleModel(parameters), parameters.modes
+    root, model, n = prior(parameters, settings, depth), NeedleModel(parameters), parameters.modes
     start = root @ rng.normal(size=2 * n)
     gram = parameters.linear_density * model.modes.integrals(depth).gram
     state = model.state_at(depth)
@@ -654,20 +657,20 @@ def watch_plant(
 
 def test_defaults_of_plant_and_observer_agree() -> None:
     """The sensor settings of observer and plant are equal, with noise behind the filters."""
-    beliefs, sensor, tip = ObserverSettings(), ForceSensorParameters(), TipParameters()
-    assert (beliefs.cutoffs, beliefs.filter_rate) == (sensor.cutoffs, sensor.rate)
+    settings, sensor, tip = ObserverSettings(), ForceSensorParameters(), TipParameters()
+    assert (settings.cutoffs, settings.filter_rate) == (sensor.cutoffs, sensor.rate)
     impulse = np.zeros(20_000)
     impulse[0] = 1.0
     for cutoff in sensor.cutoffs:
         impulse = lfilter(*butter(2, cutoff, fs=sensor.rate), impulse)
     read = np.sqrt((impulse**2).sum()) * sensor.per_axis('noise')[2:4]
     # Rounded to four digits, so that they read well.
-    assert_allclose((beliefs.force_noise, beliefs.torque_noise), read, rtol=1e-3)
-    counts = beliefs.force_resolution, beliefs.torque_resolution
+    assert_allclose((settings.force_noise, settings.torque_noise), read, rtol=1e-3)
+    counts = settings.force_resolution, settings.torque_resolution
     assert counts == tuple(sensor.per_axis('resolution')[2:4])
-    assert beliefs.tip_noise == tip.noise
+    assert settings.tip_noise == tip.noise
     # A sample of the tip with every one of the plant, which by default is every millisecond.
-    assert (tip.rate, tip.delay, beliefs.tip_exposure) == (0.0, 0.0, PERIOD)
+    assert (tip.rate, tip.delay, settings.tip_exposure) == (0.0, 0.0, PERIOD)
 
 
 @pytest.mark.parametrize(
@@ -682,12 +685,12 @@ def test_observer_is_consistent_on_the_plant_over_200_runs(name: str, irregulari
     """
     parameters = preset(name)
     # The initial state of the low-pass is a guess: NIS is computed from later samples.
-    beliefs = ObserverSettings(irregularity=irregularity, history=0.06, **NO_LOADS)
-    observer = Observer(parameters, beliefs, PERIOD)
+    settings = ObserverSettings(irregularity=irregularity, history=0.06, **NO_LOADS)
+    observer = Observer(parameters, settings, PERIOD)
     runs, count, n = 200, 100, parameters.modes
     nees, tip, squares, degrees = 0.0, 0.0, 0.0, 0
     for seed in range(runs):
-        simulated, force = plant(seed, parameters, 0.1, beliefs, irregularity)
+        simulated, force = plant(seed, parameters, 0.1, settings, irregularity)
         watch_plant(observer, simulated, force, count)
         now = simulated.integrator.state
         nees += observer.nees(now[2 : 2 + n], now[4 + n :])
@@ -703,11 +706,11 @@ def test_observer_is_consistent_on_the_plant_over_200_runs(name: str, irregulari
 
 def test_observer_is_conservative_without_irregularity_and_tip_noise() -> None:
     """Errors are smaller than predicted: NEES and NIS below their bands."""
-    parameters, beliefs = preset('paper_mm'), ObserverSettings()
-    observer = Observer(parameters, beliefs, PERIOD)
+    parameters, settings = preset('paper_mm'), ObserverSettings()
+    observer = Observer(parameters, settings, PERIOD)
     nees, squares, degrees = 0.0, 0.0, 0
     for seed in range(20):
-        simulated, force = plant(seed, parameters, 0.1, beliefs)
+        simulated, force = plant(seed, parameters, 0.1, settings)
         perfect = Plant(simulated.integrator, ForceSensor(ForceSensorParameters(), 1e3, seed), 1e3)
         watch_plant(observer, perfect, force, 100)
         now = perfect.integrator.state
@@ -724,7 +727,7 @@ def simulate(
     depth: float,
     count: int,
     *,
-    believed: NeedleParameters | None = None,
+    nominal: NeedleParameters | None = None,
     **options: Any,
 ) -> tuple[Observer, FloatArray]:
     """
@@ -735,13 +738,13 @@ def simulate(
     Returns the observer, and for every sample NEES, true tip deflection, its estimate, the
     standard deviation of the estimate, and the last received tip sample.
     """
-    beliefs = ObserverSettings(**options)
+    settings = ObserverSettings(**options)
     rng = np.random.default_rng([seed, 3])
     n = parameters.modes
     carried = replace(parameters, viscous_friction=1e6)
-    simulated, force = plant(seed, carried, depth, beliefs)
+    simulated, force = plant(seed, carried, depth, settings)
     needle = simulated.integrator
-    observer = Observer(believed or parameters, beliefs, PERIOD)
+    observer = Observer(nominal or parameters, settings, PERIOD)
     observer.update(ns(0.0), needle.depth, needle.velocity)
     late: list[tuple[int, float]] = []
     rows, raw = [], 0.0
@@ -750,7 +753,7 @@ def simulate(
         wrench = float(shown.wrench[2]), float(shown.wrench[3])
         observer.update(ns(k * PERIOD), shown.depth, shown.speed, wrench)
         if k % 20 == 0:
-            late.append((k, shown.tip_deflection + beliefs.tip_noise * rng.normal()))
+            late.append((k, shown.tip_deflection + settings.tip_noise * rng.normal()))
         if late and late[0][0] == k - 20:
             taken, raw = late.pop(0)
             observer.add_tip(ns(taken * PERIOD), raw)
@@ -819,14 +822,14 @@ def test_tip_estimate_is_better_than_the_tip_sensor(name: str, depth: float, mod
 @pytest.mark.parametrize('factor', [0.7, 1.3])
 def test_default_irregularity_covers_a_stiffness_mismatch(depth: float, factor: float) -> None:
     """Stiffness 30 % off on the undamped needle: errors are approximately consistent."""
-    believed = preset('paper_mm')
-    parameters = preset('paper_mm', tissue_stiffness=factor * believed.tissue_stiffness)
-    observer, rows = simulate(4, parameters, depth, 300, believed=believed)
+    nominal = preset('paper_mm')
+    parameters = preset('paper_mm', tissue_stiffness=factor * nominal.tissue_stiffness)
+    observer, rows = simulate(4, parameters, depth, 300, nominal=nominal)
     _, truth, estimate, spread, _ = rows[60:].T
     assert np.sqrt(np.mean((estimate - truth) ** 2)) < 2.0 * np.sqrt(np.mean(spread**2))
     assert observer.nis.ratio < 1.5
     # Without configured irregularity it is inconsistent, and detects it.
-    observer, _ = simulate(4, parameters, depth, 300, believed=believed, irregularity=0.0)
+    observer, _ = simulate(4, parameters, depth, 300, nominal=nominal, irregularity=0.0)
     assert observer.nis.ratio > 2.0 * observer.nis.high
 
 
@@ -864,12 +867,12 @@ def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrato
     """Observe the simulated needle with very accurate sensors."""
     parameters = phantom(modes, **changes)
     needle = Integrator(parameters, NeedleModel(parameters).state_at(depth, 1e-3), 2e-6)
-    beliefs = ObserverSettings(
+    settings = ObserverSettings(
         irregularity=0.0, tip_noise=1e-9, force_noise=1e-6, torque_noise=1e-8,
         force_resolution=0.0, torque_resolution=0.0, cutoffs=(), filter_rate=1.0 / PERIOD,
         **NO_LOADS,
     )  # fmt: skip
-    observer = Observer(parameters, beliefs, PERIOD)
+    observer = Observer(parameters, settings, PERIOD)
     observer.update(ns(0.0), depth, 0.0)
     for k in range(1, 31):
         seen = needle.advance_moved(PERIOD, 0.0)

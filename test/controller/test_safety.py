@@ -231,7 +231,7 @@ def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
     now = 15 * SECOND
-    assert whole.news(now) == []
+    assert whole.new_warnings(now) == []
     assert whole.warning(now) is None
     said = []
     for i in range(2000):
@@ -239,24 +239,24 @@ def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
         joints.check(now, now)
         if i < 1000:
             wrench.check(now, now, 'needle_base', [0.0, 0.0])
-        said += whole.news(now)
+        said += whole.new_warnings(now)
     assert said == ['base_wrench is stale: no valid message for 0.5 s']
     assert whole.warning(now) == 'base_wrench is stale: no valid message for 1.0 s'
     now += MILLISECOND
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     assert whole.warning(now) is None
     # No warnings without a plant.
-    assert whole.news(now + 9 * SECOND) == []
+    assert whole.new_warnings(now + 9 * SECOND) == []
 
 
 def test_silence_is_measured_from_the_first_clock_message() -> None:
     """A node with simulated time is at 0 before the first /clock."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
     whole.begin(0)
-    assert whole.news(0) == []
+    assert whole.new_warnings(0) == []
     now = 1_795_193_306 * SECOND
     whole.streams['joint_states'].check(now, now)
-    assert whole.news(now) == []
+    assert whole.new_warnings(now) == []
 
 
 def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
@@ -286,22 +286,22 @@ def test_duplicate_publishers_of_commands_are_reported() -> None:
     """Each topic with more than one publisher, until there is one again."""
     whole = safety()
     whole.count_publishers({'wrench_command': 2})
-    assert whole.rivals == '2 nodes publish wrench_command'
+    assert whole.duplicate_publishers == '2 nodes publish wrench_command'
     whole.count_publishers({'wrench_command': 1})
-    assert whole.rivals is None
+    assert whole.duplicate_publishers is None
 
 
 def test_sensor_with_two_publishers_is_rejected() -> None:
     """No force with duplicate encoders; after the duplicate ends, the sensor is valid again."""
     whole, now = safety(), 5 * SECOND
     whole.count_publishers({'joint_states': 2, 'base_wrench': 3})
-    assert whole.rivals == '2 nodes publish joint_states'
+    assert whole.duplicate_publishers == '2 nodes publish joint_states'
     for name, count in (('joint_states', 2), ('base_wrench', 3)):
         refusal = whole.streams[name].check(now, now, 'needle_base')
         assert refusal is not None
         assert (refusal.kind, refusal.line) == ('disputed', f'{count} nodes publish {name}')
     whole.count_publishers({'joint_states': 1, 'base_wrench': 2})
-    assert whole.rivals is None
+    assert whole.duplicate_publishers is None
     # Messages of the other publisher have no effect.
     assert whole.streams['joint_states'].check(now - SECOND // 100, now) is None
 
@@ -331,7 +331,7 @@ def test_out_of_order_encoders_stop_the_motion() -> None:
         assert (stream.window.share(now) > 0.5) == (share > 0.5)
         said = f'joint_states has {stream.window.share(now):.0%} of its messages out of order'
         assert whole.warning(now) == (said if warned or share > 0.5 else None)
-        assert whole.muddled(now) == (said if stopped else None)
+        assert whole.mixed_sources(now) == (said if stopped else None)
 
 
 @pytest.mark.parametrize(

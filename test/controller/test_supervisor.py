@@ -93,7 +93,7 @@ class Loop:
         return next(answer for answer in answers if answer is not None and answer.force > 0.5)
 
     def said(self) -> list[str]:
-        return [line for _, line in self.supervisor.journal.take()]
+        return [line for _, line in self.supervisor.events.take()]
 
 
 #: Events of a control loop, except for a release of the stop.
@@ -248,7 +248,7 @@ class Robot:
             self.loop.depth += self.velocity * 1e-9 * PERIOD
             effort = [answer.force if obeys else 0.0] if self.reports else []
             self.loop.encoders(self.loop.now, self.loop.depth, self.velocity, *effort)
-            self.loop.supervisor.journal.take()
+            self.loop.supervisor.events.take()
 
     @property
     def aim(self) -> float:
@@ -337,7 +337,7 @@ def test_inactive_supervisor_accepts_only_the_stop() -> None:
     assert supervisor.emergency_stop(SECOND).answer == ForceCommand(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
-    assert supervisor.journal.last_rejection == 'target rejected: the controller is not active'
+    assert supervisor.events.last_rejection == 'target rejected: the controller is not active'
     assert supervisor.pause(True).message == 'pause refused: the controller is not active'
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
@@ -391,20 +391,20 @@ def test_invalid_observer_settings_are_named() -> None:
 def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
     """Each kind has its own limit; a line without a kind is always logged."""
     times = iter([0.0, 0.5, 1.0, 1.9, 2.1, 2.1])
-    journal = EventLog(steady=lambda: next(times))
+    events = EventLog(steady=lambda: next(times))
     for number in range(5):
-        journal.say(Severity.WARNING, f'line {number}', 'stale')
-    journal.say(Severity.WARNING, 'another', 'jump')
-    journal.say(Severity.INFO, 'always')
-    assert journal.changed
-    said = [line for _, line in journal.take()]
+        events.add(Severity.WARNING, f'line {number}', 'stale')
+    events.add(Severity.WARNING, 'another', 'jump')
+    events.add(Severity.INFO, 'always')
+    assert events.changed
+    said = [line for _, line in events.take()]
     # Suppressed lines are counted in the next line of their kind.
     assert said == [
         *('line 0', 'line 2 (1 similar omitted)', 'line 4 (1 similar omitted)'),
         *('another', 'always'),
     ]
-    assert not journal.changed
-    assert journal.take() == []
+    assert not events.changed
+    assert events.take() == []
 
 
 def test_many_rejected_targets_give_one_log_line_per_second() -> None:
@@ -413,9 +413,9 @@ def test_many_rejected_targets_give_one_log_line_per_second() -> None:
     changes = 0
     for _ in range(1000):
         loop.supervisor.target(0, '', 9.0, 0.0, loop.now)
-        changes += loop.supervisor.journal.changed
-        loop.supervisor.journal.take()
-    assert loop.supervisor.journal.rejected == 1000
+        changes += loop.supervisor.events.changed
+        loop.supervisor.events.take()
+    assert loop.supervisor.events.rejected == 1000
     assert changes == 1
 
 

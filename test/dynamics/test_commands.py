@@ -106,7 +106,7 @@ def test_no_force_acts_with_several_command_publishers() -> None:
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     assert not commands.count_commanders(1)
     assert commands.count_commanders(3)
-    assert commands.rivals == 2
+    assert commands.duplicates == 2
     commands.hold(NOW + PERIOD)
     assert commands.held == AppliedForces(NOW)
     commands.offer(NOW + PERIOD, '', 1.0, 0.0, NOW + PERIOD)

@@ -198,7 +198,7 @@ def test_bevel_steering_moves_only_the_roll(ros_graph: RosGraph) -> None:
     """The guide rests, the joint roll alternates."""
     bench = Bench(
         ros_graph, bevel=1.0, guide_limit=0.0, turns=4, roll_speed=20.0, step_length=0.005,
-        steering__bevel_load=[1.0], belief__tilt=5e-3, belief__frame=5e-3,
+        steering__bevel_load=[1.0], prior__tilt=5e-3, prior__frame=5e-3,
     )  # fmt: skip
     bench.aim((1e-3, 0.051, 0.0))
     assert bench.end() is SteeringPhase.DONE
@@ -374,7 +374,7 @@ def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> Non
     assert 'out of reach' in bench.status.last_rejection
     for name, value, complaint in (
         ('speed', 0.0, 'speed must be finite, > 0 m/s, got 0.0'),
-        ('belief.noise', 0.0, 'belief.noise must be finite, > 0 m, got 0.0'),
+        ('prior.noise', 0.0, 'prior.noise must be finite, > 0 m, got 0.0'),
         ('model.tissue_stiffness', 'soft', "model.tissue_stiffness must be a number, got 'soft'"),
         ('steering.path_noise', 0.1, "unknown parameter 'steering.path_noise'"),
         ('turns', 0.5, 'turns must be a whole number, got 0.5'),

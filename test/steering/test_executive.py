@@ -460,7 +460,7 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
 
 def test_noisy_readings_give_a_warning() -> None:
     """Five times the configured noise."""
-    robot = Robot(belief=SteeringPrior(noise=8e-6))
+    robot = Robot(prior=SteeringPrior(noise=8e-6))
     robot.tick(5)
     robot.aim()
     robot.tick(60)

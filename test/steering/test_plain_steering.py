@@ -38,12 +38,12 @@ class Plain:
     ) -> None:
         self.model, self.goal, self.limit = model, complex(*target), limit
         self.turns, self.load_limit, self.roll, self.step = turns, load_limit, 0.0, 0
-        n, m = model.steps, len(model.prior)
+        n, m = model.steps, len(model.prior_covariance)
         self.ways = np.minimum(step_limit * np.arange(1, n + 1), 2.0 * limit)
         self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
         self.mean = np.zeros((len(model.lengths), m), complex)
         self.mean[:, 3] = 1j * model.push
-        self.covariance = np.array([model.prior] * len(model.lengths), complex)
+        self.covariance = np.array([model.prior_covariance] * len(model.lengths), complex)
         self.logs = np.zeros(len(model.lengths))
 
     @property
@@ -79,7 +79,7 @@ class Plain:
     def see(self, look: FloatArray) -> None:
         """Update the hypotheses by a tip measurement."""
         means, variances, shared = self.tip(self.step, self.held())
-        whole, off = variances + self.model.belief.noise**2, complex(*look) - means
+        whole, off = variances + self.model.prior.noise**2, complex(*look) - means
         self.mean += (off / whole)[:, None] * shared
         self.covariance -= np.einsum('hm,hl->hml', shared / whole[:, None], shared.conj())
         self.logs -= 0.5 * abs(off) ** 2 / whole + np.log(whole)

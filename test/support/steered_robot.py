@@ -33,12 +33,12 @@ class Robot:
     def __init__(
         self,
         own: ExecutiveSettings = SETTINGS,
-        belief: SteeringPrior | None = None,
+        prior: SteeringPrior | None = None,
         law: str = DEFAULT_LAW,
     ) -> None:
         self.seconds = 0.0
         self.loop = SteeringExecutive(
-            NEEDLE, STEERING, belief or SteeringPrior(), own, steady=lambda: self.seconds, law=law
+            NEEDLE, STEERING, prior or SteeringPrior(), own, steady=lambda: self.seconds, law=law
         )
         softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
@@ -132,9 +132,9 @@ class Robot:
 
     def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
         """Send a target; return the reason of a rejection."""
-        before = self.loop.journal.rejected
+        before = self.loop.events.rejected
         self.follow(self.loop.target(0, frame, point, self.now))
-        return self.loop.journal.last_rejection if self.loop.journal.rejected > before else ''
+        return self.loop.events.last_rejection if self.loop.events.rejected > before else ''
 
     def steer(self, ticks: int = 6000) -> None:
         """Send a target, and run until the loop has finished."""

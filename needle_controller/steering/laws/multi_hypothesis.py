@@ -174,11 +174,11 @@ class MultiHypothesisLaw:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
         from needle_dynamics.compiled.boxed import Boxed
 
-        count, size = len(model.lengths), len(model.prior)
+        count, size = len(model.lengths), len(model.prior_covariance)
         mean = np.zeros((count, size), dtype=np.complex128)
         mean[:, BEVEL] = 1j * model.push
         covariance = np.empty((count, size, size), dtype=np.complex128)
-        covariance[:] = model.prior
+        covariance[:] = model.prior_covariance
         self._model = model
         self._now = Steering(
             responses=model.responses,
@@ -364,7 +364,7 @@ class MultiHypothesisLaw:
         if seen.shape != (2,):
             raise ShapeError(f'a tip measurement must be x and z, got shape {seen.shape}')
         x, z = seen.tolist()
-        variance = max(self._model.belief.noise, noise) ** 2
+        variance = max(self._model.prior.noise, noise) ** 2
         kind, off_x, off_z = see(self._held, at, x, z, variance)
         if kind == FINE:
             return
@@ -376,7 +376,7 @@ class MultiHypothesisLaw:
             raise SteeringFaultError(f'the tip sensor is frozen: {same} identical measurements')
         raise SteeringFaultError(
             f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from its '
-            f'expected position, outside the model uncertainty (belief.*)'
+            f'expected position, outside the model uncertainty (prior.*)'
         )
 
     def plan(self) -> GuideSetpoint:
