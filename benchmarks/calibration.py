@@ -187,7 +187,7 @@ def insertion(parameters: NeedleParameters) -> RobotMotion:
     return RobotMotion(
         np.arange(1, len(samples) + 1) / RATE,
         np.array([sample.joint_position for sample in samples]),
-        np.array([sample.speed for sample in samples]),
+        np.array([sample.velocity for sample in samples]),
         felt,
     )
 

@@ -105,7 +105,7 @@ def jobs() -> dict[str, Callable[[], object]]:
         found[f'{name}, with observer'] = _observed(physical, observe)
     found['observer'] = observe
     plain = NumpyInverseDynamics(parameters, InverseDynamicsGains())
-    target = np.array([goal.position, goal.speed, goal.acceleration])
+    target = np.array([goal.position, goal.velocity, goal.acceleration])
     found['inverse_dynamics, NumPy'] = lambda: plain.command(_DEPTH, _SPEED, target)
     return found
 

@@ -19,7 +19,9 @@ class Spring:
 
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         """Compute the force for a measurement; `load` [N] is the force of a bent needle."""
-        return ControllerOutput(force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.speed)
+        return ControllerOutput(
+            force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.velocity
+        )
 
 
 def main() -> None:

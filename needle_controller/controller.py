@@ -125,9 +125,9 @@ class Measurement:
     ----------
     time : float
         Time of the sample [s].
-    depth, speed : float
+    depth, velocity : float
         Insertion depth [m] and insertion velocity [m/s], positive into the tissue.
-    angle, angular_speed : float
+    angle, angular_velocity : float
         Rotation of the base about x [rad] and its velocity [rad/s].
     force : float
         Axial force on the needle as reported by the robot [N]; NaN if it is not reported.
@@ -136,15 +136,15 @@ class Measurement:
 
     time: float
     depth: float
-    speed: float
+    velocity: float
     angle: float = 0.0
-    angular_speed: float = 0.0
+    angular_velocity: float = 0.0
     force: float = nan
 
     def is_finite(self) -> bool:
         """Return whether every number is finite; the force may be missing."""
-        insertion = isfinite(self.depth) and isfinite(self.speed)
-        return insertion and isfinite(self.angle) and isfinite(self.angular_speed)
+        insertion = isfinite(self.depth) and isfinite(self.velocity)
+        return insertion and isfinite(self.angle) and isfinite(self.angular_velocity)
 
 
 #: Time over which positions and velocities are compared [s].
@@ -231,7 +231,7 @@ class Controller:
     >>> from needle_dynamics import NeedleParameters
     >>> controller = Controller(NeedleParameters.preset('phantom'))
     >>> controller.set_target(0.05)
-    >>> command = controller.command(Measurement(time=0.0, depth=0.02, speed=0.0))
+    >>> command = controller.command(Measurement(time=0.0, depth=0.02, velocity=0.0))
     >>> command.setpoint.position
     0.02
     >>> 0.0 < command.force < 15.0
@@ -358,14 +358,14 @@ class Controller:
         self,
         times: Sequence[float],
         positions: Sequence[float],
-        speeds: Sequence[float] | None = None,
+        velocities: Sequence[float] | None = None,
     ) -> None:
         """
         Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`.
 
         Parameters
         ----------
-        times, positions, speeds
+        times, positions, velocities
             As for `ReferenceGenerator.follow`.
 
         Raises
@@ -374,7 +374,7 @@ class Controller:
             If the path is not valid.
 
         """
-        self.guide.follow(times, positions, speeds)
+        self.guide.follow(times, positions, velocities)
         self._last_depth = None
 
     def forget(self) -> None:
@@ -420,21 +420,21 @@ class Controller:
             return None
         jump, elapsed = self.settings.jump, measured.time - before.time
         moved = measured.depth - before.depth
-        rest = moved - 0.5 * (before.speed + measured.speed) * elapsed
+        rest = moved - 0.5 * (before.velocity + measured.velocity) * elapsed
         if not abs(rest) <= jump:
             # The position jumped; the next measurements may be consistent.
             self._unexplained = 0.0
             return (
-                f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
-                f'{before.speed:.6g} and {measured.speed:.6g} m/s'
+                f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at velocities of '
+                f'{before.velocity:.6g} and {measured.velocity:.6g} m/s'
             )
         unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
         # Clipped, so that the fault ends as soon as position and velocity agree again.
         self._unexplained = min(max(unexplained, -jump), jump)
         if abs(unexplained) > jump:
             return (
-                f'insertion and its speed contradict each other: {1e3 * abs(unexplained):.3g} mm '
-                f'too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
+                f'insertion and its velocity contradict each other: {1e3 * abs(unexplained):.3g} '
+                f'mm too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
             )
         return None
 
@@ -475,9 +475,9 @@ class Controller:
         torque = 0.0
         if self.settings.rotation:
             still = Setpoint(0.0)
-            torque = self._rotation.command(measured.angle, measured.angular_speed, still)
+            torque = self._rotation.command(measured.angle, measured.angular_velocity, still)
         return ControllerOutput(
-            force=self._insertion.command(measured.depth, measured.speed, ahead, load),
+            force=self._insertion.command(measured.depth, measured.velocity, ahead, load),
             torque=torque,
             setpoint=now,
             notice=notice,

@@ -377,8 +377,8 @@ class Robot:
         if isfinite(depth):
             self._depth = depth
         return Measurement(
-            time=time, depth=depth, speed=velocity, angle=angle, angular_speed=angular_velocity,
-            force=force,
+            time=time, depth=depth, velocity=velocity, angle=angle,
+            angular_velocity=angular_velocity, force=force,
         )  # fmt: skip
 
     def _find(self, joint: str, reading: Reading) -> int:

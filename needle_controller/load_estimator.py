@@ -110,7 +110,7 @@ class LoadEstimator:
         if wrench is not None and wrench[0] <= stamp:
             self._waiting = None
         self.load = 0.0
-        observer.update(stamp, measured.depth, measured.speed, own)
+        observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1
         if self._updates % _LOOK == 0:
             self._judge(observer)

@@ -25,7 +25,7 @@ from needle_controller.compiled.laws import (
     INVERSE_DYNAMICS,
     POSITION,
     RATE,
-    SPEED,
+    VELOCITY,
 )
 from needle_controller.laws.axis import Axis
 from needle_controller.laws.inverse_dynamics import BANDWIDTH, InverseDynamics
@@ -113,17 +113,17 @@ def transition_matrix(
     # Only memory used by the gains is part of the loop; the offset after a switch decays.
     c = law.constants
     follows = c.kp if c.kind == INVERSE_DYNAMICS else 0.0
-    uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, SPEED: follows}
+    uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, VELOCITY: follows}
     used = [entry for entry, gain in uses.items() if gain > 0.0]
     first = 2 + len(used)
 
     def period(state: FloatArray) -> list[float]:
-        position, speed = state[:2].tolist()
+        position, velocity = state[:2].tolist()
         commands: list[float] = state[first:].tolist()
         loop.memory[used], loop.memory[FOLLOWS] = state[2:first], float(follows > 0.0)
         loop.pending.extend(commands[unmodeled:])
-        commands.append(loop.command(position, speed, rest))
-        end = moved.propagate(position, speed, commands[0], linear.period)
+        commands.append(loop.command(position, velocity, rest))
+        end = moved.propagate(position, velocity, commands[0], linear.period)
         return [*end, *loop.memory[used].tolist(), *commands[1:]]
 
     return np.array([period(unit) for unit in np.eye(first + late)]).T

@@ -629,7 +629,7 @@ class Supervisor:
             self.events.last_rejection = command.notice
             self.events.add(Severity.ERROR, command.notice)
         aim = command.setpoint
-        error = aim.position - measured.depth, aim.speed - measured.speed
+        error = aim.position - measured.depth, aim.velocity - measured.velocity
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
         if stopped is not None:
             return stopped

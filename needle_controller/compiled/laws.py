@@ -29,7 +29,7 @@ PID: Final = 1.0
 #: Entries of the memory of a law: integral of the error, filtered rate of the error, force offset
 #: that fades after a switch of laws, and for inverse dynamics position and velocity of the modeled
 #: motion, valid if `FOLLOWS` is 1.
-INTEGRAL, RATE, OFFSET, POSITION, SPEED, FOLLOWS = 0, 1, 2, 3, 4, 5
+INTEGRAL, RATE, OFFSET, POSITION, VELOCITY, FOLLOWS = 0, 1, 2, 3, 4, 5
 
 #: Learned friction, for insertion and then for withdrawal; before it a flag and the last measured
 #: position and velocity, valid if the flag is 1.
@@ -126,17 +126,17 @@ class Instant(NamedTuple):
 
     Attributes
     ----------
-    position, speed : float
+    position, velocity : float
         State of the axis.
-    target, target_speed, target_acceleration : float
+    target, target_velocity, target_acceleration : float
         Setpoint.
 
     """
 
     position: float
-    speed: float
+    velocity: float
     target: float
-    target_speed: float
+    target_velocity: float
     target_acceleration: float
 
 
@@ -176,11 +176,11 @@ def _friction(c: LawConstants) -> FrictionConstants:
 
 
 @compiled
-def _dry(c: LawConstants, speed: float, acceleration: float) -> float:
+def _dry(c: LawConstants, velocity: float, acceleration: float) -> float:
     """Return the dry friction of a motion [N] at its predicted velocity."""
     if c.coulomb == 0.0:
         return 0.0
-    soon = speed + c.ahead * acceleration
+    soon = velocity + c.ahead * acceleration
     level = dry_friction(_friction(c), c.coulomb, abs(soon))[0]
     if soon < 0.0:
         level *= c.withdrawal
@@ -198,15 +198,15 @@ def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
     """
     if c.kind == PID:
         return at
-    position, speed = at.position, at.speed
+    position, velocity = at.position, at.velocity
     if memory[FOLLOWS] == 1.0:
-        position, speed = float(memory[POSITION]), float(memory[SPEED])
+        position, velocity = float(memory[POSITION]), float(memory[VELOCITY])
     acceleration = (
         at.target_acceleration
-        + c.model_kv * (at.target_speed - speed)
+        + c.model_kv * (at.target_velocity - velocity)
         + c.model_kp * (at.target - position)
     )
-    return Instant(at.position, at.speed, position, speed, acceleration)
+    return Instant(at.position, at.velocity, position, velocity, acceleration)
 
 
 @compiled
@@ -214,7 +214,7 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
     """Return the learned additional friction of the motion to follow [N]."""
     if c.bound == 0.0:
         return 0.0
-    soon = aim.target_speed + c.ahead * aim.target_acceleration
+    soon = aim.target_velocity + c.ahead * aim.target_acceleration
     first = LEARNED if soon > 0.0 else LEARNED + BLOCK
     most = bounds(c.bound, c.coulomb, c.viscous)
     found = correction(memory[first : first + BLOCK], most, aim.target, abs(soon))
@@ -223,7 +223,7 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
 
 @kernel
 def law_learn(
-    constants: LawTuple, memory: Vector, position: float, speed: float, force: float
+    constants: LawTuple, memory: Vector, position: float, velocity: float, force: float
 ) -> None:
     """
     Update the learned friction with the last period, if the law learns and the axis was sliding.
@@ -235,17 +235,17 @@ def law_learn(
     if c.bound == 0.0:
         return
     seen, before, rate = memory[SEEN], memory[SEEN + 1], memory[SEEN + 2]
-    memory[SEEN], memory[SEEN + 1], memory[SEEN + 2] = 1.0, position, speed
+    memory[SEEN], memory[SEEN + 1], memory[SEEN + 2] = 1.0, position, velocity
     if seen != 1.0 or c.noise == inf:
         return
     mean = (position - before) / c.period
     # Sliding in the same direction at both ends, and no missing measurement between them.
-    slides = min(abs(mean), abs(speed), abs(rate)) > _SLIDES and speed * rate > 0.0
-    if not slides or abs(mean - 0.5 * (speed + rate)) > 0.5 * abs(mean):
+    slides = min(abs(mean), abs(velocity), abs(rate)) > _SLIDES and velocity * rate > 0.0
+    if not slides or abs(mean - 0.5 * (velocity + rate)) > 0.5 * abs(mean):
         return
     sign = 1.0 if mean > 0.0 else -1.0
     first = LEARNED if mean > 0.0 else LEARNED + BLOCK
-    modeled = friction_force(_friction(c), mean, 0.0) + c.inertia * (speed - rate) / c.period
+    modeled = friction_force(_friction(c), mean, 0.0) + c.inertia * (velocity - rate) / c.period
     learn(
         memory[first : first + BLOCK],
         bounds(c.bound, c.coulomb, c.viscous),
@@ -261,26 +261,26 @@ def law_learn(
 def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     """Set up feed-forward and implicit feedback; see `needle_controller.laws.pid.Pid`."""
     h = c.period
-    reached = aim.target_speed + h * aim.target_acceleration
-    way = aim.target_speed + reached
+    reached = aim.target_velocity + h * aim.target_acceleration
+    way = aim.target_velocity + reached
     if way == 0.0:
         way = aim.target - aim.position
     pv, vv, pf, vf = c.pv, c.vv, c.pf, c.vf
     if way < 0.0:
         pv, vv, pf, vf = c.back_pv, c.back_vv, c.back_pf, c.back_vf
-    linear = (reached - vv * aim.target_speed) / vf
+    linear = (reached - vv * aim.target_velocity) / vf
     share = h / (c.filter_time + h)
     rate = (1.0 - share) * memory[RATE]
     stiffness, slope = c.kp + h * c.ki, share * vf
     divisor = 1.0 + stiffness * pf + c.kd * slope
     if c.kind == PID:
-        end = aim.target + h * aim.target_speed
-        rate += share * (reached - vv * aim.speed)
-        push = stiffness * (end - aim.position - pv * aim.speed)
+        end = aim.target + h * aim.target_velocity
+        rate += share * (reached - vv * aim.velocity)
+        push = stiffness * (end - aim.position - pv * aim.velocity)
     else:
         # The feed-forward moves the model to the end; feedback of the deviation only.
-        end = aim.target + pv * aim.target_speed + pf * linear
-        slower = aim.target_speed - aim.speed
+        end = aim.target + pv * aim.target_velocity + pf * linear
+        slower = aim.target_velocity - aim.velocity
         rate += share * vv * slower
         push = stiffness * (aim.target - aim.position + pv * slower)
     push += c.kd * rate + c.ki * memory[INTEGRAL] + memory[OFFSET]
@@ -288,7 +288,7 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     if c.kind == PID and c.feed_forward != 0.0:
         push += linear
     if c.feed_forward != 0.0:
-        forward += _dry(c, aim.target_speed, aim.target_acceleration)
+        forward += _dry(c, aim.target_velocity, aim.target_acceleration)
         if c.kind != PID:
             forward += linear
     return _Implicit(forward, push, divisor, rate, slope, end, reached)
@@ -306,7 +306,7 @@ def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: 
     excess = wanted - force
     memory[RATE] = form.rate - form.slope * (form.push / form.divisor - excess)
     error = aim.target - aim.position
-    at_rest = at.target_speed == 0.0 and at.target_acceleration == 0.0
+    at_rest = at.target_velocity == 0.0 and at.target_acceleration == 0.0
     if not (at_rest and abs(at.target - at.position) < c.tolerance):
         if c.tracking > 0.0:
             memory[INTEGRAL] += c.period * error
@@ -317,7 +317,7 @@ def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: 
     memory[OFFSET] *= c.fade
     # Without feedback, and at the force limit, the modeled motion restarts at the measurement.
     memory[FOLLOWS] = 1.0 if c.kp > 0.0 and excess == 0.0 else 0.0
-    memory[POSITION], memory[SPEED] = form.end, form.reached
+    memory[POSITION], memory[VELOCITY] = form.end, form.reached
     return force
 
 
@@ -344,7 +344,7 @@ def law_match(
     """Set the memory such that the force of the law equals ``force`` [N]; else as `law_force`."""
     c, at = LawConstants(*constants), Instant(*instant)
     memory[:SEEN] = 0.0
-    memory[RATE] = at.target_speed - at.speed
+    memory[RATE] = at.target_velocity - at.velocity
     form = _implicit(c, memory, _aim(c, memory, at))
     missing = (force - form.forward) * form.divisor - form.push
     if c.kind != PID:
@@ -369,9 +369,9 @@ def law_step(
 
 @kernel
 def axis_step(
-    constants: LawTuple, position: float, speed: float, force: float
+    constants: LawTuple, position: float, velocity: float, force: float
 ) -> tuple[float, float]:
     """Return position and velocity of the axis after one period under a force less loads [N]."""
     c = LawConstants(*constants)
-    speed, moved = friction_flow(_friction(c), c.inertia, speed, force, c.period)
-    return position + moved, speed
+    velocity, moved = friction_flow(_friction(c), c.inertia, velocity, force, c.period)
+    return position + moved, velocity

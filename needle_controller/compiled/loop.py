@@ -80,7 +80,7 @@ def run_loop(  # noqa: C901
     count = setpoints.shape[0]
     largest, squares, acts = 0.0, 0.0, 0.0
     for k in range(count + 1):
-        depth, speed = c.length - state[0], -state[m]
+        depth, velocity = c.length - state[0], -state[m]
         if depths.shape[0] > 0:
             depths[k] = depth
         if states.shape[0] > 0:
@@ -93,12 +93,12 @@ def run_loop(  # noqa: C901
         if k == count:
             break
         if noise.shape[0] > 0:
-            depth, speed = depth + noise[k, 0], speed + noise[k, 1]
-        law_learn(law, memory, depth, speed, acts)
+            depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
+        law_learn(law, memory, depth, velocity, acts)
         for i in range(delay - known, delay):
-            depth, speed = axis_step(law, depth, speed, pending[i])
+            depth, velocity = axis_step(law, depth, velocity, pending[i])
         aim = setpoints[k]
-        instant = (depth, speed, aim[0], aim[1], aim[2])
+        instant = (depth, velocity, aim[0], aim[1], aim[2])
         command = law_step(law, memory, instant, 0.0, limit)
         if commands.shape[0] > 0:
             commands[k] = command
@@ -149,10 +149,10 @@ def ring(
     for part in range(3):
         low, high = position, position
         for _ in range(count):
-            seen, speed = position, velocity
+            seen, rate = position, velocity
             for i in range(delay - known, delay):
-                seen, speed = axis_step(law, seen, speed, pending[i])
-            command = law_step(law, memory, (seen, speed, 0.0, 0.0, 0.0), 0.0, np.inf)
+                seen, rate = axis_step(law, seen, rate, pending[i])
+            command = law_step(law, memory, (seen, rate, 0.0, 0.0, 0.0), 0.0, np.inf)
             force = command
             if delay > 0:
                 force = pending[0]

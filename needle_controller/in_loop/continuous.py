@@ -187,10 +187,10 @@ class _Pieces:
 
     def _way(self, time: float, y: FloatArray) -> int:
         """Return the direction of motion: 1 into the tissue, -1 out of it, 0 at rest."""
-        speed = -y[self.m]
+        velocity = -y[self.m]
         at_hub = self.plant.parameters.hub_stop and y[0] <= 0.0
-        if speed != 0.0 and not (at_hub and speed > 0.0):
-            return 1 if speed > 0.0 else -1
+        if velocity != 0.0 and not (at_hub and velocity > 0.0):
+            return 1 if velocity > 0.0 else -1
         if self._excess(time, y, 1) > 0.0 and not at_hub:
             return 1
         return -1 if self._excess(time, y, -1) > 0.0 else 0

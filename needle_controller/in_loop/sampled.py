@@ -130,9 +130,9 @@ def run_controller(
         measured = Measurement(
             time=float(time[k]),
             depth=integrator.depth,
-            speed=integrator.velocity,
+            velocity=integrator.velocity,
             angle=float(x[1]),
-            angular_speed=float(x[m + 1]),
+            angular_velocity=float(x[m + 1]),
         )
         load = -float(model.bias_forces(x, measured.time)[0]) if ground_truth else 0.0
         command = controller.command(measured, load)

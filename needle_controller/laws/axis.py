@@ -114,14 +114,14 @@ class Axis(Friction):
         return replace(self, coulomb=0.0)
 
     def propagate(
-        self, position: float, speed: float, force: float, t: float
+        self, position: float, velocity: float, force: float, t: float
     ) -> tuple[float, float]:
         """
         Solve the motion under a constant force, exactly.
 
         Parameters
         ----------
-        position, speed : float
+        position, velocity : float
             Initial position and velocity.
         force : float
             Force [N].
@@ -130,11 +130,11 @@ class Axis(Friction):
 
         Returns
         -------
-        position, speed : float
+        position, velocity : float
             Final position and velocity.
 
         """
-        end, moved = friction_flow(self.constants, self.inertia, speed, force, t)
+        end, moved = friction_flow(self.constants, self.inertia, velocity, force, t)
         return position + moved, end
 
     def response(self, t: float, factor: float = 1.0) -> Response:

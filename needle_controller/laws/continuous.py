@@ -206,16 +206,16 @@ class ContinuousInverseDynamics(ContinuousLaw):
         forces[k:] = 0.0
         return forces
 
-    def _friction(self, speed: float, acceleration: float) -> float:
+    def _friction(self, velocity: float, acceleration: float) -> float:
         """Return viscous friction plus the compensated share of dry friction [N]."""
         law = self.model.friction
-        lean = (speed + BREAKAWAY_TIME * acceleration) / self.breakaway_speed
+        lean = (velocity + BREAKAWAY_TIME * acceleration) / self.breakaway_speed
         lean = min(max(lean, -1.0), 1.0)
         # Dry friction in the direction of the lean; at rest, break-away friction.
-        sign, modulus = copysign(1.0, lean), abs(speed)
+        sign, modulus = copysign(1.0, lean), abs(velocity)
         ahead = 1.0 if lean > 0.0 else law.withdrawal
         dry = law.force(sign * modulus, sign * inf) - sign * ahead * law.viscous * modulus
-        viscous = law.viscous * speed * (1.0 if speed > 0.0 else law.withdrawal)
+        viscous = law.viscous * velocity * (1.0 if velocity > 0.0 else law.withdrawal)
         return abs(lean) * dry + viscous
 
 

@@ -110,7 +110,7 @@ class Law:
     def force(
         self,
         position: float,
-        speed: float,
+        velocity: float,
         setpoint: Setpoint,
         memory: FloatArray,
         load: float = 0.0,
@@ -120,7 +120,7 @@ class Law:
 
         Parameters
         ----------
-        position, speed : float
+        position, velocity : float
             Position and velocity of the axis.
         setpoint : Setpoint
             Setpoint.
@@ -135,7 +135,7 @@ class Law:
             Force [N].
 
         """
-        return law_force(self.packed, memory, _instant(position, speed, setpoint), float(load))
+        return law_force(self.packed, memory, _instant(position, velocity, setpoint), float(load))
 
     def linear(self) -> Law:
         """Return the law without Coulomb friction, for its poles."""
@@ -159,9 +159,9 @@ class Law:
         return replace(self, gains=self.gains.scaled(factor))
 
 
-def _instant(position: float, speed: float, setpoint: Setpoint) -> tuple[float, ...]:
+def _instant(position: float, velocity: float, setpoint: Setpoint) -> tuple[float, ...]:
     """Return state and setpoint as the plain tuple of `Instant`."""
-    return float(position), float(speed), *setpoint
+    return float(position), float(velocity), *setpoint
 
 
 class SampledLoop:
@@ -260,7 +260,7 @@ class SampledLoop:
         self.memory[:LEARNED] = 0.0
 
     def command(
-        self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
+        self, position: float, velocity: float, setpoint: Setpoint, load: float = 0.0
     ) -> float:
         """
         Return the force to apply, within the limit [N]; see `Law.force`.
@@ -269,7 +269,7 @@ class SampledLoop:
 
         Parameters
         ----------
-        position, speed : float
+        position, velocity : float
             Measured position and velocity of the axis [m, m/s] or [rad, rad/s].
         setpoint : Setpoint
             Setpoint at the time of the effect of the command.
@@ -283,10 +283,10 @@ class SampledLoop:
 
         """
         law, load = self.law, float(load)
-        law_learn(law.packed, self.memory, float(position), float(speed), self._acts - load)
+        law_learn(law.packed, self.memory, float(position), float(velocity), self._acts - load)
         for force in self.pending:
-            position, speed = axis_step(law.packed, position, speed, force - load)
-        instant = _instant(position, speed, setpoint)
+            position, velocity = axis_step(law.packed, position, velocity, force - load)
+        instant = _instant(position, velocity, setpoint)
         if self._take_over:
             self._take_over = False
             law_match(law.packed, self.memory, instant, load, self.last)

@@ -163,7 +163,7 @@ class Observer:
         self,
         stamp: int,
         depth: float,
-        speed: float,
+        velocity: float,
         wrench: tuple[float, float] | None = None,
     ) -> None:
         """
@@ -177,7 +177,7 @@ class Observer:
         ----------
         stamp : int
             Time of the sample [ns]. Steps within 1 % of the period count as one period.
-        depth, speed : float
+        depth, velocity : float
             Insertion depth [m] and velocity [m/s], positive into the tissue.
         wrench : tuple of float, optional
             Lateral force along z [N] and moment about x at the base [N m], less any torque that
@@ -186,7 +186,7 @@ class Observer:
         Raises
         ------
         ParameterError
-            If the stamp is not an integer, depth or speed is not finite, or the speed is
+            If the stamp is not an integer, depth or velocity is not finite, or the speed is
             implausible; the estimate does not change.
         InsertionDepthError
             If the depth is outside its range; the estimate does not change.
@@ -194,10 +194,10 @@ class Observer:
         """
         needle = self._filter.needle
         fastest = needle.length / self.period
-        if not (isfinite(depth) and abs(speed) <= fastest):
+        if not (isfinite(depth) and abs(velocity) <= fastest):
             raise ParameterError(
-                'depth and speed must be finite, and the speed at most a needle length in '
-                f'a period, {fastest:g} m/s, got {depth!r} and {speed!r}'
+                'depth and velocity must be finite, and the speed at most a needle length in '
+                f'a period, {fastest:g} m/s, got {depth!r} and {velocity!r}'
             )
         slack = ROUNDING * needle.length
         if not needle.minimum_depth <= depth <= needle.maximum_depth + slack:
@@ -210,7 +210,7 @@ class Observer:
             self._origin = _checked(stamp)
         time = self._seconds(stamp)
         # An integer would trigger a compilation for its type.
-        depth, speed = min(float(depth), needle.maximum_depth), float(speed)
+        depth, velocity = min(float(depth), needle.maximum_depth), float(velocity)
         elapsed, history = time - self._time, self.settings.history
         if self._begun:
             if -history <= elapsed <= 0.0:
@@ -225,10 +225,10 @@ class Observer:
             if wrench is not None:
                 lateral = float(wrench[0]) if isfinite(wrench[0]) else nan
                 moment = float(wrench[1]) if isfinite(wrench[1]) else nan
-            self._go_on(time, depth, speed, lateral, moment)
+            self._go_on(time, depth, velocity, lateral, moment)
         else:
             self._begin(time, depth)
-        self._time, self._depth, self._velocity = time, depth, speed
+        self._time, self._depth, self._velocity = time, depth, velocity
         if self._waiting:
             waiting, self._waiting = self._waiting, []
             for earlier, lateral, moment in waiting:
@@ -332,7 +332,7 @@ class Observer:
         begin(self._held, time, self.period, depth)
 
     def _go_on(
-        self, time: float, depth: float, speed: float, lateral: float, moment: float
+        self, time: float, depth: float, velocity: float, lateral: float, moment: float
     ) -> None:
         """Step to the next sample, or over a gap in steps without measurements but the last."""
         start, elapsed, period = self._time, time - self._time, self.period
@@ -346,21 +346,27 @@ class Observer:
             self._step(start + elapsed * k / count, span, middle, advance / elapsed, nan, nan)
         if count == 1:
             # Mean of the cubic through both ends, limited to their range.
-            mean = before + 0.5 * advance + span * (self._velocity - speed) / 12.0
+            mean = before + 0.5 * advance + span * (self._velocity - velocity) / 12.0
             mean = min(max(mean, min(before, depth)), max(before, depth))
-            pace = 0.5 * (self._velocity + speed)
+            pace = 0.5 * (self._velocity + velocity)
         else:
             mean, pace = depth - 0.5 * advance / count, advance / elapsed
         self._step(time, span, mean, pace, lateral, moment)
 
     def _step(
-        self, time: float, span: float, depth: float, speed: float, lateral: float, moment: float
+        self,
+        time: float,
+        span: float,
+        depth: float,
+        velocity: float,
+        lateral: float,
+        moment: float,
     ) -> None:
         old, slots = self._slot, self._slots
         new = old + 1 if old + 1 < slots else 0
         if new == self._oldest:
             self._oldest = new + 1 if new + 1 < slots else 0
-        observe(self._held, self._count, old, new, time, span, depth, speed, lateral, moment)
+        observe(self._held, self._count, old, new, time, span, depth, velocity, lateral, moment)
         self._slot, self._estimate = new, None
 
     # Estimates.

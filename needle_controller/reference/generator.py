@@ -91,10 +91,10 @@ class ReferenceGenerator:
         self,
         times: Sequence[float],
         positions: Sequence[float],
-        speeds: Sequence[float] | None = None,
+        velocities: Sequence[float] | None = None,
     ) -> None:
         """Follow a path from now on, with times relative to now [s]; see `Path`."""
-        path = Path(times, positions, speeds, self._limits, self._depths)
+        path = Path(times, positions, velocities, self._limits, self._depths)
         self.target, self._path, self._passed = path.last, path, 0.0
         self._replan()
 
@@ -142,7 +142,7 @@ class ReferenceGenerator:
             return self._brake(now)
         if self._path is not None:
             if self._kind is not MinimumJerk:
-                now = Setpoint(now.position, now.speed)
+                now = Setpoint(now.position, now.velocity)
             return Joined(now, self._path, self._passed, self._limits)
         target = now.position if self.target is None else self.target
         if self._kind is MinimumJerk:

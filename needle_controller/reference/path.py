@@ -24,7 +24,7 @@ import numpy as np
 
 class Path:
     """
-    Path through given points: straight lines between positions, or cubics if speeds are given.
+    Path through given points: straight lines between positions, or cubics if velocities are given.
 
     Corners between lines are rounded by parabolas at the acceleration limit. The points define the
     duration of the path. It ends at rest.
@@ -35,7 +35,7 @@ class Path:
         Times of the points [s], not negative, increasing.
     positions : sequence of float
         Insertion depths [m].
-    speeds : sequence of float, optional
+    velocities : sequence of float, optional
         Insertion velocities [m/s], zero at the end.
     limits : ReferenceLimits
         Limits.
@@ -62,17 +62,17 @@ class Path:
         self,
         times: Sequence[float],
         positions: Sequence[float],
-        speeds: Sequence[float] | None,
+        velocities: Sequence[float] | None,
         limits: ReferenceLimits,
         depths: tuple[float, float],
     ) -> None:
-        _check(times, positions, speeds, depths)
-        #: Start time, position, speed, acceleration and jerk of each piece.
+        _check(times, positions, velocities, depths)
+        #: Start time, position, velocity, acceleration and jerk of each piece.
         self._pieces: list[tuple[float, float, float, float, float]] = []
-        if speeds is None:
+        if velocities is None:
             self._join_lines(times, positions, limits)
         else:
-            self._join_cubics(times, positions, speeds, limits)
+            self._join_cubics(times, positions, velocities, limits)
             self._check_depths(*depths)
         self._starts, self.depths = np.array([piece[0] for piece in self._pieces]), depths
         self.begin, self.last = float(times[0]), float(positions[-1])
@@ -82,34 +82,34 @@ class Path:
     ) -> None:
         """Build the pieces from lines joined by parabolas."""
         ramp = limits.acceleration
-        speed, free = 0.0, times[0]
+        velocity, free = 0.0, times[0]
         # At the first point the velocity equals the slope of the first line.
         if len(times) > 1:
-            speed = (positions[1] - positions[0]) / (times[1] - times[0])
-            self._pieces.append((times[0], positions[0], speed, 0.0, 0.0))
+            velocity = (positions[1] - positions[0]) / (times[1] - times[0])
+            self._pieces.append((times[0], positions[0], velocity, 0.0, 0.0))
         for k in range(len(times)):
             following = 0.0
             if k + 1 < len(times):
                 following = (positions[k + 1] - positions[k]) / (times[k + 1] - times[k])
             if abs(following) > limits.speed * (1.0 + ROUNDING):
                 raise ParameterError(
-                    f'speed after {times[k]:g} s must be within {limits.speed:g} m/s, got '
+                    f'velocity after {times[k]:g} s must be within {limits.speed:g} m/s, got '
                     f'{following:g} m/s'
                 )
             if k > 0:
-                half = 0.5 * abs(following - speed) / ramp
+                half = 0.5 * abs(following - velocity) / ramp
                 start = times[k] - half
                 if start < free - ROUNDING:
                     raise ParameterError(
-                        f'speed changes from {speed:g} to {following:g} m/s at {times[k]:g} s '
-                        f'faster than the acceleration limit {ramp:g} m/s^2 allows'
+                        f'velocity changes from {velocity:g} to {following:g} m/s at {times[k]:g} '
+                        f's faster than the acceleration limit {ramp:g} m/s^2 allows'
                     )
-                turn = copysign(ramp, following - speed)
-                self._pieces.append((start, positions[k] - half * speed, speed, turn, 0.0))
+                turn = copysign(ramp, following - velocity)
+                self._pieces.append((start, positions[k] - half * velocity, velocity, turn, 0.0))
                 free = times[k] + half
                 at = positions[k] + half * following
                 self._pieces.append((free, at, following, 0.0, 0.0))
-            speed = following
+            velocity = following
         self.end = free
         # Exactly at the last position, and at rest.
         self._pieces[len(self._pieces) - 1 :] = [(free, positions[-1], 0.0, 0.0, 0.0)]
@@ -118,15 +118,15 @@ class Path:
         self,
         times: Sequence[float],
         positions: Sequence[float],
-        speeds: Sequence[float],
+        velocities: Sequence[float],
         limits: ReferenceLimits,
     ) -> None:
         """Build the pieces from cubics."""
-        if speeds[-1] != 0.0:
-            raise ParameterError(f'speed at the end must be 0, got {speeds[-1]:g} m/s')
+        if velocities[-1] != 0.0:
+            raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
         for k in range(len(times) - 1):
             t = times[k + 1] - times[k]
-            d, v0, v1 = positions[k + 1] - positions[k], speeds[k], speeds[k + 1]
+            d, v0, v1 = positions[k + 1] - positions[k], velocities[k], velocities[k + 1]
             a = (6.0 * d / t - 4.0 * v0 - 2.0 * v1) / t
             jerk = (6.0 * (v0 + v1) - 12.0 * d / t) / (t * t)
             inside = -a / jerk if jerk else -1.0
@@ -173,7 +173,7 @@ class Path:
 def _check(
     times: Sequence[float],
     positions: Sequence[float],
-    speeds: Sequence[float] | None,
+    velocities: Sequence[float] | None,
     depths: tuple[float, float],
 ) -> None:
     """Reject points that are missing, not finite, out of order or out of range."""
@@ -182,12 +182,13 @@ def _check(
             f'path needs one position for each of at least one time, got {len(positions)} '
             f'positions and {len(times)} times'
         )
-    if speeds is not None and len(speeds) != len(times):
+    if velocities is not None and len(velocities) != len(times):
         raise ParameterError(
-            f'path needs a speed for each of its {len(times)} points or none, got {len(speeds)}'
+            f'path needs a velocity for each of its {len(times)} points or none, '
+            f'got {len(velocities)}'
         )
-    if not all(map(isfinite, (*times, *positions, *(speeds or ())))):
-        raise ParameterError('times, positions and speeds must be finite')
+    if not all(map(isfinite, (*times, *positions, *(velocities or ())))):
+        raise ParameterError('times, positions and velocities must be finite')
     check_times(times)
     low, high = depths
     if not all(low <= at <= high for at in positions):
@@ -232,7 +233,7 @@ class Joined:
             stopped = halt(start, limits, depths)
             self._halt, start = stopped, stopped.end
         found = _join(start, path, since, limits, depths)
-        if found is None and start.speed:
+        if found is None and start.velocity:
             self._halt = brake(start, limits, depths)
             start = self._halt.at(self._halt.duration)
             found = _join(start, path, since, limits, depths)
@@ -262,7 +263,7 @@ def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float])
     It exceeds the acceleration limit only where the range of depths ends before.
     """
     low, high = depths
-    stop = start.position + 0.5 * start.speed * abs(start.speed) / limits.acceleration
+    stop = start.position + 0.5 * start.velocity * abs(start.velocity) / limits.acceleration
     slack = ROUNDING * (high - low)
     if low - slack <= stop <= high + slack:
         return Trapezoid(start, min(max(stop, low), high), limits)
@@ -287,7 +288,7 @@ def _join(
         return None, first
     duration = max(least, SHORTEST)
     # Time that is sufficient to reach the end of the path within the limits.
-    braking = abs(start.speed) / limits.acceleration
+    braking = abs(start.velocity) / limits.acceleration
     distance = abs(path.last - start.position)
     enough = distance / limits.speed + braking + sqrt(distance / limits.acceleration)
     longest = max(least, path.end - since) + 100.0 * enough

@@ -24,8 +24,8 @@ class Quintic:
         t = duration
         self.duration = t
         self.start, self.end = start, end
-        v0, a0 = start.speed * t, start.acceleration * t * t
-        v1, a1 = end.speed * t, end.acceleration * t * t
+        v0, a0 = start.velocity * t, start.acceleration * t * t
+        v1, a1 = end.velocity * t, end.acceleration * t * t
         d = end.position - start.position
         # Powers of time over duration.
         c3 = 10.0 * d - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
@@ -51,11 +51,11 @@ class Quintic:
     def within(self, limits: ReferenceLimits) -> bool:
         """Return whether the motion is within limits, or within larger values of its ends."""
         ends = self.start, self.end
-        top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + ROUNDING)
+        top = max(limits.speed, *(abs(end.velocity) for end in ends)) * (1.0 + ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
         ramp *= 1.0 + ROUNDING
-        _, speed, acceleration = self.extremes
-        return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
+        _, velocity, acceleration = self.extremes
+        return bool(np.abs(acceleration).max() <= ramp and np.abs(velocity).max() <= top)
 
     def stays(self, depths: tuple[float, float]) -> bool:
         """Return whether all positions are in a range [m], up to rounding."""
@@ -66,7 +66,7 @@ class Quintic:
 
     @property
     def extremes(self) -> FloatArray:
-        """Least and largest position [m], speed [m/s] and acceleration [m/s^2], shape (3, 2)."""
+        """Range of position [m], velocity [m/s] and acceleration [m/s^2], shape (3, 2)."""
         t = self.duration
         return np.asarray(quintic_extremes(np.array(self._c)) / [[1.0], [t], [t * t]])
 
@@ -94,7 +94,7 @@ class MinimumJerk:
     limits : ReferenceLimits
         Limits; values that the start already exceeds are allowed.
     depths : tuple of float
-        Least and largest position of the motion [m]; the start is always allowed.
+        Lowest and highest position of the motion [m]; the start is always allowed.
 
     Attributes
     ----------
@@ -113,11 +113,11 @@ class MinimumJerk:
         depths = around(depths, start)
         least = max(
             shortest(abs(target - start.position), limits),
-            2.0 * abs(start.speed) / limits.acceleration,
+            2.0 * abs(start.velocity) / limits.acceleration,
         )
         end = Setpoint(target)
         motion = Quintic(start, end, least)
-        at_rest = start.speed == 0.0 and start.acceleration == 0.0
+        at_rest = start.velocity == 0.0 and start.acceleration == 0.0
 
         def fits() -> bool:
             return at_rest or (motion.within(limits) and motion.stays(depths))
@@ -166,7 +166,7 @@ def halt(
     the velocity may first increase by up to 4/27 of acceleration times duration.
     """
     depths = around(depths, start)
-    v, a = start.speed, start.acceleration
+    v, a = start.velocity, start.acceleration
     time = max(1.5 * abs(v) / limits.acceleration, SHORTEST)
 
     def motion() -> Quintic:

@@ -25,13 +25,13 @@ class Setpoint(NamedTuple):
     ----------
     position : float
         Insertion depth [m] or angle [rad].
-    speed, acceleration : float
+    velocity, acceleration : float
         First and second derivative in time.
 
     """
 
     position: float
-    speed: float = 0.0
+    velocity: float = 0.0
     acceleration: float = 0.0
 
 

@@ -48,29 +48,29 @@ class Trapezoid:
     >>> round(motion.duration, 9)
     3.1
     >>> motion.at(3.0)
-    Setpoint(position=0.0495, speed=0.01, acceleration=0.0)
+    Setpoint(position=0.0495, velocity=0.01, acceleration=0.0)
     >>> motion.at(5.0)
-    Setpoint(position=0.05, speed=0.0, acceleration=0.0)
+    Setpoint(position=0.05, velocity=0.0, acceleration=0.0)
 
     """
 
     def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
         top, ramp = limits.speed, limits.acceleration
-        position, speed = start.position, start.speed
+        position, velocity = start.position, start.velocity
         #: (duration, acceleration) of each part.
         parts: list[tuple[float, float]] = []
         # First brake a motion in the wrong direction, too fast, or too far.
-        stop = position + copysign(speed * speed / (2.0 * ramp), speed)
+        stop = position + copysign(velocity * velocity / (2.0 * ramp), velocity)
         sign = copysign(1.0, target - stop)
-        if speed * sign < 0.0:
-            parts.append((abs(speed) / ramp, -copysign(ramp, speed)))
-            position, speed = stop, 0.0
-        elif abs(speed) > top:
-            slowing = (abs(speed) - top) / ramp
+        if velocity * sign < 0.0:
+            parts.append((abs(velocity) / ramp, -copysign(ramp, velocity)))
+            position, velocity = stop, 0.0
+        elif abs(velocity) > top:
+            slowing = (abs(velocity) - top) / ramp
             parts.append((slowing, -sign * ramp))
-            position += sign * slowing * (abs(speed) + top) / 2.0
-            speed = sign * top
-        v0 = abs(speed)
+            position += sign * slowing * (abs(velocity) + top) / 2.0
+            velocity = sign * top
+        v0 = abs(velocity)
         distance = abs(target - position)
         peak = min(top, sqrt(ramp * distance + 0.5 * v0 * v0))
         cruise = distance - (2.0 * peak * peak - v0 * v0) / (2.0 * ramp)
@@ -99,14 +99,14 @@ class Trapezoid:
         """
         if time >= self.duration:
             return Setpoint(self._target)
-        position, speed = self._start.position, self._start.speed
+        position, velocity = self._start.position, self._start.velocity
         if time <= 0.0:
-            return Setpoint(position, speed)
+            return Setpoint(position, velocity)
         for duration, acceleration in self._parts:
             t = min(time, duration)
-            position += t * (speed + 0.5 * t * acceleration)
-            speed += t * acceleration
+            position += t * (velocity + 0.5 * t * acceleration)
+            velocity += t * acceleration
             time -= t
             if time <= 0.0:
                 break
-        return Setpoint(position, speed, acceleration)
+        return Setpoint(position, velocity, acceleration)

@@ -32,8 +32,8 @@ def read_encoders(reading: Reading) -> Measurement:
     return Measurement(
         time=reading.stamp / NANOSECONDS,
         depth=depth,
-        speed=velocity,
+        velocity=velocity,
         angle=angle,
-        angular_speed=angular_velocity,
+        angular_velocity=angular_velocity,
         force=efforts[i] if i < len(efforts) else nan,
     )

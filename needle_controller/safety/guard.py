@@ -86,9 +86,9 @@ class Guard:
             )
         return self._hold(
             'joint_states',
-            ('insertion speed', measured.speed, limits.speed, 'm/s', 'speed'),
+            ('insertion speed', measured.velocity, limits.speed, 'm/s', 'speed'),
             ('angle', measured.angle, limits.angle, 'rad', 'angle'),
-            ('angular speed', measured.angular_speed, limits.angular_speed, 'rad/s',
+            ('angular speed', measured.angular_velocity, limits.angular_speed, 'rad/s',
              'angular_speed'),
         )  # fmt: skip
 

@@ -11,7 +11,7 @@ from needle_dynamics.compiled.friction import slide
 
 #: Indices of the axis state.
 DEPTH: Final = 0
-SPEED: Final = 1
+VELOCITY: Final = 1
 DEEPEST: Final = 2
 
 #: Bisections of an event time: to the last digit of a step.
@@ -132,20 +132,20 @@ def _arrive(a: AxisConstants, state: FloatArray, punctured: BoolArray) -> None:
     for i in range(len(a.membranes)):
         if depth >= a.membranes[i] + a.strengths[i] / a.stiffness[i]:
             punctured[i] = True
-    if depth >= a.reach and state[SPEED] > 0.0:
+    if depth >= a.reach and state[VELOCITY] > 0.0:
         # Contact of the hub with the guide.
-        state[SPEED] = 0.0
+        state[VELOCITY] = 0.0
 
 
 @inlined
 def _glide(
-    a: AxisConstants, r: Resistance, speed: float, force: float, t: float
+    a: AxisConstants, r: Resistance, velocity: float, force: float, t: float
 ) -> tuple[float, float]:
     """Return velocity [m/s] and displacement [m] under a constant resistance."""
     # Cutting as friction with the ratio of `slide`, plus a constant force.
     share = r.cutting / (1.0 + a.withdrawal)
     drive = force - r.elastic - a.withdrawal * share
-    return slide(speed, drive, a.mass, r.dry + share, r.viscous, t, a.withdrawal)
+    return slide(velocity, drive, a.mass, r.dry + share, r.viscous, t, a.withdrawal)
 
 
 @kernel
@@ -166,36 +166,36 @@ def push(
     left = duration
     while left > 0.0:
         t = min(step, left)
-        depth, speed = state[DEPTH], state[SPEED]
+        depth, velocity = state[DEPTH], state[VELOCITY]
         low, high = _events(a, state, punctured)
-        if depth >= a.reach and speed >= 0.0 and force > 0.0:
+        if depth >= a.reach and velocity >= 0.0 and force > 0.0:
             # At rest on the hub, pushed against it.
-            state[SPEED] = 0.0
+            state[VELOCITY] = 0.0
             return 0.0
         touches = depth >= state[DEEPEST]
         # Second order: resistance at the middle of the displacement.
         r = resistance(a, depth, touches, punctured)
-        _, half = _glide(a, r, speed, force, 0.5 * t)
+        _, half = _glide(a, r, velocity, force, 0.5 * t)
         middle = min(max(depth + half, low), high)
         r = resistance(a, middle, touches, punctured)
-        after, way = _glide(a, r, speed, force, t)
+        after, way = _glide(a, r, velocity, force, t)
         if not low < depth + way < high and way != 0.0:
             at = high if way > 0.0 else low
             early, late = 0.0, t
             for _ in range(_HALVINGS):
                 between = 0.5 * (early + late)
-                _, gone = _glide(a, r, speed, force, between)
+                _, gone = _glide(a, r, velocity, force, between)
                 beyond = depth + gone >= at if way > 0.0 else depth + gone <= at
                 if beyond:
                     late = between
                 else:
                     early = between
             t = late
-            after, _ = _glide(a, r, speed, force, t)
+            after, _ = _glide(a, r, velocity, force, t)
             state[DEPTH] = at
         else:
             state[DEPTH] = depth + way
-        state[SPEED] = after
+        state[VELOCITY] = after
         left -= t
         if state[DEPTH] <= 0.0 and way < 0.0:
             state[DEPTH] = 0.0
@@ -209,25 +209,25 @@ def carry_on(
     a: AxisConstants,
     state: Vector,
     punctured: BoolVector,
-    speed: float,
+    velocity: float,
     duration: float,
     step: float,
     felt: Vector,
 ) -> float:
     """
-    Advance with a velocity ramp to ``speed`` [m/s] over ``duration`` [s], at any force, in place.
+    Advance with a ramp to ``velocity`` [m/s] over ``duration`` [s], at any force, in place.
 
     ``state`` and ``step`` as in `push`; ``felt``, shape (parts,), takes the mean force in equal
     parts of the duration [N]. Returns the time left when the needle leaves the tissue [s],
     otherwise 0.
     """
-    rate = (speed - state[SPEED]) / duration
+    rate = (velocity - state[VELOCITY]) / duration
     left = duration
     for k in range(len(felt)):
         begin, end, impulse = left, duration * ((len(felt) - 1 - k) / len(felt)), 0.0
         while left > end:
             t = min(step, left - end)
-            depth, before = state[DEPTH], state[SPEED]
+            depth, before = state[DEPTH], state[VELOCITY]
             low, high = _events(a, state, punctured)
             touches = depth >= state[DEEPEST]
             way = (before + 0.5 * rate * t) * t
@@ -240,7 +240,7 @@ def carry_on(
                 state[DEPTH] = at
             else:
                 state[DEPTH] = depth + way
-            state[SPEED] = speed if t == left else before + rate * t
+            state[VELOCITY] = velocity if t == left else before + rate * t
             r = resistance(a, min(max(depth + 0.5 * way, low), high), touches, punctured)
             mean = before + 0.5 * rate * t
             impulse += t * (a.mass * rate + r.elastic + _held(a, r, mean))
@@ -255,10 +255,10 @@ def carry_on(
 
 
 @inlined
-def _held(a: AxisConstants, r: Resistance, speed: float) -> float:
+def _held(a: AxisConstants, r: Resistance, velocity: float) -> float:
     """Return friction and cutting force [N]; at rest the static friction of least force."""
-    if speed > 0.0:
-        return r.dry + r.cutting + r.viscous * speed
-    if speed < 0.0:
-        return a.withdrawal * (r.viscous * speed - r.dry)
+    if velocity > 0.0:
+        return r.dry + r.cutting + r.viscous * velocity
+    if velocity < 0.0:
+        return a.withdrawal * (r.viscous * velocity - r.dry)
     return min(max(-r.elastic, -a.withdrawal * r.dry), r.dry + r.cutting)

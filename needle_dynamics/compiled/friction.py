@@ -51,20 +51,20 @@ class FrictionConstants(NamedTuple):
 
 
 @kernel
-def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[float, float]:
+def dry_friction(f: FrictionConstants, coulomb: float, velocity: float) -> tuple[float, float]:
     """
-    Return dry friction at a speed [N] and its derivative by the speed [N s/m], for every law.
+    Return dry friction at a velocity [N] and its derivative [N s/m], for every law.
 
     ``coulomb`` is the Coulomb friction in the direction of motion [N]. The value at rest is the
     static friction limit. Where it is zero, the law is smooth: the needle never sticks, and
     creeps.
     """
     if f.law == STRIBECK:
-        ratio = speed / f.stribeck_speed
+        ratio = velocity / f.stribeck_speed
         excess = (f.breakaway - 1.0) * exp(-ratio * ratio)
         return coulomb * (1.0 + excess), -2.0 * coulomb * excess * ratio / f.stribeck_speed
     if f.law == TANH:
-        turned = tanh(speed / f.smoothing_speed)
+        turned = tanh(velocity / f.smoothing_speed)
         return coulomb * turned, coulomb * (1.0 - turned * turned) / f.smoothing_speed
     return coulomb, 0.0
 

@@ -278,14 +278,14 @@ def _move(w: FloatArray, n: int) -> None:
 def _end(w: FloatArray, n: int) -> None:
     """End the step of each lane; a lane that would leave its range keeps its state."""
     for i in range(n):
-        depth, speed = w[_S + i] + w[_TRAVEL + i], w[_NEW_U + i]
+        depth, velocity = w[_S + i] + w[_TRAVEL + i], w[_NEW_U + i]
         stopped = depth >= w[_STOP + i]
         high = inf if stopped else w[_HIGH + i]
         inside = w[_INSIDE + i] != 0.0 and w[_LOW + i] <= depth <= high
-        gain = (speed - w[_U + i]) / w[_H + i]
+        gain = (velocity - w[_U + i]) / w[_H + i]
         w[_INSIDE + i] = 1.0 if inside else 0.0
         w[_S + i] = (w[_STOP + i] if stopped else depth) if inside else w[_S + i]
-        w[_U + i] = (0.0 if stopped else speed) if inside else w[_U + i]
+        w[_U + i] = (0.0 if stopped else velocity) if inside else w[_U + i]
         w[_A + i] = gain
         w[_Q1 + i] = w[_NEW_Q1 + i] if inside else w[_Q1 + i]
         w[_Q2 + i] = w[_NEW_Q2 + i] if inside else w[_Q2 + i]

@@ -80,7 +80,7 @@ class BaseMotion:
         """
         Start a new trajectory, linear in time between its points.
 
-        ``start`` [s] is on the clock of `speed`, ``depth`` the present insertion depth [m],
+        ``start`` [s] is on the clock of `velocity`, ``depth`` the present insertion depth [m],
         ``times`` [s] are relative to the start. A point without a depth (None) ends a push: until
         its time the force changes linearly from the force at the previous point, zero if that was
         no push, to the given force [N]. The segment after a push starts at the actual position of
@@ -113,7 +113,7 @@ class BaseMotion:
 
     @property
     def end(self) -> float:
-        """Time of the last point [s], on the clock of `speed`."""
+        """Time of the last point [s], on the clock of `velocity`."""
         return float(self._times[-1])
 
     def push(self, time: float, depth: float, interval: float) -> float | None:
@@ -135,11 +135,11 @@ class BaseMotion:
         self._force = 0.0
         return None
 
-    def speed(self, time: float, depth: float, speed: float, interval: float) -> float:
+    def velocity(self, time: float, depth: float, velocity: float, interval: float) -> float:
         """
         Return the velocity [m/s] at the end of the next interval that tracks the trajectory.
 
-        ``depth`` [m] and ``speed`` [m/s] are the present position and velocity of the base. The
+        ``depth`` [m] and ``velocity`` [m/s] are the present position and velocity of the base. The
         result is within the velocity and acceleration limits.
         """
         limits = self.limits
@@ -147,11 +147,11 @@ class BaseMotion:
         ahead = float(np.interp(time + interval, self._times, self._depths))
         change = limits.acceleration_limit * interval
         error = now - depth
-        if ahead == now and abs(error) < _SETTLED and abs(speed) <= change:
+        if ahead == now and abs(error) < _SETTLED and abs(velocity) <= change:
             return 0.0
         # Reduce the error no faster than the base can brake; half the limit leaves a margin.
         gain = min(limits.position_gain, 1.0 / interval)
         closing = min(gain * abs(error), sqrt(limits.acceleration_limit * abs(error)))
         wanted = (ahead - now) / interval + copysign(closing, error)
         wanted = min(max(wanted, -limits.speed_limit), limits.speed_limit)
-        return min(max(wanted, speed - change), speed + change)
+        return min(max(wanted, velocity - change), velocity + change)

@@ -60,7 +60,7 @@ class PlantSample(NamedTuple):
     ----------
     state : ndarray, shape (8,)
         Complete state.
-    depth, speed : float
+    depth, velocity : float
         Insertion depth [m] and insertion velocity [m/s].
     joint_position : float
         Insertion depth measured by the encoder [m].
@@ -77,7 +77,7 @@ class PlantSample(NamedTuple):
 
     state: FloatArray
     depth: float
-    speed: float
+    velocity: float
     joint_position: float
     force: float
     wrench: FloatArray
@@ -182,9 +182,9 @@ class Plant:
             If the needle moves, or has not rested long enough.
 
         """
-        speed = self.integrator.velocity
-        if abs(speed) > AT_REST:
-            raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
+        velocity = self.integrator.velocity
+        if abs(velocity) > AT_REST:
+            raise JobError(f'the needle moves at {1e3 * velocity:.3g} mm/s; it must rest')
         self._sensor.tare()
 
     def change(self, parameters: NeedleParameters) -> None:
@@ -234,7 +234,8 @@ class Plant:
         state = sample.state.tolist()
         middle = len(state) // 2
         joints = [
-            sample.joint_position, state[1], sample.speed, state[middle + 1], sample.force, torque,
+            sample.joint_position, state[1], sample.velocity, state[middle + 1],
+            sample.force, torque,
         ]  # fmt: skip
         if self.base is None:
             # Insertion decreases d.
@@ -295,8 +296,8 @@ class Plant:
             push = base.push(self.time, needle.depth, interval / _PUSHES)
             if push is None:
                 before = needle.velocity
-                speed = base.speed(self.time, needle.depth, before, interval)
-                seen = needle.advance_moved(interval, speed)
+                velocity = base.velocity(self.time, needle.depth, before, interval)
+                seen = needle.advance_moved(interval, velocity)
                 late = _friction_gained(needle.model.friction, before, needle.velocity)
             else:
                 seen, late = self._pushed(base, push)
@@ -312,14 +313,14 @@ class Plant:
             wrench, start = np.zeros((2, 6))
             wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
             start[1] -= 2.0 * late
-        depth, speed = needle.depth, needle.velocity
+        depth, velocity = needle.depth, needle.velocity
         return PlantSample(
             state=needle.state,
             depth=depth,
-            speed=speed,
+            velocity=velocity,
             joint_position=on_grid(depth, resolution),
             force=axial,
-            wrench=self._sensor.measure(wrench, start=start, moving=abs(speed) > AT_REST),
+            wrench=self._sensor.measure(wrench, start=start, moving=abs(velocity) > AT_REST),
             tip_deflection=seen.tip_deflection,
             tip=self._tip.measure(depth, seen.tip_deflection),
         )

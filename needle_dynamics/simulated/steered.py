@@ -100,7 +100,7 @@ class SteeredPlant:
         self._motions = {name: guide.motion(name, robot.position_gain) for name in _JOINTS}
         #: Position and velocity of the joints other than `insertion`.
         self._at = dict.fromkeys(_JOINTS, 0.0)
-        self._speed = dict.fromkeys(_JOINTS, 0.0)
+        self._velocity = dict.fromkeys(_JOINTS, 0.0)
         #: Joints in motion.
         self._moving: set[str] = set()
         self._resolution = robot.encoder_resolution if base is not None else 0.0
@@ -164,9 +164,9 @@ class SteeredPlant:
 
     def tare(self) -> None:
         """Zero the sensor on the mean of its latest readings; needle and guide must rest."""
-        speed = self.insertion.velocity
-        if abs(speed) > AT_REST:
-            raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
+        velocity = self.insertion.velocity
+        if abs(velocity) > AT_REST:
+            raise JobError(f'the needle moves at {1e3 * velocity:.3g} mm/s; it must rest')
         if self._moving:
             raise JobError(f'{", ".join(sorted(self._moving))} moves; it must rest')
         self._sensor.tare()
@@ -203,9 +203,9 @@ class SteeredPlant:
         part = interval / _PUSHES
         push = base.push(self.time, self.depth, part)
         if push is None:
-            speed = base.speed(self.time, self.depth, insertion.velocity, interval)
+            velocity = base.velocity(self.time, self.depth, insertion.velocity, interval)
             forces = np.empty(self._sensor.samples)
-            insertion.carry(interval, speed, felt=forces, **across)
+            insertion.carry(interval, velocity, felt=forces, **across)
             self._felt[:, 1] = forces
             return
         self._felt[:, 1] = 0.0
@@ -219,12 +219,12 @@ class SteeredPlant:
 
     def _move_guide(self) -> dict[str, Any]:
         """Advance guide, tilt and roll by one interval and return their positions."""
-        at, speeds = self._at, self._speed
+        at, velocities = self._at, self._velocity
         for name in sorted(self._moving):
-            motion, before = self._motions[name], speeds[name]
-            after = motion.speed(self.time, at[name], before, self.interval)
+            motion, before = self._motions[name], velocities[name]
+            after = motion.velocity(self.time, at[name], before, self.interval)
             at[name] += 0.5 * (before + after) * self.interval
-            speeds[name] = after
+            velocities[name] = after
             if before == after == 0.0 and self.time >= motion.end:
                 self._moving.discard(name)
         x, z, tilt_x, tilt_z, roll = at.values()
@@ -245,16 +245,16 @@ class SteeredPlant:
         if seen is not None:
             measured.append((TIP_DEFLECTION.name, seen.age, seen.point))
         rates = [(b - a) / self.interval for a, b in zip(before, tip, strict=True)]
-        speed = self.insertion.velocity
+        velocity = self.insertion.velocity
         outside = needle.needle.length - depth
-        truth = [outside, x, z, tip[3], -speed, rates[0], rates[2], rates[3]]
+        truth = [outside, x, z, tip[3], -velocity, rates[0], rates[2], rates[3]]
         if self.base is None:
             # Insertion decreases d; the other coordinates have no command.
             truth += [-force, 0.0, 0.0, 0.0]
         measured.append((GROUND_TRUTH.name, 0, truth))
         joints = [
             on_grid(depth, self._resolution), *self._at.values(),
-            speed, *self._speed.values(),
+            velocity, *self._velocity.values(),
             float(self._felt[-1, 1]), *self._load,
         ]  # fmt: skip
         measured.append((JOINT_STATES.name, 0, joints))

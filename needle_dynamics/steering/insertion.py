@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import copysign, inf, isfinite
 
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, SPEED
+from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, VELOCITY
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -129,7 +129,7 @@ class Insertion:
     @property
     def velocity(self) -> float:
         """Insertion velocity relative to the guide [m/s]."""
-        return float(self._state[SPEED] + self._drift)
+        return float(self._state[VELOCITY] + self._drift)
 
     @property
     def punctured(self) -> tuple[bool, ...]:
@@ -199,10 +199,10 @@ class Insertion:
         state, punctured = self._state.copy(), self._punctured.copy()
         felt = np.full(1, float(force))
         left = push(self.axis, state, punctured, felt[0], float(duration), self._step)
-        speed = float(state[SPEED]) + self._drift
-        if abs(speed) > speed_limit:
+        velocity = float(state[VELOCITY]) + self._drift
+        if abs(velocity) > speed_limit:
             state[:], punctured[:] = self._state, self._punctured
-            limited = copysign(speed_limit, speed)
+            limited = copysign(speed_limit, velocity)
             left = self._carry(state, punctured, duration, limited, felt)
         self._state, self._punctured = state, punctured
         self._across(duration, left, shift, given)
@@ -277,7 +277,7 @@ class Insertion:
     def _drift_to(self, duration: float, shift: FloatArray) -> None:
         """Move the tissue linearly to its new position: the axis is in the tissue frame."""
         drift = float(shift[1] - self._tissue[1]) / duration
-        self._state[SPEED] += self._drift - drift
+        self._state[VELOCITY] += self._drift - drift
         self._drift = drift
 
     def _across(

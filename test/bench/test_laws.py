@@ -40,7 +40,7 @@ def test_every_scenario_ends_at_rest_within_20_mm() -> None:
     for one in situations():
         end = one.reference.at(one.duration)
         assert abs(one.reference.at(0.0).position - one.start) < 1e-12
-        assert abs(end.speed) < 1e-9
+        assert abs(end.velocity) < 1e-9
         assert 1e-3 < abs(end.position - one.start) < 0.021
 
 

@@ -209,7 +209,7 @@ def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, 
     said: list[bool] = []
     for topic, _, values in study.protocol.replay(drawn, study.rng(0, 1)):
         if topic.name == 'joint_states':
-            measured = Measurement(time=0.0, depth=values[0], speed=values[2])
+            measured = Measurement(time=0.0, depth=values[0], velocity=values[2])
             beyond = [guard.encoders(measured)]
             if settings.get('reference') == 'step':
                 beyond.append(guard.tracking(0.03 - values[0]))

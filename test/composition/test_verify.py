@@ -215,7 +215,7 @@ def measured(
     efforts = [] if acting is None else [-acting, torque, 0.0, 0.0]
     data = joints(at, names, state[:m], state[m:], efforts)
     result.append(Message('/ground_truth', 0, at, data))
-    position, velocity = [sample.joint_position, state[1]], [sample.speed, state[m + 1]]
+    position, velocity = [sample.joint_position, state[1]], [sample.velocity, state[m + 1]]
     data = joints(at, ['insertion', 'rotation'], position, velocity, [sample.force, torque])
     result.append(Message('/joint_states', 0, at, data))
     for n, message in enumerate(result):

@@ -176,7 +176,7 @@ def test_controller_reports_learned_friction() -> None:
     truth = replace(PHANTOM, viscous=400.0)
     position, speed, force = 0.02, 0.0, 0.0
     for i in range(3000):
-        measured = Measurement(time=i * PERIOD, depth=position, speed=speed)
+        measured = Measurement(time=i * PERIOD, depth=position, velocity=speed)
         coming = controller.command(measured).force
         position, speed = truth.propagate(position, speed, force, PERIOD)
         force = coming

@@ -121,7 +121,7 @@ def follow(
     path = []
     for k in range(int(seconds * rate)):
         time = k * period
-        command = controller.command(Measurement(time=time, depth=depth, speed=speed))
+        command = controller.command(Measurement(time=time, depth=depth, velocity=speed))
         assert command.fault is None
         sent.append(base.step(command.force, depth, round(1e9 * time)))
         moved = share * (sent[0] - depth)

@@ -36,7 +36,7 @@ def insert(
     waiting = [0.0] * late
     depths, aims = [], []
     for i in range(round(duration / PERIOD)):
-        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.velocity)
+        measured = Measurement(time=i * PERIOD, depth=needle.depth, velocity=needle.velocity)
         command = steering.command(measured)
         depths.append(needle.depth)
         aims.append(command.setpoint.position)
@@ -82,15 +82,15 @@ def test_one_period_of_unmodeled_delay_is_stable() -> None:
 def test_zero_force_without_target_and_for_nan_measurements() -> None:
     """Zero force until there is a target, and zero force for a measurement of NaN."""
     steering = controller()
-    good = Measurement(time=0.0, depth=0.02, speed=0.0)
+    good = Measurement(time=0.0, depth=0.02, velocity=0.0)
     assert steering.command(good).force == 0.0
     steering.set_target(0.05)
     steering.command(good)
-    assert steering.command(Measurement(time=0.1, depth=0.02, speed=0.0)).force > 0.0
-    lost = steering.command(Measurement(time=0.101, depth=nan, speed=0.0))
+    assert steering.command(Measurement(time=0.1, depth=0.02, velocity=0.0)).force > 0.0
+    lost = steering.command(Measurement(time=0.101, depth=nan, velocity=0.0))
     assert (lost.force, lost.torque) == (0.0, 0.0)
     # The motion restarts from the measured depth, not from the old reference.
-    again = steering.command(Measurement(time=5.0, depth=0.021, speed=0.0))
+    again = steering.command(Measurement(time=5.0, depth=0.021, velocity=0.0))
     assert again.setpoint.position == 0.021
 
 
@@ -102,9 +102,9 @@ def test_reference_is_continuous_when_the_target_changes() -> None:
     for i in range(1000):
         if i == 500:
             steering.set_target(0.02)
-        measured = Measurement(time=i * PERIOD, depth=0.02, speed=0.0)
+        measured = Measurement(time=i * PERIOD, depth=0.02, velocity=0.0)
         points.append(steering.command(measured).setpoint)
-    speeds = np.array([point.speed for point in points])
+    speeds = np.array([point.velocity for point in points])
     # One period at the acceleration limit of 0.1 m/s^2, plus rounding.
     assert np.abs(np.diff(speeds)).max() < 1e-4 * (1.0 + 1e-6)
     assert speeds.min() < -0.009
@@ -120,8 +120,8 @@ def test_change_of_constants_continues_the_motion() -> None:
     nominal, _ = insert(steering, truth, 2.0)
     steering.change(truth)
     assert steering.target == 0.05
-    where = Measurement(time=2.0, depth=nominal[-1], speed=0.0)
-    before = steering.command(Measurement(time=1.999, depth=nominal[-1], speed=0.0)).setpoint
+    where = Measurement(time=2.0, depth=nominal[-1], velocity=0.0)
+    before = steering.command(Measurement(time=1.999, depth=nominal[-1], velocity=0.0)).setpoint
     # One period at 0.01 m/s.
     assert steering.command(where).setpoint.position == pytest.approx(before.position, abs=1.1e-5)
     depths, aims = insert(told, truth, 3.5)
@@ -136,10 +136,10 @@ def test_constants_with_unstable_gains_are_rejected() -> None:
     thin = NeedleParameters.preset('phantom', viscous_friction=0.3)
     with pytest.raises(ParameterError, match=r'pid.insertion gains are unstable at 1000 Hz'):
         steering.change(thin)
-    measured = Measurement(time=0.5, depth=0.021, speed=1e-3)
+    measured = Measurement(time=0.5, depth=0.021, velocity=1e-3)
     for each in (steering, other):
         each.set_target(0.05)
-        each.command(Measurement(time=0.0, depth=0.02, speed=0.0))
+        each.command(Measurement(time=0.0, depth=0.02, velocity=0.0))
     assert steering.command(measured) == other.command(measured)
 
 
@@ -148,7 +148,8 @@ def test_forces_stay_within_their_limit() -> None:
     steering = controller(force_limit=2.0)
     steering.set_target(0.2)
     forces = [
-        steering.command(Measurement(time=i * 0.1, depth=0.02, speed=0.0)).force for i in range(99)
+        steering.command(Measurement(time=i * 0.1, depth=0.02, velocity=0.0)).force
+        for i in range(99)
     ]
     assert max(forces) == 2.0
 
@@ -189,7 +190,7 @@ def test_missing_gains_have_their_defaults() -> None:
     given = Controller(
         NeedleParameters.preset('phantom'), 'pid', gains={'pid': {'insertion': PidGains()}}
     )
-    measured = Measurement(time=0.0, depth=0.02, speed=0.0, angle=0.1)
+    measured = Measurement(time=0.0, depth=0.02, velocity=0.0, angle=0.1)
     for each in (plain, given):
         each.set_target(0.05)
         each.change(gains={'inverse_dynamics': {'insertion': InverseDynamicsGains(kp=400.0)}})
@@ -230,7 +231,7 @@ def test_switch_in_motion_is_bumpless(switch: str) -> None:
         elif i == 2000:
             stiff = InverseDynamicsGains(kp=2500.0, kv=100.0)
             steering.change(gains={'inverse_dynamics': {'insertion': stiff}})
-        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.velocity)
+        measured = Measurement(time=i * PERIOD, depth=needle.depth, velocity=needle.velocity)
         forces.append(steering.command(measured).force)
         waiting.append(forces[-1])
         needle.advance(PERIOD, waiting.pop(0))
@@ -271,14 +272,14 @@ def test_inconsistent_measurement_gives_zero_force(depth: float, speed: float, f
     steering = controller()
     steering.set_target(0.05)
     for i in range(100):
-        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, speed=0.0))
+        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, velocity=0.0))
     assert command.force > 0.0
-    wrong = steering.command(Measurement(time=0.1, depth=depth, speed=speed))
+    wrong = steering.command(Measurement(time=0.1, depth=depth, velocity=speed))
     assert (wrong.force, wrong.torque) == (0.0, 0.0)
     assert fault in wrong.fault
     # Two consistent measurements at the old depth: it continues to its target.
     for i in range(101, 200):
-        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, speed=0.0))
+        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, velocity=0.0))
     assert command.fault is None
     assert command.force > 0.0
     assert steering.target == 0.05
@@ -289,7 +290,7 @@ def test_needle_moved_during_a_fault_clears_the_target() -> None:
     steering = controller()
     steering.set_target(0.05)
     commands = [
-        steering.command(Measurement(time=i * PERIOD, depth=0.02 + 0.01 * (i > 50), speed=0.0))
+        steering.command(Measurement(time=i * PERIOD, depth=0.02 + 0.01 * (i > 50), velocity=0.0))
         for i in range(100)
     ]
     assert [c.notice for c in commands if c.notice] == [
@@ -311,7 +312,7 @@ def test_integral_is_frozen_without_a_command() -> None:
     assert learned != 0.0
     steering.release()
     for i in range(500):
-        steering.command(Measurement(time=2.0 + i * PERIOD, depth=nan, speed=0.0))
+        steering.command(Measurement(time=2.0 + i * PERIOD, depth=nan, velocity=0.0))
     assert loop.memory[INTEGRAL] == learned
     steering.forget()
     assert loop.memory[INTEGRAL] == 0.0
@@ -324,18 +325,18 @@ def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
     steering.set_target(0.05)
     for i in range(500):
         before = steering.command(
-            Measurement(time=10.0 + i * PERIOD, depth=0.02 + 1e-5 * i, speed=0.01)
+            Measurement(time=10.0 + i * PERIOD, depth=0.02 + 1e-5 * i, velocity=0.01)
         )
-    assert before.setpoint.speed == pytest.approx(0.01, rel=1e-12)
+    assert before.setpoint.velocity == pytest.approx(0.01, rel=1e-12)
     where = 0.02 + 1e-5 * 500
     for i in range(200):
         after = steering.command(
-            Measurement(time=10.5 + step + i * PERIOD, depth=where, speed=0.0)
+            Measurement(time=10.5 + step + i * PERIOD, depth=where, velocity=0.0)
         )
         assert after.fault is None
         if i == 0:
             assert after.setpoint.position == where
-            assert after.setpoint.speed == 0.0
+            assert after.setpoint.velocity == 0.0
             assert f'continued after {7.001 if step > 0 else -6.999:.3f} s' in after.notice
         else:
             assert after.notice is None
@@ -348,7 +349,7 @@ def test_command_detects_non_finite_values(load: float) -> None:
     """An invalid load gives a command that must not be sent."""
     steering = controller()
     steering.set_target(0.05)
-    measured = Measurement(time=0.0, depth=0.02, speed=0.0)
+    measured = Measurement(time=0.0, depth=0.02, velocity=0.0)
     assert steering.command(measured).is_finite()
     assert not steering.command(measured, nan).is_finite()
     assert not ControllerOutput(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()

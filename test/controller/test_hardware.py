@@ -88,7 +88,7 @@ def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None
     measured = robot.measurement(state(['insertion'], [0.0], [velocity]))
     told = forces(sign=settings.sign, scale=settings.scale, zero=settings.zero)
     (effort,) = told.command(ForceCommand(0, force)) or [nan]
-    assert effort * velocity == pytest.approx(force * measured.speed, rel=1e-9, abs=1e-12)
+    assert effort * velocity == pytest.approx(force * measured.velocity, rel=1e-9, abs=1e-12)
     assert told.force(effort) == pytest.approx(force, rel=1e-12, abs=1e-12)
     read = robot.measurement(state(['insertion'], [0.0], [velocity], [effort]))
     assert read.force == pytest.approx(force, rel=1e-12, abs=1e-12)
@@ -104,7 +104,7 @@ def test_joint_is_found_by_name(names: list[str]) -> None:
         (Robot(HardwareSettings(joint='slide')), 0.5),
     ):
         found = robot.measurement(reading)
-        assert (found.depth, found.speed, found.angle) == (0.03, 0.01, angle)
+        assert (found.depth, found.velocity, found.angle) == (0.03, 0.01, angle)
         assert isnan(found.force)
 
 
@@ -135,13 +135,13 @@ def test_velocity_is_estimated_for_position_commands(velocities: list[float]) ->
         for k in range(100)
     ]
     assert robot.estimates
-    assert found[0].speed == 0.0
-    assert found[5].speed == pytest.approx(0.01 * (1.0 - (5.0 / 6.0) ** 5))
-    assert found[-1].speed == pytest.approx(0.01, rel=1e-6)
+    assert found[0].velocity == 0.0
+    assert found[5].velocity == pytest.approx(0.01 * (1.0 - (5.0 / 6.0) ** 5))
+    assert found[-1].velocity == pytest.approx(0.01, rel=1e-6)
     later = robot.measurement(state(['insertion'], [30.0], velocities, stamp=SECOND))
-    assert later.speed == 0.0
+    assert later.velocity == 0.0
     assert not moves().estimates
-    assert moves().measurement(state(['insertion'], [0.02], [0.01])).speed == 0.01
+    assert moves().measurement(state(['insertion'], [0.02], [0.01])).velocity == 0.01
 
 
 @pytest.mark.parametrize(('along', 'aside'), [*product(SIGNED, ['', *SIGNED])])
@@ -175,8 +175,8 @@ def test_default_settings_are_the_contract() -> None:
     found = robot.measurement(
         state(['insertion', 'rotation'], [0.02, 0.1], [0.3, 0.2], [4.0, 5.0])
     )
-    assert (found.depth, found.speed, found.force) == (0.02, 0.3, 4.0)
-    assert (found.angle, found.angular_speed) == (0.1, 0.2)
+    assert (found.depth, found.velocity, found.force) == (0.02, 0.3, 4.0)
+    assert (found.angle, found.angular_velocity) == (0.1, 0.2)
 
 
 def test_dynamic_joint_state_is_converted() -> None:
@@ -197,7 +197,7 @@ def test_dynamic_joint_state_is_converted() -> None:
         reading.values, [[0.1, 0.02, nan], [nan, 0.01, nan], [nan, 3.0, nan]]
     )
     found = forces(joint='slide').measurement(reading)
-    assert (found.depth, found.speed, found.force) == (0.02, 0.01, 3.0)
+    assert (found.depth, found.velocity, found.force) == (0.02, 0.01, 3.0)
 
 
 def test_other_joints_get_zero_effort() -> None:

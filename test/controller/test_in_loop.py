@@ -291,7 +291,8 @@ class Blurred:
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         depth, speed, _ = next(self._noise)
         return self._controller.command(
-            replace(measured, depth=measured.depth + depth, speed=measured.speed + speed), load
+            replace(measured, depth=measured.depth + depth, velocity=measured.velocity + speed),
+            load,
         )
 
 

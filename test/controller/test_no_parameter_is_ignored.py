@@ -74,7 +74,7 @@ def forces(law: str, gains: dict[str, Any], **changes: Any) -> list[float]:
         if i == 25:
             controller.set_target(0.01)
         now = i * PERIOD if i < 30 else i * PERIOD + 0.05 * (i - 29)
-        measured = Measurement(time=now, depth=depth, speed=speed)
+        measured = Measurement(time=now, depth=depth, velocity=speed)
         found.append(controller.command(measured).force)
     return found
 

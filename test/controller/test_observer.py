@@ -648,7 +648,7 @@ def watch_plant(
     for k in range(1, count + 1):
         shown = simulated.advance(force)
         wrench = float(shown.wrench[2]), float(shown.wrench[3])
-        observer.update(ns(k * PERIOD), shown.joint_position, shown.speed, wrench)
+        observer.update(ns(k * PERIOD), shown.joint_position, shown.velocity, wrench)
         if shown.tip is not None:
             observer.add_tip(ns((k - shown.tip.age) * PERIOD), shown.tip.deflection)
         samples.append(shown)
@@ -751,7 +751,7 @@ def simulate(
     for k in range(1, count + 1):
         shown = simulated.advance(force)
         wrench = float(shown.wrench[2]), float(shown.wrench[3])
-        observer.update(ns(k * PERIOD), shown.depth, shown.speed, wrench)
+        observer.update(ns(k * PERIOD), shown.depth, shown.velocity, wrench)
         if k % 20 == 0:
             late.append((k, shown.tip_deflection + settings.tip_noise * rng.normal()))
         if late and late[0][0] == k - 20:
@@ -1156,7 +1156,7 @@ def test_inconsistent_observer_is_not_used() -> None:
         for stamp in islice(stamps, count):
             moment = size * float(rng.choice([-1.0, 1.0]))
             bending.take_wrench(stamp, 0.5, 0.1 + moment, stamp - 1)
-            bending.update(stamp, Measurement(time=1e-9 * stamp, depth=0.1, speed=0.0))
+            bending.update(stamp, Measurement(time=1e-9 * stamp, depth=0.1, velocity=0.0))
 
     watch(600, 0.0)
     assert bending.warning is None

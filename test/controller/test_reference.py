@@ -31,11 +31,11 @@ def test_motion_starts_at_start_and_ends_at_target_at_rest(
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 0.0)
     first, last = motion.at(0.0), motion.at(motion.duration)
-    assert (first.position, first.speed) == (start, speed)
+    assert (first.position, first.velocity) == (start, speed)
     assert last == Setpoint(target)
     before = motion.at(motion.duration * (1.0 - 1e-9))
     # 1e-9 of the duration at these speeds, and rounding of the sums over the parts.
-    assert_allclose([before.position, before.speed], [target, 0.0], atol=1e-7)
+    assert_allclose([before.position, before.velocity], [target, 0.0], atol=1e-7)
 
 
 @BOTH
@@ -50,7 +50,7 @@ def test_position_velocity_and_acceleration_are_consistent(
     times = np.linspace(0.0, motion.duration, 801)
     points = [motion.at(t) for t in times]
     position = np.array([p.position for p in points])
-    rate = np.array([p.speed for p in points])
+    rate = np.array([p.velocity for p in points])
     ramp = np.array([p.acceleration for p in points])
     # The trapezoidal rule: exact within a part, and off by one step's change at a corner.
     step = times[1]
@@ -69,12 +69,12 @@ def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponen
     """All samples of position, velocity and acceleration are within the extremes."""
     motion = Quintic(start, end, 10.0**exponent)
     points = [motion.at(x * motion.duration) for x in np.linspace(0.0, 1.0, 1001)]
-    found = np.array([(p.position, p.speed, p.acceleration) for p in points]).T
+    found = np.array([(p.position, p.velocity, p.acceleration) for p in points]).T
     low, high = motion.extremes.T
     # The size of the terms affected by rounding and by a thousandth of the duration.
     t = motion.duration
     terms = sum(
-        abs(e.position) + t * abs(e.speed) + t * t * abs(e.acceleration) for e in (start, end)
+        abs(e.position) + t * abs(e.velocity) + t * t * abs(e.acceleration) for e in (start, end)
     )
     size = 100.0 * terms / np.array([1.0, t, t * t]) + 1e-300
     assert (low <= found.min(axis=1) + 1e-13 * size).all()
@@ -99,7 +99,7 @@ def test_minimum_jerk_reaches_its_speed_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
     # Peak of the quintic at half time: 15/8 of the mean speed.
-    assert motion.at(0.5 * motion.duration).speed == pytest.approx(LIMITS.speed, rel=1e-12)
+    assert motion.at(0.5 * motion.duration).velocity == pytest.approx(LIMITS.speed, rel=1e-12)
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
 
 
@@ -107,7 +107,7 @@ def samples(motion: Callable[..., Any], end: float, count: int = 801) -> tuple[F
     """Return times, positions, speeds and accelerations of a motion."""
     times = np.linspace(0.0, end, count)
     points = [motion(t) for t in times]
-    return times, *np.array([(p.position, p.speed, p.acceleration) for p in points]).T
+    return times, *np.array([(p.position, p.velocity, p.acceleration) for p in points]).T
 
 
 def check_smooth(
@@ -153,7 +153,7 @@ def test_path_is_joined_continuously_from_any_state_and_followed_to_its_end(
     path = Path(times, positions, [0.0] * len(times) if cubic else None, LIMITS, REACH)
     motion = Joined(Setpoint(start, speed), path, 0.0, LIMITS)
     first = motion.at(0.0)
-    assert_allclose((first.position, first.speed), (start, speed), rtol=1e-12)
+    assert_allclose((first.position, first.velocity), (start, speed), rtol=1e-12)
     check_smooth(motion.at, motion.duration + 0.1, speed)
     assert motion.at(motion.duration) == Setpoint(positions[-1])
 
@@ -174,16 +174,21 @@ def test_lines_are_followed_exactly_between_their_corners() -> None:
     [
         ([], [], None, 'at least one time'),
         ([1.0], [0.1, 0.2], None, 'one position for each'),
-        ([1.0, 2.0], [0.1, 0.1], [0.0], 'a speed for each of its 2 points or none'),
+        ([1.0, 2.0], [0.1, 0.1], [0.0], 'a velocity for each of its 2 points or none'),
         ([1.0, 1.0], [0.1, 0.1], None, 'times must be >= 0 and increasing'),
         ([-1.0], [0.1], None, 'times must be >= 0 and increasing'),
         ([1.0, np.nan], [0.1, 0.1], None, 'must be finite'),
         ([1.0], [np.inf], None, 'must be finite'),
         ([1.0], [0.3], None, r'positions must be in \[0.001, 0.2\] m'),
-        ([0.0, 1.0], [0.1, 0.12], None, 'speed after 0 s must be within 0.01 m/s, got 0.02 m/s'),
-        ([0.0, 1.0], [0.1, 0.101], [0.0, 0.01], 'speed at the end must be 0'),
+        (
+            [0.0, 1.0],
+            [0.1, 0.12],
+            None,
+            'velocity after 0 s must be within 0.01 m/s, got 0.02 m/s',
+        ),
+        ([0.0, 1.0], [0.1, 0.101], [0.0, 0.01], 'velocity at the end must be 0'),
         ([0.0, 0.1], [0.1, 0.1004], [0.0, 0.0], 'acceleration after 0 s must be within 0.1'),
-        ([0.0, 0.01, 1.0], [0.1, 0.1001, 0.1], None, 'speed changes from 0.01 to'),
+        ([0.0, 0.01, 1.0], [0.1, 0.1001, 0.1], None, 'velocity changes from 0.01 to'),
         ([0.0, 4.0], [0.1995, 0.1995], [0.009, 0.0], r'must stay in \[0.001, 0.2\] m'),
     ],
 )
@@ -237,11 +242,11 @@ def test_reference_is_continuous_across_all_changes(
             getattr(walk.guide, event)()
         before, after = walk.guide.ahead(walk.time), walk.guide.at(walk.time, 0.05)
         assert_allclose(after.position, before.position, rtol=1e-12)
-        assert_allclose(after.speed, before.speed, rtol=1e-9, atol=1e-12)
+        assert_allclose(after.velocity, before.velocity, rtol=1e-9, atol=1e-12)
         if kind == 'minimum_jerk':
             assert_allclose(after.acceleration, before.acceleration, rtol=1e-9, atol=1e-9)
     walk.on(0.5)
-    position, speed = np.array([(p.position, p.speed) for p in walk.points]).T
+    position, speed = np.array([(p.position, p.velocity) for p in walk.points]).T
     assert np.abs(np.diff(position)).max() <= 1e-3 * LIMITS.speed * (1.0 + 1e-6)
     assert np.abs(np.diff(speed)).max() <= 1e-3 * LIMITS.acceleration * (1.0 + 1e-6)
 
@@ -254,7 +259,7 @@ def test_pause_brakes_holds_and_resumes(kind: str) -> None:
     before = walk.on(2.0)
     walk.guide.pause()
     held = walk.on(1.0)
-    assert held.speed == held.acceleration == 0.0
+    assert held.velocity == held.acceleration == 0.0
     assert 0.0 < held.position - before.position <= 2.9 * 0.01**2 / (2.0 * 0.1) + 1e-5
     assert walk.on(1.0) == held
     # A target while paused waits.
@@ -329,7 +334,7 @@ def test_reference_stays_in_the_depth_range(kind: str, start: float, events: lis
         for _ in range(round(wait * 500.0) + 1):
             points.append(guide.at(time, start))
             time += 2e-3
-    positions, rates = np.array([(point.position, point.speed) for point in points]).T
+    positions, rates = np.array([(point.position, point.velocity) for point in points]).T
     assert np.abs(np.diff(positions)).max() <= 2e-3 * LIMITS.speed * (1.0 + 1e-6)
     if kind == 'trapezoid':
         # A reference within limits and range can always brake before the end of the range.

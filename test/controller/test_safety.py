@@ -133,7 +133,7 @@ def test_constant_readings_of_a_noise_free_sensor_are_valid(readings: list[float
 
 def encoded(depth: float, speed: float, angle: float = 0.0, rate: float = 0.0) -> Measurement:
     """Return a sample of the encoders."""
-    return Measurement(time=0.0, depth=depth, speed=speed, angle=angle, angular_speed=rate)
+    return Measurement(time=0.0, depth=depth, velocity=speed, angle=angle, angular_velocity=rate)
 
 
 GUARD = [
@@ -180,9 +180,9 @@ def test_readings_at_a_limit_are_within_it() -> None:
         edge = Measurement(
             time=0.0,
             depth=0.1 + limits.depth_tolerance,
-            speed=limits.speed,
+            velocity=limits.speed,
             angle=limits.angle,
-            angular_speed=-limits.angular_speed,
+            angular_velocity=-limits.angular_speed,
         )
         assert guard.encoders(edge) is None
         assert guard.wrench(-limits.axial_load, limits.lateral_load, limits.moment_load) is None
@@ -357,7 +357,9 @@ def joints(names: list[str], positions: list[float], speeds: list[float]) -> Rea
 def test_encoders_are_read_by_name() -> None:
     """In any order, with or without the rotation."""
     both = read_encoders(joints(['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01]))
-    assert both == Measurement(time=1.0, depth=0.02, speed=0.01, angle=0.1, angular_speed=0.2)
+    assert both == Measurement(
+        time=1.0, depth=0.02, velocity=0.01, angle=0.1, angular_velocity=0.2
+    )
     assert read_encoders(joints(['insertion'], [0.02], [0.01])).angle == 0.0
 
 

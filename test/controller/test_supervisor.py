@@ -321,7 +321,7 @@ def test_measurement_beyond_a_limit_gets_one_zero_command_with_its_stamp() -> No
     """The second reading in a row latches the stop, with no further command."""
     loop = Loop()
     loop.pushes()
-    loop.supervisor.safety.guard.encoders(Measurement(time=0.0, depth=0.02, speed=0.2))
+    loop.supervisor.safety.guard.encoders(Measurement(time=0.0, depth=0.02, velocity=0.2))
     answer = loop.measure(0.0, 0.2)
     assert answer == ForceCommand(loop.now)
     assert loop.said()[-1] == (

@@ -211,8 +211,8 @@ def test_tare_requires_rest() -> None:
     with pytest.raises(JobError, match=r'^the needle moves at 10 mm/s; it must rest$'):
         plant.tare()
     samples = run(plant, 1.5)
-    assert samples[-1].speed == 0.0
-    rested = sum(1 for sample in samples if abs(sample.speed) <= 1e-6)
+    assert samples[-1].velocity == 0.0
+    rested = sum(1 for sample in samples if abs(sample.velocity) <= 1e-6)
     assert rested >= 50
     plant.tare()
     # At rest with the least force: only the tare value remains.
