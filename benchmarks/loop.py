@@ -13,8 +13,8 @@ from needle_controller import (
     ForceCommand,
     ObserverSettings,
     SafetyLimits,
-    Supervisor,
 )
+from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.run import PlantRun
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION

@@ -59,7 +59,6 @@ from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw,
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
 
 __all__ = [
@@ -111,7 +110,6 @@ __all__ = [
     'SteeringLaw',
     'SteeringModel',
     'SteeringPrior',
-    'Supervisor',
     'TipEstimate',
     'Trapezoid',
     'Uncertainty',

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import exp, isfinite, nan
+from math import isfinite, nan
 from typing import Final, TypeAlias
 
 from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
@@ -14,11 +14,13 @@ from needle_controller.laws.law import Law, SampledLoop
 from needle_controller.laws.pid import Pid, PidGains
 from needle_controller.reference.generator import ReferenceGenerator
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
+from needle_controller.safety.displacement_monitor import DisplacementMonitor
 from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
+from needle_ros.status import ControllerStatus
 
 #: Controlled axes.
 AXES: Final = ('insertion', 'rotation')
@@ -147,9 +149,6 @@ class Measurement:
         return insertion and isfinite(self.angle) and isfinite(self.angular_velocity)
 
 
-#: Time over which positions and velocities are compared [s].
-_MEMORY: Final = 2.0
-
 #: Setpoint of a command without a reference.
 NO_SETPOINT: Final = Setpoint(nan)
 
@@ -260,6 +259,8 @@ class Controller:
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
+        longest = settings.measurement_timeout + self.period
+        self._displacement = DisplacementMonitor(settings.jump, longest)
         self._last_depth: float | None = None
         self.forget()
 
@@ -335,6 +336,18 @@ class Controller:
         """Learned correction of the insertion friction; see `SampledLoop.learned`."""
         return self._insertion.learned
 
+    def status(self) -> ControllerStatus:
+        """Return target, law, stability and learned correction as fields of a status."""
+        name, limit = max(self.limits.items(), key=lambda item: item[1].radius - item[1].bound)
+        return ControllerStatus(
+            target=self.target,
+            law=self.law,
+            least_stable_axis=name,
+            spectral_radius=limit.radius,
+            spectral_radius_limit=limit.bound,
+            learned=self.learned,
+        )
+
     def set_target(self, depth: float) -> None:
         """
         Set the target insertion depth; see `ReferenceGenerator.aim`.
@@ -378,13 +391,14 @@ class Controller:
         self._last_depth = None
 
     def forget(self) -> None:
-        """Discard target, motion and the memory of the laws."""
+        """Discard target, motion, measurements and the memory of the laws."""
+        self._discard_motion()
+        self._displacement.forget()
+
+    def _discard_motion(self) -> None:
         self.guide.forget()
         self._insertion.reset()
         self._rotation.reset()
-        self._seen: Measurement | None = None
-        #: Displacement unexplained by the velocities of the last seconds [m].
-        self._unexplained = 0.0
         self._last_depth = None
         self._stopped = False
 
@@ -404,40 +418,6 @@ class Controller:
         self._insertion.unwind()
         self._rotation.unwind()
 
-    def _gap(self, measured: Measurement) -> float:
-        """Return the time between measurements [s] if it is too long or negative; else zero."""
-        elapsed = measured.time - self._seen.time if self._seen is not None else 0.0
-        most = self.settings.measurement_timeout + self.period
-        return 0.0 if 0.0 <= elapsed <= most else elapsed
-
-    def _fault(self, measured: Measurement, gap: float) -> str | None:
-        """Return why a measurement after a gap [s], or without, is rejected; or None."""
-        if not measured.is_finite():
-            return f'joint_states must be finite, got {measured}'
-        before, self._seen = self._seen, measured
-        if before is None or gap:
-            self._unexplained = 0.0
-            return None
-        jump, elapsed = self.settings.jump, measured.time - before.time
-        moved = measured.depth - before.depth
-        rest = moved - 0.5 * (before.velocity + measured.velocity) * elapsed
-        if not abs(rest) <= jump:
-            # The position jumped; the next measurements may be consistent.
-            self._unexplained = 0.0
-            return (
-                f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at velocities of '
-                f'{before.velocity:.6g} and {measured.velocity:.6g} m/s'
-            )
-        unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
-        # Clipped, so that the fault ends as soon as position and velocity agree again.
-        self._unexplained = min(max(unexplained, -jump), jump)
-        if abs(unexplained) > jump:
-            return (
-                f'insertion and its velocity contradict each other: {1e3 * abs(unexplained):.3g} '
-                f'mm too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
-            )
-        return None
-
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         """
         Return the command that answers a measurement.
@@ -456,12 +436,15 @@ class Controller:
 
         """
         notice = None
-        gap = self._gap(measured)
+        gap = self._displacement.gap(measured.time)
         if gap:
             if self.guide.moves:
                 notice = f'measurements continued after {gap:.3f} s; the motion starts again'
             self.release()
-        fault = self._fault(measured, gap)
+        if measured.is_finite():
+            fault = self._displacement.fault(measured.time, measured.depth, measured.velocity)
+        else:
+            fault = f'joint_states must be finite, got {measured}'
         if fault is not None:
             self.release()
         else:
@@ -489,9 +472,7 @@ class Controller:
         moved = abs(measured.depth - last) if last is not None else 0.0
         elsewhere = self._stopped and moved > self.settings.jump and self.target is not None
         if elsewhere:
-            seen, unexplained = self._seen, self._unexplained
-            self.forget()
-            self._seen, self._unexplained = seen, unexplained
+            self._discard_motion()
             self._last_depth = measured.depth
         self._stopped = False
         if not elsewhere:

@@ -7,6 +7,7 @@ from typing import Final
 
 from needle_controller.controller import Measurement
 from needle_controller.observer.observer import Observer
+from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.status import ObserverStatus
@@ -14,6 +15,16 @@ import numpy as np
 
 #: Samples between two consistency checks of the observer.
 _LOOK: Final = 25
+
+
+def build_observer(
+    parameters: NeedleParameters, settings: ObserverSettings, period: float
+) -> Observer:
+    """Return an observer with a sample period [s]; its errors name the parameter of the node."""
+    try:
+        return Observer(parameters, settings, period)
+    except ParameterError as error:
+        raise ParameterError(f'observer.{error}') from error
 
 
 class LoadEstimator:

@@ -1,36 +1,28 @@
 """
 Equations of motion of a flexible needle in soft tissue, one method per equation.
 
-The generalized coordinates are q = [d, theta, q1, ..., qn] and the state is X = [q, q_dot]:
-eight numbers for n = 2. d is the length of needle outside the tissue and decreases during
-insertion; the insertion force f_y is positive into the tissue. The formulation `complete` has
-every term of the Euler-Lagrange equations of T - V, equation (12). The formulation `as_printed`
-is the final form in the source, which omits the row of d and the terms from dG/dt.
+`needle_dynamics.statics` describes the state; the insertion force f_y is positive into the tissue.
+The formulation `complete` has every term of the Euler-Lagrange equations of T - V, equation (12).
+The formulation `as_printed` is the final form in the source, which omits the row of d and the
+terms from dG/dt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.integrals import ModeIntegrals, tip_deflections
+from needle_dynamics.compiled.integrals import ModeIntegrals
 from needle_dynamics.compiled.normal_modes import coupling
 from needle_dynamics.compiled.step import CompiledNeedle
-from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.friction import Friction
-from needle_dynamics.modes import mode_shapes, ModeShapes
-from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.tissue import Tissue
+from needle_dynamics.statics import NeedleStatics, ROUNDING
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
-
-#: Rounding tolerance of an insertion depth, relative to the needle length.
-ROUNDING: Final = 1e-12
 
 
 class _Instant(NamedTuple):
@@ -49,7 +41,7 @@ class _Instant(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NeedleModel:
+class NeedleModel(NeedleStatics):
     """
     Lagrangian model of needle and tissue for one set of constants.
 
@@ -71,19 +63,6 @@ class NeedleModel:
     0.00031 J
 
     """
-
-    parameters: NeedleParameters
-
-    @cached_property
-    def modes(self) -> ModeShapes:
-        """Shape modes of the needle."""
-        p = self.parameters
-        return mode_shapes(p.length, p.modes, p.reach)
-
-    @cached_property
-    def tissue(self) -> Tissue:
-        """Tissue along the needle."""
-        return self.parameters.tissue
 
     @cached_property
     def friction(self) -> Friction:
@@ -110,61 +89,8 @@ class NeedleModel:
             swelling_time=p.swelling_time,
             friction=self.friction.constants,
             modes=self.modes.tables,
-            layers=self.tissue.layers(self.modes),
+            layers=self.layers,
         )
-
-    @property
-    def coordinates(self) -> int:
-        """Number of generalized coordinates, 2 + n."""
-        return 2 + self.parameters.modes
-
-    @property
-    def coordinate_names(self) -> tuple[str, ...]:
-        """Names of the generalized coordinates, in order: d, theta, q1, ..., qn."""
-        return ('d', 'theta', *(f'q{i + 1}' for i in range(self.parameters.modes)))
-
-    def checked_state(self, state: ArrayLike) -> FloatArray:
-        """
-        Check a state and return it as an array.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            X = [d, theta, q1, ..., qn] and its rates, SI units.
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            Copy of the state.
-
-        Raises
-        ------
-        ShapeError
-            If the shape is wrong or a number is not finite.
-        InsertionDepthError
-            If the insertion depth is outside its range.
-
-        """
-        try:
-            checked = np.array(state, dtype=float)
-        except (TypeError, ValueError):
-            raise ShapeError(f'state must be numbers, got {state!r}') from None
-        if checked.shape != (2 * self.coordinates,):
-            raise ShapeError(
-                f'state must have shape ({2 * self.coordinates},), got {checked.shape}'
-            )
-        if not np.isfinite(checked).all():
-            raise ShapeError(f'state must be finite, got {checked.tolist()}')
-        p = self.parameters
-        depth = p.length - checked[0]
-        high = self.modes.reach * p.length
-        # The insertion depth is a difference, so its limits hold up to rounding.
-        if not p.minimum_depth - ROUNDING * p.length <= depth <= high:
-            raise InsertionDepthError(
-                f'insertion depth {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
-                '(minimum_depth to the hub)'
-            )
-        return checked
 
     def _instant(self, state: ArrayLike, time: float = 0.0) -> _Instant:
         """Check a state and evaluate the modes and stiffness at it."""
@@ -174,83 +100,6 @@ class NeedleModel:
         tip_stiffness = self.tissue.stiffness(depth, time)
         stiffness = self._stiffness(at, depth, time)
         return _Instant(x, depth, x[m], x[2:m], x[m + 2 :], at, tip_stiffness, stiffness)
-
-    def _stiffness(self, at: ModeIntegrals, depth: float, time: float) -> FloatArray:
-        tissue, layer = self.tissue, self.tissue.layer(depth)
-        above = self.compiled.layers.gram[layer]
-        held = tissue.growth(time) * (tissue.stiffnesses[layer] * at.gram + above)
-        return np.asarray(self.parameters.bending_stiffness * at.curvature_gram + held)
-
-    def state_at(
-        self, depth: float, tip_deflection: float = 0.0, modal: Sequence[float] = ()
-    ) -> FloatArray:
-        """
-        Return the state at rest with a given insertion depth and tip deflection or shape.
-
-        With a tip deflection, the shape is the static shape under a lateral force at the tip,
-        which has the least elastic energy for that deflection. (The source gives only the tip
-        deflection.)
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth s [m].
-        tip_deflection : float
-            w(s) [m].
-        modal : sequence of float, shape (n,) or (0,)
-            q1 to qn [m^3/2], instead of a tip deflection.
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            State.
-
-        Raises
-        ------
-        InsertionDepthError
-            If ``depth`` is outside its range.
-        ShapeError
-            If a number is not finite, or the number of modal coordinates is not n.
-        ParameterError
-            If both a tip deflection and modal coordinates are given.
-
-        """
-        state = np.zeros(2 * self.coordinates)
-        state[0] = self.parameters.length - depth
-        state = self.checked_state(state)
-        if len(modal):
-            if len(modal) != self.modes.count:
-                raise ShapeError(f'modal must have {self.modes.count} numbers, got {modal!r}')
-            if tip_deflection != 0.0:
-                raise ParameterError(
-                    'modal and tip_deflection both define the shape: '
-                    f'one must be empty or 0, got {modal!r} and {tip_deflection!r} m'
-                )
-            state[2 : self.coordinates] = modal
-            return self.checked_state(state)
-        at = self.modes.integrals(depth)
-        shape = np.linalg.solve(self._stiffness(at, depth, 0.0), at.value)
-        state[2 : self.coordinates] = shape * (tip_deflection / (at.value @ shape))
-        return self.checked_state(state)
-
-    def stiffness_matrix(self, depth: float, time: float = 0.0) -> FloatArray:
-        """
-        Modal stiffness E I_y H + k_a G of needle and tissue, from (12).
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth s [m].
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (n, n)
-            Stiffness [N/m] for modal coordinates in m^3/2.
-
-        """
-        return self._stiffness(self.modes.integrals(depth), depth, time)
 
     def mass_matrix(self, state: ArrayLike) -> FloatArray:
         """
@@ -414,7 +263,7 @@ class NeedleModel:
         """
         p, tissue, now = self.parameters, self.tissue, self._instant(state, time)
         acceleration = self._acceleration(now, force, torque)
-        layer, layers = tissue.layer(now.depth), self.compiled.layers
+        layer, layers = tissue.layer(now.depth), self.layers
         integrals = np.array([now.at.area, now.at.moment])
         above = np.array([layers.area[layer], layers.moment[layer]])
         held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
@@ -508,67 +357,3 @@ class NeedleModel:
 
         """
         return self.kinetic_energy(state) + self.potential_energy(state, time)
-
-    def tip_deflection(self, state: ArrayLike) -> float:
-        """
-        Deflection of the tip Y = w(s, t), the model's output.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-
-        Returns
-        -------
-        float
-            Deflection [m] along z.
-
-        """
-        return float(self.tip_deflections(self.checked_state(state)[np.newaxis])[0])
-
-    def tip_deflections(self, states: ArrayLike) -> FloatArray:
-        """
-        Deflection of the tip for many states at once.
-
-        Parameters
-        ----------
-        states : array_like, shape (..., 2 (2 + n))
-            Valid states, or NaN.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            Deflections [m] along z; NaN where a state is NaN.
-
-        """
-        x = np.ascontiguousarray(states, dtype=float)
-        rows = x.reshape(-1, 2 * self.coordinates)
-        return tip_deflections(self.modes.tables, rows).reshape(x.shape[:-1])
-
-    def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
-        """
-        Points of the inserted needle from the entry point to the tip, equation (10).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        points : int
-            Number of points, at least 2.
-
-        Returns
-        -------
-        ndarray, shape (points, 2)
-            y and w(y) [m].
-
-        Raises
-        ------
-        ShapeError
-            If there are fewer than two points.
-
-        """
-        x = self.checked_state(state)
-        if not isinstance(points, int) or points < 2:
-            raise ShapeError(f'points must be an integer >= 2, got {points!r}')
-        y = np.linspace(0.0, self.parameters.length - x[0], points)
-        return np.column_stack([y, self.modes.values(y) @ x[2 : self.coordinates]])

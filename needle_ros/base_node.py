@@ -1,44 +1,34 @@
-"""
-Base class of all nodes: life cycle, contract topics, parameters, diagnostics.
-
-The parameters of a node are the fields of frozen dataclasses. `constant` gives each field a unit,
-a description and a range, and the constructor of the dataclass checks them. An invalid parameter
-file therefore fails the `configure` transition, with a one-line error that names the parameter.
-"""
+"""Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from importlib import import_module
 import traceback
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
-from needle_ros.errors import MessageError, NeedleError, ParameterError, printable
+from needle_ros.errors import MessageError, NeedleError, printable
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import LifeCycle
+from needle_ros.parameter_node import ParameterNode
 from needle_ros.preparation import imports, Preparation, PreparationProgress
-from needle_ros.settings import from_values, unknown_name
 from needle_ros.status import Diagnosis, NodeStatus
 from needle_ros.wire import MessageReader, Reading
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
-import yaml
 
 
 def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
@@ -75,36 +65,13 @@ LATCHED, COMMAND, SENSOR = (
     profile(qos, request=True) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
 
-#: Strings that rcl parses as booleans in a parameter file.
-_READ_AS_BOOL = ('y', 'n')
-
-
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
-    """Quotes strings that rcl would parse as booleans and PyYAML would not."""
-
-
-_Dumper.add_representer(
-    str,
-    lambda dumper, text: dumper.represent_scalar(
-        'tag:yaml.org,2002:str', text, style="'" if text.lower() in _READ_AS_BOOL else None
-    ),
-)
-
-_Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
 #: Period of log lines about a running preparation [s].
 _LONG = 2.0
 
 
-def _same(new: Any, old: Any) -> bool:
-    """Return whether a parameter keeps its value."""
-    if isinstance(new, (list, tuple, array)):
-        new = list(new)
-    return bool(new == old)
-
-
-class BaseNode(LifecycleNode):
+class BaseNode(ParameterNode):
     """
     Lifecycle node with parameters from dataclasses and diagnostics.
 
@@ -121,14 +88,9 @@ class BaseNode(LifecycleNode):
         Whether the node failed at its task: its process then ends with status 1.
     invalid : Counter
         Number of invalid messages by topic.
-    shared : frozenset of str
-        Names of parameters that a file sets for several nodes; names that this node does not
-        declare are not an error.
 
     """
 
-    #: Names of the parameters that may change in the configured node.
-    LIVE: ClassVar[frozenset[str]] = frozenset()
     #: Modules with a slow import, imported before `configure`.
     IMPORTS: ClassVar[tuple[str, ...]] = ()
 
@@ -137,10 +99,6 @@ class BaseNode(LifecycleNode):
         self.failure: str | None = None
         self.failed = False
         self.invalid: Counter[str] = Counter()
-        #: Names of numeric parameters.
-        self._numbers: set[str] = set()
-        self.shared: frozenset[str] = frozenset()
-        self._configured = False
         self._preparation = Preparation(self.preparation())
         self._life_cycle = LifeCycle(self, self._preparation, self._is_valid)
         self.declare_text('autostart', True, 'configure and activate at start')
@@ -150,7 +108,6 @@ class BaseNode(LifecycleNode):
         # Steady clock: diagnostics continue in a paused simulation.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
-        self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._after_change)
 
     # Hooks of subclasses.
@@ -178,9 +135,6 @@ class BaseNode(LifecycleNode):
 
     def deactivate(self) -> None:
         """Stop the periodic work, and command zero force."""
-
-    def change(self, changes: Mapping[str, Any]) -> None:
-        """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
 
     def diagnose(self) -> Diagnosis[NodeStatus]:
         """Return severity, one-line message and typed status."""
@@ -246,143 +200,6 @@ class BaseNode(LifecycleNode):
             raw=True,
             event_callbacks=events,
         )
-
-    # Parameters.
-
-    def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
-        """Declare a parameter that is not a number."""
-        # YAML 1.1 parses y as true; `text` converts it back.
-        dynamic = default in _READ_AS_BOOL
-        descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
-        self.declare_parameter(name, default, descriptor)
-
-    def declare_settings(self, prefix: str, defaults: object, names: Collection[str] = ()) -> None:
-        """Declare one parameter per dataclass field; without ``names`` for all fields."""
-        for item in fields(defaults):  # type: ignore[arg-type]
-            if names and item.name not in names:
-                continue
-            meta = item.metadata
-            unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
-            descriptor = ParameterDescriptor(
-                description=f'{meta.get("description", item.name)}{unit}',
-                # Integers are accepted for floats; the dataclass checks the value.
-                dynamic_typing=True,
-            )
-            if 'low' in meta:
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
-                ]
-            if 'unit' in meta:
-                self._numbers.add(prefix + item.name)
-            default = getattr(defaults, item.name)
-            if isinstance(default, tuple):
-                default = list(default)
-            self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
-
-    def settings(
-        self,
-        prefix: str,
-        kind: Callable[..., _Settings],
-        changes: Mapping[str, Any] | None = None,
-    ) -> _Settings:
-        """Return the dataclass filled from the parameters; ``changes`` override values."""
-        values = {}
-        for item in fields(kind):  # type: ignore[arg-type]
-            name = f'{prefix}{item.name}'
-            value = self._meant(name, (changes or {}).get(name, self._value(name)))
-            if isinstance(value, bool) and isinstance(item.default, str):
-                value = _READ_AS_BOOL[not value]
-            values[item.name] = value
-        return from_values(kind, values, prefix)
-
-    def _meant(self, name: str, value: Any) -> Any:
-        """Parse numbers that PyYAML reads as strings, such as 1e-3."""
-        if name in self._numbers and isinstance(value, str):
-            with suppress(ValueError):
-                return float(value)
-        return value
-
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
-
-    def text(
-        self,
-        name: str,
-        valid: tuple[str, ...] = (),
-        changes: Mapping[str, Any] | None = None,
-    ) -> str:
-        """Return a text parameter; ``changes`` override it, empty ``valid`` allows any value."""
-        value = (changes or {}).get(name, self._value(name))
-        if isinstance(value, bool):
-            value = _READ_AS_BOOL[not value]
-        if not isinstance(value, str) or (valid and value not in valid):
-            raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
-        return value
-
-    def configuration(self) -> str:
-        """Return all parameters as a ROS parameter file (YAML)."""
-        values = self.values()
-        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
-        return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
-
-    def values(self) -> dict[str, Any]:
-        """Return all parameters by name."""
-        values = {}
-        for name, parameter in sorted(self._parameters.items()):
-            value = parameter.value
-            if value is None or isinstance(value, (list, tuple, array)):
-                # rcl returns an empty list of a parameter file as None.
-                value = list(value or ())
-            if not name.startswith(('qos_overrides', 'start_type')):
-                values[name] = self._meant(name, value)
-        return values
-
-    def _is_valid(self) -> bool:
-        """Return whether all parameter overrides are declared."""
-        try:
-            self._check_overrides()
-        except ParameterError:
-            return False
-        return True
-
-    def _check_overrides(self) -> None:
-        known = sorted(self._parameters)
-        others = sorted(self.shared - set(known))
-        if others:
-            self.get_logger().warning(
-                f'shared parameters that this node does not declare: {", ".join(others)}'
-            )
-        unknown = sorted(set(self._parameter_overrides) - set(known) - self.shared)
-        if unknown:
-            count = len(self._parameter_overrides)
-            complaints = '; '.join(unknown_name(name, known) for name in unknown)
-            raise ParameterError(
-                f'{count - len(unknown)} of {count} given parameters are known: {complaints}'
-            )
-
-    def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
-        if not self._configured:
-            return SetParametersResult(successful=True)
-        # Unchanged values are accepted, so that a whole parameter file can be loaded again.
-        now = self.values()
-        parameters = [
-            one
-            for one in parameters
-            if not _same(self._meant(one.name, one.value), now.get(one.name))
-        ]
-        fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
-        if fixed:
-            return SetParametersResult(
-                successful=False,
-                reason=f'{", ".join(fixed)}: cannot change while configured; clean up the node '
-                'first',
-            )
-        try:
-            if parameters:
-                self.change({parameter.name: parameter.value for parameter in parameters})
-        except NeedleError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
 
     def _after_change(self, _parameters: list[Parameter]) -> None:
         if self._configured:

@@ -43,6 +43,10 @@ MAY_IMPORT = {
     },
     'tools': set(),
 }
+#: Largest number of lines of a file, and files with a reason for more.
+MOST_LINES = 500
+#: Compiled functions that call each other and share their arguments.
+LONGER = {'needle_controller/compiled/steering.py', 'needle_dynamics/compiled/cut.py'}
 #: Packages without nodes.
 NO_NODES = {'needle_study'}
 #: These packages may import any external package.
@@ -145,6 +149,12 @@ def repeated_classes(files: Mapping[str, str]) -> list[str]:
     return [f'{name}: {", ".join(paths)}' for name, paths in found.items() if len(paths) > 1]
 
 
+def long_files(files: Mapping[str, str]) -> list[str]:
+    """Return the files with too many lines, with their number of lines."""
+    counts = {path: len(source.splitlines()) for path, source in files.items()}
+    return [f'{path}: {count}' for path, count in counts.items() if count > MOST_LINES]
+
+
 def forbidden_words(path: str, content: str) -> list[str]:
     """Return the lines with a word that must not be published."""
     return [
@@ -198,6 +208,12 @@ def test_files_do_not_import_each_other_in_circles() -> None:
 def test_names_of_public_classes_are_unique() -> None:
     """A name of a class identifies it, in all packages."""
     assert repeated_classes(sources()) == []
+
+
+def test_files_are_short() -> None:
+    """One concept per file; an exception that is short enough again must be removed."""
+    found = long_files(sources())
+    assert {line.partition(':')[0] for line in found} == LONGER, '\n'.join(found)
 
 
 def test_no_file_mentions_a_forbidden_word() -> None:
@@ -308,3 +324,8 @@ def test_repeated_class_is_reported() -> None:
         'tools/a.py': 'class A:\n    pass\nclass B:\n    pass\nclass _C:\n    pass',
     }
     assert repeated_classes(files) == ['A: needle_ros/a.py, tools/a.py']
+
+
+def test_long_file_is_reported() -> None:
+    files = {'tools/a.py': '\n' * MOST_LINES, 'tools/b.py': '\n' * (MOST_LINES + 1)}
+    assert long_files(files) == [f'tools/b.py: {MOST_LINES + 1}']

@@ -144,6 +144,14 @@ class ObserverSettings:
             )
         object.__setattr__(self, 'cutoffs', cutoffs)
 
+    @property
+    def sensor_noise(self) -> dict[str, tuple[float, ...]]:
+        """Noise of the values of each sensor that the observer uses, by topic."""
+        return {
+            'base_wrench': (self.force_noise, self.torque_noise),
+            'tip_deflection': (self.tip_noise,),
+        }
+
     def noise(self) -> Noise:
         """Return the variances of the filter."""
         gain = _low_pass(self.cutoffs, self.filter_rate)[3]

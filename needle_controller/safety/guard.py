@@ -6,9 +6,21 @@ from typing import Final
 
 from needle_controller.controller import Measurement
 from needle_controller.safety.limits import SafetyLimits
+from needle_dynamics import euler_loads, NeedleParameters
 
 #: Readings in a row beyond a limit that violate it: a single one may be a sensor fault.
 _IN_A_ROW: Final = 2
+
+
+def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:
+    """Return a warning if a force [N] bends the part outside of the tissue, without a guide."""
+    most = euler_loads(parameters, max(depth, 0.0)).pinned
+    if force <= most:
+        return None
+    return (
+        f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the tissue: "
+        'without a guide it buckles; lower force_limit'
+    )
 
 
 class Guard:

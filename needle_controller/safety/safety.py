@@ -98,8 +98,6 @@ class Safety:
             )
         }  # fmt: skip
         self._expected = expected
-        self._back = round(settings.measurement_timeout * NANOSECONDS)
-        self._seen = 0
         #: Start of encoder measurements without a gap [ns]; 0: no /clock yet.
         self._begun: int | None = None
         self._stale: set[str] = set()
@@ -114,25 +112,12 @@ class Safety:
             Time [ns].
 
         """
-        self._seen, self._begun = now, now or None
+        self._begun = now or None
         self._stale.clear()
         for stream in self.streams.values():
             stream.forget()
             self.guard.forget(stream.name)
         self.guard.forget('reference')
-
-    def clock_went_back(self, now: int) -> float:
-        """
-        Return the step back of the clock since the last call [s], or zero.
-
-        Parameters
-        ----------
-        now : int
-            Time now [ns].
-
-        """
-        back, self._seen = self._seen - now, now
-        return back / NANOSECONDS if back > self._back else 0.0
 
     def latch(self, reason: str | None) -> bool:
         """

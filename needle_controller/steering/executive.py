@@ -14,6 +14,7 @@ from time import monotonic
 from typing import Final
 
 from needle_controller.safety.input_monitor import InputMonitor, Refusal
+from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw, NORMAL
 from needle_controller.steering.insertion import DESCRIPTIONS, InsertionStrategy
@@ -30,11 +31,10 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import ENTRY, INSERTION, JOINT_STATES, TARGET, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
-from needle_ros.event_log import EventLog, Severity
-from needle_ros.requests import RequestLog, RequestStatus, Verdict
+from needle_ros.event_log import Severity
+from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
-from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -48,7 +48,7 @@ _SAME: Final = 1e-6
 _SCATTERED: Final = 3.0
 
 
-class SteeringExecutive:
+class SteeringExecutive(StateMachine):
     """
     Execute a steered insertion, and stop it on any fault.
 
@@ -75,12 +75,6 @@ class SteeringExecutive:
 
     Attributes
     ----------
-    settings : ExecutiveSettings
-        As given.
-    events : EventLog
-        Lines for the log.
-    requests : RequestLog
-        Targets, and the answers to them.
     fault : str
         Reason of the stop, '' without a stop.
 
@@ -96,9 +90,8 @@ class SteeringExecutive:
         start: StartJob = ComputedJob,
         law: str = DEFAULT_LAW,
     ) -> None:
+        super().__init__(steady, {TARGET: (INSERTION,)})
         self.settings = settings
-        self.events = EventLog(steady)
-        self.requests = RequestLog({TARGET: (INSERTION,)}, ('', ENTRY), steady)
         timeout = settings.measurement_timeout
         self._joint_stream = InputMonitor(JOINT_STATES.name, timeout, jumps=_JUMPS)
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
@@ -108,8 +101,8 @@ class SteeringExecutive:
         self._motions = MotionControl(settings, self.events)
         #: The latest insertion.
         self._insertion: InsertionStrategy | None = None
-        #: Time of the last check, and stamp of the latest joint states [ns].
-        self._time = self._latest = 0
+        #: Stamp of the latest joint states [ns].
+        self._latest = 0
 
     @property
     def phase(self) -> Phase:
@@ -170,10 +163,7 @@ class SteeringExecutive:
             Motion to send.
 
         """
-        known = self.requests.check(TARGET, stamp, now, frame, (INSERTION,))
-        if known is not None:
-            if known.verdict is Verdict.REJECTED:
-                self.events.reject(f'target rejected: {known.reason}')
+        if not self._is_new(TARGET, stamp, frame, now):
             return None
         try:
             if not np.isfinite(point).all():
@@ -183,17 +173,11 @@ class SteeringExecutive:
             else:
                 self._plan(stamp, point, now)
         except NeedleError as error:
-            self._reject(stamp, error)
+            self._reject(TARGET, stamp, str(error))
             return None
-        if self.phase is not Phase.PLANNING:
-            self.requests.answer(TARGET, stamp, Verdict.ACCEPTED, joints=(INSERTION,))
-            return None
-        self.requests.answer(TARGET, stamp, Verdict.RECEIVED, joints=(INSERTION,))
-        return self._begin_if_planned(now)
-
-    def _reject(self, stamp: int, error: NeedleError) -> None:
-        self.events.reject(f'target rejected: {error}')
-        self.requests.answer(TARGET, stamp, Verdict.REJECTED, str(error))
+        planning = self.phase is Phase.PLANNING
+        self._accept(TARGET, stamp, Verdict.RECEIVED if planning else Verdict.ACCEPTED)
+        return self._begin_if_planned(now) if planning else None
 
     def _aim(self, point: tuple[float, float, float]) -> None:
         depth = self.depth
@@ -247,9 +231,9 @@ class SteeringExecutive:
             if len(moved):
                 raise JobError(f'{settings.joints[moved[0]]} has moved during planning')
         except NeedleError as error:
-            self._reject(stamp, error)
+            self._reject(TARGET, stamp, str(error))
             return None
-        self.requests.answer(TARGET, stamp, Verdict.ACCEPTED, joints=(INSERTION,))
+        self._accept(TARGET, stamp)
         guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
         strategy = ContinuousInsertion if settings.continuous else SteppedInsertion
         self._insertion, self.fault = strategy(guarded, motions, settings), ''
@@ -331,9 +315,7 @@ class SteeringExecutive:
             )
             return None
         at = [found[name] for name in joints]
-        refusal = self._joint_stream.check(reading.stamp, now, values=at)
-        if refusal is not None:
-            self._refuse(self._joint_stream, refusal)
+        if not self._is_valid(self._joint_stream, reading, at, now):
             return None
         motions, stamp = self._motions, reading.stamp
         motions.at = np.array(at)
@@ -381,15 +363,12 @@ class SteeringExecutive:
 
         """
         tip = reading.values[0]
-        refusal = self._tip_stream.check(reading.stamp, now, reading.frame, tip)
-        if refusal is not None:
-            self._refuse(self._tip_stream, refusal)
+        if not self._is_valid(self._tip_stream, reading, tip, now):
             return None
         return self._run(lambda insertion: insertion.tip(reading.stamp, tip, now), now)
 
-    def _refuse(self, stream: InputMonitor, refusal: Refusal) -> None:
-        if not refusal.harmless:
-            self.events.reject(f'{stream.name} refused: {refusal.line}')
+    def _report(self, stream: InputMonitor, refusal: Refusal) -> None:
+        self.events.reject(f'{stream.name} refused: {refusal.line}')
 
     def watch(self, now: int) -> JointMotion | None:
         """
@@ -402,8 +381,8 @@ class SteeringExecutive:
 
         """
         timeout = self.settings.measurement_timeout
-        back, self._time = (self._time - now) / NANOSECONDS, now
-        if back > timeout:
+        back = self.clock_went_back(now, self._joint_stream.timeout)
+        if back:
             for stream in self._streams:
                 stream.forget()
             self._motions.restart()

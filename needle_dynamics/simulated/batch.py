@@ -13,11 +13,12 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.step import CompiledNeedle, run
-from needle_dynamics.model import NeedleModel, ROUNDING
+from needle_dynamics.model import NeedleModel
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import count_of, floats
+from needle_dynamics.statics import ROUNDING
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike

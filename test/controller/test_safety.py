@@ -275,13 +275,6 @@ def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
     assert whole.clear(later) is None
 
 
-def test_clock_set_back_is_detected() -> None:
-    """By more than the timeout of 0.1 s; forward steps and pauses of the clock are no fault."""
-    whole = safety()
-    steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
-    assert [whole.clock_went_back(round(t * SECOND)) for t in steps] == [0, 0, 0, 0, 0, 48.95, 0]
-
-
 def test_duplicate_publishers_of_commands_are_reported() -> None:
     """Each topic with more than one publisher, until there is one again."""
     whole = safety()

@@ -15,8 +15,8 @@ from needle_controller import (
     Measurement,
     ObserverSettings,
     SafetyLimits,
-    Supervisor,
 )
+from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.trajectories import MOST_POINTS
@@ -490,3 +490,11 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
         loop.measure()
     assert loop.supervisor.controller is not None
     assert loop.supervisor.controller.target == 0.01
+
+
+def test_clock_set_back_is_detected() -> None:
+    """By more than the timeout of 0.1 s; forward steps and pauses of the clock are no fault."""
+    supervisor, timeout = Supervisor(), SECOND // 10
+    steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
+    found = [supervisor.clock_went_back(round(t * SECOND), timeout) for t in steps]
+    assert found == [0, 0, 0, 0, 0, 48.95, 0]

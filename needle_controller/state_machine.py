@@ -1,0 +1,66 @@
+"""Base of the state machines: event log, request log, clock, and checks of the inputs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+
+from needle_controller.safety.input_monitor import InputMonitor, Refusal
+from needle_ros.contract import ENTRY, INSERTION, Topic
+from needle_ros.event_log import EventLog
+from needle_ros.requests import RequestLog, Verdict
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+
+
+class StateMachine(ABC):
+    """
+    Events, requests, clock and inputs of the axial supervisor and the steering executive.
+
+    `steady` is as for `EventLog`, `takes` as for `RequestLog`.
+    """
+
+    def __init__(self, steady: Callable[[], float], takes: Mapping[Topic, Sequence[str]]) -> None:
+        self._steady = steady
+        self.events = EventLog(steady)
+        #: Time of the last event [ns].
+        self._time = 0
+        self._take_requests(takes)
+
+    def _take_requests(self, takes: Mapping[Topic, Sequence[str]]) -> None:
+        """Set which requests are accepted."""
+        self.requests = RequestLog(takes, ('', ENTRY), self._steady)
+
+    def _is_new(self, topic: Topic, stamp: int, frame: str, now: int) -> bool:
+        """Return whether a request must be executed; log why it is rejected."""
+        known = self.requests.check(topic, stamp, now, frame, (INSERTION,))
+        if known is not None and known.verdict is Verdict.REJECTED:
+            self.events.reject(f'{topic.name} rejected: {known.reason}')
+        return known is None
+
+    def _accept(self, topic: Topic, stamp: int, verdict: Verdict = Verdict.ACCEPTED) -> None:
+        """Acknowledge a request."""
+        self.requests.answer(topic, stamp, verdict, joints=(INSERTION,))
+
+    def _reject(self, topic: Topic, stamp: int, reason: str) -> None:
+        """Log and answer that a request is rejected."""
+        self.events.reject(f'{topic.name} rejected: {reason}')
+        self.requests.answer(topic, stamp, Verdict.REJECTED, reason)
+
+    def clock_went_back(self, now: int, tolerance: int) -> float:
+        """Return the step back of the clock since the last call [s], or 0; `tolerance` in ns."""
+        back, self._time = self._time - now, now
+        return back / NANOSECONDS if back > tolerance else 0.0
+
+    def _is_valid(
+        self, stream: InputMonitor, reading: Reading, values: Sequence[float], now: int
+    ) -> bool:
+        """Return whether a measurement is valid; report the reason if not."""
+        refusal = stream.check(reading.stamp, now, reading.frame, values)
+        if refusal is not None and not refusal.harmless:
+            self._report(stream, refusal)
+        return refusal is None
+
+    @abstractmethod
+    def _report(self, stream: InputMonitor, refusal: Refusal) -> None:
+        """Log that a measurement is refused."""

@@ -1,0 +1,104 @@
+"""Visualization messages of the node `plant`: shape, path, poses and transform."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamped, Vector3
+from needle_dynamics.simulated.measured import MeasuredShape, SimulatedPlant
+from needle_ros import contract
+from needle_ros.base_node import BaseNode
+from needle_ros.errors import MessageError, ParameterError
+from needle_ros.timing import NANOSECONDS
+from rclpy.publisher import Publisher
+from visualization_msgs.msg import Marker
+
+#: Line widths of needle and path [m].
+_WIDTH: Final = 1e-3
+_PATH_WIDTH: Final = 5e-4
+
+
+def time_message(stamp: int) -> TimeMessage:
+    """Convert a stamp [ns] to a message."""
+    return TimeMessage(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
+
+
+def _line(name: str, width: float, shade: float) -> Marker:
+    """Return a line marker in the frame of the entry point."""
+    line = Marker(ns=name, type=Marker.LINE_STRIP)
+    line.header.frame_id = contract.ENTRY
+    line.pose.orientation.w = 1.0
+    line.scale.x = width
+    line.color.r = line.color.g = line.color.b = shade
+    line.color.a = 1.0
+    return line
+
+
+def _transform(seen: MeasuredShape, stamp: int) -> TransformStamped:
+    """Return the transform from the base to the tip."""
+    (x, y, z), (i, j, k, w) = seen.tip
+    made = TransformStamped(child_frame_id=contract.TIP)
+    made.header.frame_id, made.header.stamp = contract.BASE, time_message(stamp)
+    made.transform.translation = Vector3(x=x, y=y, z=z)
+    made.transform.rotation = Quaternion(x=i, y=j, z=k, w=w)
+    return made
+
+
+class PlantDisplay:
+    """Publishers of the needle shape for displays, on `needle_shape`, `needle_poses` and `/tf`."""
+
+    def __init__(self, node: BaseNode) -> None:
+        self._node = node
+        self._needle_shape = node.publisher(contract.NEEDLE_SHAPE)
+        self._needle_poses = node.publisher(contract.NEEDLE_POSES)
+        self._tf: Publisher | None = None
+        self._shape = _line('needle', _WIDTH, 0.8)
+        self._path = _line('path', _PATH_WIDTH, 0.4)
+        self._poses = PoseArray()
+        self._poses.header.frame_id = contract.ENTRY
+
+    def offer_transform(self, mode: str) -> None:
+        """Create the publisher of transforms, or raise ParameterError if that is not possible."""
+        try:
+            if mode == 'indenter':
+                raise MessageError('there is no needle in mode indenter')
+            self._tf = self._node.publisher(contract.TF)
+        except MessageError as error:
+            raise ParameterError(f'publish_tf must be false: {error}') from error
+
+    def cleanup(self) -> None:
+        """Destroy the publisher of transforms."""
+        if self._tf is not None:
+            self._node.destroy_publisher(self._tf)
+            self._tf = None
+
+    def publish(self, plant: SimulatedPlant, stamp: int) -> None:
+        """Publish the shape of the needle from base to tip, and the path that it cut."""
+        lines = self._needle_shape.get_subscription_count()
+        poses = self._needle_poses.get_subscription_count()
+        wanted = lines or poses or self._tf is not None
+        seen = plant.outline() if wanted else None
+        if seen is None:
+            return
+        if self._tf is not None:
+            kind: Any = self._tf.msg_type
+            self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
+        if lines:
+            self._publish_line(self._shape, [seen.base.tolist(), *seen.points.tolist()], stamp)
+            if len(seen.path):
+                self._publish_line(self._path, seen.path.tolist(), stamp)
+        if poses:
+            self._poses.header.stamp = time_message(stamp)
+            self._poses.poses = [
+                Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
+                for (x, y, z), (i, j, k, w) in zip(
+                    seen.points.tolist(), seen.turns.tolist(), strict=True
+                )
+            ]
+            self._needle_poses.publish(self._poses)
+
+    def _publish_line(self, line: Marker, points: list[list[float]], stamp: int) -> None:
+        line.header.stamp = time_message(stamp)
+        line.points = [Point(x=x, y=y, z=z) for x, y, z in points]
+        self._needle_shape.publish(line)

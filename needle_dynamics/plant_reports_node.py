@@ -1,0 +1,75 @@
+"""Reports of other nodes on processed and recorded samples, for the clock of the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from needle_ros import contract
+from needle_ros.base_node import BaseNode, profile
+from needle_ros.sample_clock import SampleClock
+from needle_ros.timing import nanoseconds
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header
+
+
+class SampleReports:
+    """Pass the reports to a clock; `advance` takes the samples that are due afterwards."""
+
+    def __init__(self, node: BaseNode, advance: Callable[[], None]) -> None:
+        self._node, self._advance = node, advance
+        self._subscriptions: list[Subscription] = []
+
+    def configure(self, clock: SampleClock, *, processed: bool, recorded: bool) -> None:
+        """Subscribe to the reports of processed samples, of recorded samples, or both."""
+        self._clock = clock
+        if processed:
+            self._hear(contract.PROCESSED, self._on_processed, self._on_participant)
+        if recorded:
+            self._hear(contract.RECORDED, self._on_recorded, self._on_recorder)
+
+    def cleanup(self) -> None:
+        """Unsubscribe."""
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []
+
+    def _hear(
+        self, topic: contract.Topic, take: Callable[[Header], None], matched: Callable[[Any], None]
+    ) -> None:
+        events = SubscriptionEventCallbacks(matched=matched)
+        self._subscriptions.append(
+            self._node.create_subscription(
+                Header, topic.name, take, profile(topic.qos), event_callbacks=events
+            )
+        )
+
+    def _on_processed(self, message: Header) -> None:
+        """Record that a node has processed a sample."""
+        if self._node.is_active:
+            self._clock.answered(nanoseconds(message.stamp), message.frame_id)
+            self._advance()
+
+    def _on_participant(self, event: Any) -> None:
+        """Count the nodes for which each sample waits."""
+        self._clock.participants = event.current_count
+        self._node.publish_diagnostics()
+
+    def _on_recorded(self, message: Header) -> None:
+        """Record the newest sample of a recorder."""
+        recorded, stamp = self._clock.recorded, nanoseconds(message.stamp)
+        before = len(recorded)
+        recorded[message.frame_id] = stamp
+        if not stamp:
+            # A zero stamp marks the end of the recording.
+            del recorded[message.frame_id]
+        if len(recorded) != before:
+            self._node.publish_diagnostics()
+        if self._node.is_active:
+            self._advance()
+
+    def _on_recorder(self, event: Any) -> None:
+        """Discard the recorder list when a recorder disappears; the others report again."""
+        if event.current_count_change < 0:
+            self._clock.recorded.clear()

@@ -1,0 +1,113 @@
+"""Publishers of the node `plant` for its samples and events, with injected sensor faults."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+import json
+from math import ceil
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from needle_dynamics.plant_display_node import time_message
+from needle_dynamics.simulated.faults import FAULTY, SensorFault
+from needle_dynamics.simulated.measured import Measurement
+from needle_dynamics.simulated.run import Event, PlantRun
+from needle_ros import contract
+from needle_ros.base_node import BaseNode
+from needle_ros.timing import NANOSECONDS
+from rclpy.publisher import Publisher
+
+
+class SamplePublishers:
+    """Publishers of all measurements, with the fault of one of them, and of the events."""
+
+    def __init__(self, node: BaseNode) -> None:
+        streams = (
+            contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION,
+            contract.GROUND_TRUTH, contract.END_EFFECTOR_POSE,
+        )  # fmt: skip
+        self._streams = {topic.name: node.publisher(topic) for topic in streams}
+        self._events = node.publisher(contract.EVENTS)
+        self._name = node.get_fully_qualified_name()
+        #: Publish functions for the values of a sample, by topic.
+        self._publish: dict[str, Callable[[int, list[float]], None]] = {}
+        #: Fault, and topic of the sensor with the fault.
+        self.fault: SensorFault | None = None
+        self.faulty = ''
+        self.saturated = 0
+
+    def configure(self, plant_run: PlantRun) -> None:
+        """Publish the measurements of a plant."""
+        constants = plant_run.constants
+        rate = constants.own.rate
+        self._publish = {
+            name: partial(_write, self._streams[name], topic.template().serialize)
+            for name, topic in plant_run.topics.items()
+        }
+        limits = constants.sensor.per_axis('range').tolist()
+        # Rounding to counts may leave a saturated reading just below the limit.
+        self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
+        self._period = NANOSECONDS / rate
+        #: Stamps of the latest samples, for measurements that are published with a delay.
+        self._stamps: deque[int] = deque(maxlen=ceil(constants.tip.delay * rate) + 1)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of the published topics."""
+        return tuple(self._publish)
+
+    def begin(self) -> None:
+        """Restart the count of saturated values of the force sensor."""
+        self.saturated = 0
+
+    def publish(self, stamp: int, measured: list[Measurement]) -> None:
+        """Publish a sample."""
+        for value, limit in zip(measured[0][2], self._full_scale, strict=True):
+            if abs(value) >= limit:
+                self.saturated += 1
+        self._last = stamp, measured[-1]
+        fault, faulty, publish = self.fault, self.faulty, self._publish
+        stamps = self._stamps
+        stamps.append(stamp)
+        for topic, age, values in measured:
+            # Own stamp, even after a time jump: samples are skipped after a stall.
+            at = stamps[-1 - age] if age < len(stamps) else stamp - round(age * self._period)
+            if fault is None or topic != faulty:
+                publish[topic](at, values)
+            else:
+                for late, left in fault.leaves(at, values, FAULTY[topic]):
+                    publish[topic](late, left)
+
+    @property
+    def newest(self) -> int:
+        """Stamp of the newest sample [ns]."""
+        return self._last[0]
+
+    def repeat(self) -> None:
+        """Publish the newest `joint_states` again."""
+        stamp, (topic, _, values) = self._last
+        self._publish[topic](stamp, values)
+
+    def publish_events(self, events: list[Event], stamp: int, number: int) -> None:
+        """Publish events with the number of the first sample that they affect."""
+        array = DiagnosticArray()
+        array.header.stamp = time_message(stamp)
+        for kind, content in events:
+            values = {'sample': number, **content}
+            array.status.append(
+                DiagnosticStatus(
+                    name=self._name,
+                    message=kind,
+                    values=[
+                        KeyValue(key=key, value=json.dumps(value)) for key, value in values.items()
+                    ],
+                )
+            )
+        self._events.publish(array)
+
+
+def _write(
+    publisher: Publisher, serialize: Callable[..., bytes], stamp: int, values: list[float]
+) -> None:
+    publisher.publish(serialize(stamp, *values))

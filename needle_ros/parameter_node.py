@@ -1,0 +1,208 @@
+"""
+Parameters of a node: fields of frozen dataclasses.
+
+`constant` gives each field a unit, a description and a range, and the constructor of the dataclass
+checks them. An invalid parameter file therefore fails the `configure` transition, with a one-line
+error that names the parameter.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, ClassVar, TypeVar
+
+from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.settings import from_values, unknown_name
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.lifecycle import LifecycleNode
+from rclpy.parameter import Parameter
+import yaml
+
+#: Strings that rcl parses as booleans in a parameter file.
+_READ_AS_BOOL = ('y', 'n')
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+    """Quotes strings that rcl would parse as booleans and PyYAML would not."""
+
+
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar(
+        'tag:yaml.org,2002:str', text, style="'" if text.lower() in _READ_AS_BOOL else None
+    ),
+)
+
+_Settings = TypeVar('_Settings')
+
+
+def _same(new: Any, old: Any) -> bool:
+    """Return whether a parameter keeps its value."""
+    if isinstance(new, (list, tuple, array)):
+        new = list(new)
+    return bool(new == old)
+
+
+class ParameterNode(LifecycleNode):
+    """
+    Lifecycle node with parameters from dataclasses.
+
+    Attributes
+    ----------
+    shared : frozenset of str
+        Names of parameters that a file sets for several nodes; names that this node does not
+        declare are not an error.
+
+    """
+
+    #: Names of the parameters that may change in the configured node.
+    LIVE: ClassVar[frozenset[str]] = frozenset()
+
+    def __init__(self, name: str, **node_options: Any) -> None:
+        super().__init__(name, **node_options)
+        #: Names of numeric parameters.
+        self._numbers: set[str] = set()
+        self.shared: frozenset[str] = frozenset()
+        self._configured = False
+        self.add_on_set_parameters_callback(self._check_change)
+
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
+
+    def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
+        """Declare a parameter that is not a number."""
+        # YAML 1.1 parses y as true; `text` converts it back.
+        dynamic = default in _READ_AS_BOOL
+        descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
+        self.declare_parameter(name, default, descriptor)
+
+    def declare_settings(self, prefix: str, defaults: object, names: Collection[str] = ()) -> None:
+        """Declare one parameter per dataclass field; without ``names`` for all fields."""
+        for item in fields(defaults):  # type: ignore[arg-type]
+            if names and item.name not in names:
+                continue
+            meta = item.metadata
+            unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
+            descriptor = ParameterDescriptor(
+                description=f'{meta.get("description", item.name)}{unit}',
+                # Integers are accepted for floats; the dataclass checks the value.
+                dynamic_typing=True,
+            )
+            if 'low' in meta:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
+                ]
+            if 'unit' in meta:
+                self._numbers.add(prefix + item.name)
+            default = getattr(defaults, item.name)
+            if isinstance(default, tuple):
+                default = list(default)
+            self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
+
+    def settings(
+        self,
+        prefix: str,
+        kind: Callable[..., _Settings],
+        changes: Mapping[str, Any] | None = None,
+    ) -> _Settings:
+        """Return the dataclass filled from the parameters; ``changes`` override values."""
+        values = {}
+        for item in fields(kind):  # type: ignore[arg-type]
+            name = f'{prefix}{item.name}'
+            value = self._meant(name, (changes or {}).get(name, self._value(name)))
+            if isinstance(value, bool) and isinstance(item.default, str):
+                value = _READ_AS_BOOL[not value]
+            values[item.name] = value
+        return from_values(kind, values, prefix)
+
+    def _meant(self, name: str, value: Any) -> Any:
+        """Parse numbers that PyYAML reads as strings, such as 1e-3."""
+        if name in self._numbers and isinstance(value, str):
+            with suppress(ValueError):
+                return float(value)
+        return value
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def text(
+        self,
+        name: str,
+        valid: tuple[str, ...] = (),
+        changes: Mapping[str, Any] | None = None,
+    ) -> str:
+        """Return a text parameter; ``changes`` override it, empty ``valid`` allows any value."""
+        value = (changes or {}).get(name, self._value(name))
+        if isinstance(value, bool):
+            value = _READ_AS_BOOL[not value]
+        if not isinstance(value, str) or (valid and value not in valid):
+            raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
+        return value
+
+    def configuration(self) -> str:
+        """Return all parameters as a ROS parameter file (YAML)."""
+        values = self.values()
+        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
+        return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
+
+    def values(self) -> dict[str, Any]:
+        """Return all parameters by name."""
+        values = {}
+        for name, parameter in sorted(self._parameters.items()):
+            value = parameter.value
+            if value is None or isinstance(value, (list, tuple, array)):
+                # rcl returns an empty list of a parameter file as None.
+                value = list(value or ())
+            if not name.startswith(('qos_overrides', 'start_type')):
+                values[name] = self._meant(name, value)
+        return values
+
+    def _is_valid(self) -> bool:
+        """Return whether all parameter overrides are declared."""
+        try:
+            self._check_overrides()
+        except ParameterError:
+            return False
+        return True
+
+    def _check_overrides(self) -> None:
+        known = sorted(self._parameters)
+        others = sorted(self.shared - set(known))
+        if others:
+            self.get_logger().warning(
+                f'shared parameters that this node does not declare: {", ".join(others)}'
+            )
+        unknown = sorted(set(self._parameter_overrides) - set(known) - self.shared)
+        if unknown:
+            count = len(self._parameter_overrides)
+            complaints = '; '.join(unknown_name(name, known) for name in unknown)
+            raise ParameterError(
+                f'{count - len(unknown)} of {count} given parameters are known: {complaints}'
+            )
+
+    def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
+        if not self._configured:
+            return SetParametersResult(successful=True)
+        # Unchanged values are accepted, so that a whole parameter file can be loaded again.
+        now = self.values()
+        parameters = [
+            one
+            for one in parameters
+            if not _same(self._meant(one.name, one.value), now.get(one.name))
+        ]
+        fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
+        if fixed:
+            return SetParametersResult(
+                successful=False,
+                reason=f'{", ".join(fixed)}: cannot change while configured; clean up the node '
+                'first',
+            )
+        try:
+            if parameters:
+                self.change({parameter.name: parameter.value for parameter in parameters})
+        except NeedleError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
