@@ -19,6 +19,7 @@ from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw,
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
+from needle_controller.steering.limits import SIMULATION_LIMITS
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import drawn
@@ -28,9 +29,11 @@ from needle_ros.process_pool import processes
 import numpy as np
 from scipy.optimize import lsq_linear
 
-#: Steps [m], limit of the guide [m], depths of targets [steps], and their distance from the axis
-#: [m].
-STEP, LIMIT, DEPTHS, ASIDE = 5e-3, 6e-3, (12, 24), 6e-3
+#: Steps [m], depths of targets [steps], and their distance from the axis [m].
+STEP, DEPTHS, ASIDE = 5e-3, (12, 24), 6e-3
+
+#: Limits of the laws: 6 mm for the position of the guide.
+LIMITS: Final = SIMULATION_LIMITS
 
 #: Free length [m], and stiffness of the skin over the stiffness of the tissue [m].
 FREE, SKIN = 0.04, 0.02
@@ -245,13 +248,13 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     alone = one.known()
     causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
     drift = alone.causes[0, -1, :4] @ causes
-    could = LIMIT * np.abs(alone.guide[0, -1]).sum()
+    could = LIMITS.guide_limit * np.abs(alone.guide[0, -1]).sum()
     ends: dict[str, End] = {}
     warned = held = refused = False
     look = inf
     model = _model(medium, len(depths) - 1, sensor, spread)
     try:
-        ours = MultiHypothesisLaw(model, target, LIMIT)
+        ours = MultiHypothesisLaw(model, target, LIMITS)
     except OutOfReachError:
         refused = True
     else:
@@ -260,11 +263,11 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
         off = tip - there.mean
         warned, look = bool(one.said), one.look
         held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
-        ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMIT))[1]
+        ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMITS))[1]
     others: Mapping[str, SteeringLaw] = {
-        'springs': SpringsLaw(model, target, LIMIT),
-        'Broyden': BroydenLaw(model, target, LIMIT),
-        'open loop': OpenLoopLaw(model, target, LIMIT),
+        'springs': SpringsLaw(model, target, LIMITS),
+        'Broyden': BroydenLaw(model, target, LIMITS),
+        'open loop': OpenLoopLaw(model, target, LIMITS),
     }
     ends |= {name: one.end(law)[1] for name, law in others.items()}
     reachable = bool((np.abs(target - drift) <= could).all())
@@ -284,13 +287,14 @@ def turn(seed: int) -> SteeringOutcome:
     drift = alone.causes[0, -1, :3] @ causes
     model = _model(medium, len(depths) - 1, sensor, spread, BEVEL)
     laws: dict[str, SteeringLaw] = {
-        TURNING[2]: RollToTargetLaw(model, one.target, turns=len(depths)),
-        TURNING[3]: OpenLoopLaw(model, one.target),
+        TURNING[2]: RollToTargetLaw(model, one.target, replace(LIMITS, turns=len(depths))),
+        TURNING[3]: OpenLoopLaw(model, one.target, LIMITS),
     }
+    turned = replace(LIMITS, turns=TURNS)
     refused = False
     try:
-        laws[TURNING[0]] = MultiHypothesisLaw(model, one.target, LIMIT, TURNS)
-        laws[TURNING[1]] = MultiHypothesisLaw(model, one.target, 0.0, TURNS)
+        laws[TURNING[0]] = MultiHypothesisLaw(model, one.target, turned)
+        laws[TURNING[1]] = MultiHypothesisLaw(model, one.target, replace(turned, guide_limit=0.0))
     except OutOfReachError:
         refused = True
     ends = {name: one.end(law)[1] for name, law in laws.items()}
@@ -379,10 +383,11 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             rows,
             f'{needles} needles of each case, evenly of four media, seeds 0 to {needles - 1}; '
             f'targets within {1e3 * ASIDE:g} mm of the axis, {1e3 * STEP * DEPTHS[0]:g} to '
-            f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within {1e3 * LIMIT:g} mm, steps of '
-            f'{1e3 * STEP:g} mm. Statistics: targets that are reachable with all '
-            'parameters known except the path, and that ours did not reject. Way, turns and load '
-            'are means, of the load the mean of the largest value of each insertion.',
+            f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within '
+            f'{1e3 * LIMITS.guide_limit:g} mm, steps of {1e3 * STEP:g} mm. Statistics: targets '
+            'that are reachable with all parameters known except the path, and that ours did not '
+            'reject. Way, turns and load are means, of the load the mean of the largest value of '
+            'each insertion.',
         ),
         PageSection(
             'Ours',

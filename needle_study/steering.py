@@ -8,7 +8,13 @@ from functools import cached_property
 from math import nan
 from typing import Any, Final
 
-from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller import (
+    OutOfReachError,
+    SIMULATION_LIMITS,
+    SteeringLimits,
+    SteeringModel,
+    SteeringPrior,
+)
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
@@ -29,7 +35,7 @@ from needle_dynamics import (
 from needle_dynamics.steering.parameters import with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
 from needle_study.reading import check_names, mapping, one_of
 from needle_study.scenario import MeasuredRun, Metric, Variable
@@ -81,22 +87,11 @@ FIGURES: Final[Mapping[str, Metric]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringStudy:
-    """Settings of the scenario that are the same for all samples."""
+class SteeringStudy(SteeringLimits):
+    """Settings of the scenario that are the same for all samples; its limits are of the law."""
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
     step: float = constant(5e-3, 'm', 'depth between two tip measurements', open_low=True)
-    guide_limit: float = constant(6e-3, 'm', 'largest displacement of the guide')
-    guide_step: float = constant(1.0, 'm', 'largest motion of the guide in a step', open_low=True)
-    load_limit: float = constant(
-        1e3, 'N', 'largest planned lateral force on the guide', open_low=True
-    )
-    turns: float = constant(0.0, '1', 'largest number of needle rotations')
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.turns != int(self.turns):
-            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
 
 
 class SteeringProtocol:
@@ -113,7 +108,9 @@ class SteeringProtocol:
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
         given = {name: value for name, value in settings.items() if name not in _PARTS}
-        self._numbers = numbers = from_values(SteeringStudy, given, 'settings.')
+        self._numbers = numbers = from_values(
+            SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
+        )
         preset = settings.get('needle', 'bending_35mm')
         needle, steering, _ = STEERING_PRESETS[
             one_of('settings: needle', preset, STEERING_PRESETS)
@@ -327,13 +324,4 @@ class SteeringProtocol:
 
     def _made(self, target: tuple[float, float]) -> SteeringLaw:
         """Return the law of a target."""
-        numbers = self._numbers
-        return build_law(
-            self._law,
-            self._model,
-            target,
-            position_limit=numbers.guide_limit,
-            turns=int(numbers.turns),
-            load_limit=numbers.load_limit,
-            step_limit=numbers.guide_step,
-        )
+        return build_law(self._law, self._model, target, self._numbers)

@@ -157,7 +157,7 @@ class GuardedLaw:
                 f'{1e3 * to.z:.3f} mm and a roll of {to.roll:.3f} rad; the limit is '
                 f'{1e3 * settings.guide_limit:g} mm'
             )
-        widest = settings.farthest(float(np.diff(self.depths).max())) + _ROUNDING
+        widest = settings.limits(float(np.diff(self.depths).max())).guide_step + _ROUNDING
         change = max(abs(to.x - self._setpoint.x), abs(to.z - self._setpoint.z))
         if change > widest:
             raise SteeringFaultError(

@@ -136,11 +136,8 @@ class InsertionPlanner:
                 self._law,
                 model,
                 (point[0], point[2]),
-                position_limit=settings.guide_limit,
-                turns=settings.turns,
-                load_limit=settings.load_limit,
+                settings.limits(float(point[1] - depths[0]) / steps),
                 roll=float(at[3]) if settings.turns else 0.0,
-                step_limit=settings.farthest(float(point[1] - depths[0]) / steps),
             )
 
         self.request, self.job = request, self._start(work)

@@ -6,12 +6,17 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 import json
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 import sys
 from typing import Any, Final, NamedTuple
 
-from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller import (
+    OutOfReachError,
+    SIMULATION_LIMITS,
+    SteeringModel,
+    SteeringPrior,
+)
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
@@ -40,8 +45,8 @@ from needle_ros.files import write_whole
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-#: Default target [m], step [m] and limit of the guide [m].
-TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
+#: Default target [m] and step [m].
+TARGET, STEP = '0.004,0.1,-0.002', 5e-3
 
 #: Constants of needle and tissue with an effect here; unknown disturbances are in the prior.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
@@ -105,17 +110,21 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--limit',
         type=float,
-        default=LIMIT,
+        default=SIMULATION_LIMITS.guide_limit,
         metavar='M',
-        help=f'largest displacement of the guide along x and z (default {LIMIT:g} m)',
+        help='largest displacement of the guide along x and z '
+        f'(default {SIMULATION_LIMITS.guide_limit:g} m)',
     )
     parser.add_argument(
-        '--turns', type=int, default=0, help='largest number of needle rotations (default 0)'
+        '--turns',
+        type=int,
+        default=SIMULATION_LIMITS.turns,
+        help='largest number of needle rotations (default 0)',
     )
     parser.add_argument(
         '--load-limit',
         type=float,
-        default=inf,
+        default=SIMULATION_LIMITS.load_limit,
         metavar='N',
         help='largest planned lateral force on the guide (default: no limit)',
     )
@@ -209,9 +218,12 @@ def _run(options: argparse.Namespace) -> int:
             options.law,
             model,
             aim,
-            position_limit=options.limit,
-            turns=options.turns,
-            load_limit=options.load_limit,
+            replace(
+                SIMULATION_LIMITS,
+                guide_limit=options.limit,
+                turns=options.turns,
+                load_limit=options.load_limit,
+            ),
         )
     except OutOfReachError as error:
         if options.output is not None:

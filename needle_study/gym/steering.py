@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Final
 
 import gymnasium
 from gymnasium import spaces
-from needle_controller import SteeringPrior
+from needle_controller import SIMULATION_LIMITS, SteeringPrior
 from needle_controller.steering.simulation import drawn, GroundTruth
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
 from needle_ros.errors import ParameterError
@@ -52,7 +52,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         *,
         depth: float = 0.1,
         step: float = 5e-3,
-        guide_limit: float = 6e-3,
+        guide_limit: float = SIMULATION_LIMITS.guide_limit,
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
     ) -> None:

@@ -6,7 +6,13 @@ from dataclasses import replace
 from math import inf, sqrt, tau
 from typing import Any
 
-from needle_controller import GuideSetpoint, MultiHypothesisLaw, SteeringModel, SteeringPrior
+from needle_controller import (
+    GuideSetpoint,
+    MultiHypothesisLaw,
+    SteeringLimits,
+    SteeringModel,
+    SteeringPrior,
+)
 from needle_controller.steering.simulation import drawn, insert
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
@@ -31,15 +37,13 @@ class Plain:
         self,
         model: SteeringModel,
         target: FloatArray,
-        limit: float,
-        turns: int,
-        load_limit: float,
-        step_limit: float,
+        limits: SteeringLimits,
     ) -> None:
+        limit = limits.guide_limit
         self.model, self.goal, self.limit = model, complex(*target), limit
-        self.turns, self.load_limit, self.roll, self.step = turns, load_limit, 0.0, 0
+        self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0
         n, m = model.steps, len(model.prior_covariance)
-        self.ways = np.minimum(step_limit * np.arange(1, n + 1), 2.0 * limit)
+        self.ways = np.minimum(limits.guide_step * np.arange(1, n + 1), 2.0 * limit)
         self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
         self.mean = np.zeros((len(model.lengths), m), complex)
         self.mean[:, 3] = 1j * model.push
@@ -185,20 +189,19 @@ class Plain:
 
 
 @pytest.mark.parametrize(
-    ('limit', 'turns', 'load_limit', 'step_limit'),
+    'limits',
     [
-        (6e-3, 0, inf, inf),
-        (6e-3, 0, inf, 2e-3),
-        (6e-3, 0, 2.0, inf),
-        (6e-3, 3, 1e3, 3e-3),
-        (0.0, 4, inf, inf),
+        SteeringLimits(guide_step=inf, load_limit=inf),
+        SteeringLimits(load_limit=inf),
+        SteeringLimits(guide_step=inf, load_limit=2.0),
+        SteeringLimits(turns=3, load_limit=1e3, guide_step=3e-3),
+        SteeringLimits(guide_limit=0.0, turns=4, guide_step=inf, load_limit=inf),
     ],
+    ids=str,
 )
-def test_a_hundred_insertions_equal_the_plain_formulas(
-    limit: float, turns: int, load_limit: float, step_limit: float
-) -> None:
+def test_a_hundred_insertions_equal_the_plain_formulas(limits: SteeringLimits) -> None:
     """The same motions, to a millionth of a micrometer, and the same estimates; twenty each."""
-    model = MODELS[0.8 if turns else 0.0]
+    model = MODELS[0.8 if limits.turns else 0.0]
     for seed in range(20):
         rng = np.random.default_rng(seed)
         truth = drawn(NEEDLE, STEERING, TRUE, rng, seed)
@@ -206,9 +209,9 @@ def test_a_hundred_insertions_equal_the_plain_formulas(
         bevel = truth.bevel + np.array([0.0, load])
         steering = replace(truth.steering, bevel_load=(float(np.hypot(*bevel)),))
         truth = replace(truth, bevel=bevel, steering=steering)
-        target = (4e-3 if turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
-        ours = MultiHypothesisLaw(model, target, limit, turns, load_limit, step_limit=step_limit)
-        plain = Plain(model, target, limit, turns, load_limit, step_limit)
+        target = (4e-3 if limits.turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
+        ours = MultiHypothesisLaw(model, target, limits)
+        plain = Plain(model, target, limits)
 
         def look(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
             return np.asarray(tip + 4e-5 * rng.standard_normal(2))
