@@ -7,13 +7,11 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from math import cos, inf, pi, sin, sqrt
 import os
-from time import perf_counter
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
-from needle_controller.steering import simulation
-from needle_controller.steering.law import GuideSetpoint, SteeringFaultError, SteeringLaw
+from needle_controller.steering.law import SteeringFaultError, SteeringLaw
 from needle_controller.steering.laws.broyden import BroydenLaw
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
@@ -22,7 +20,7 @@ from needle_controller.steering.laws.springs import SpringsLaw
 from needle_controller.steering.limits import SIMULATION_LIMITS
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.simulation import drawn
+from needle_controller.steering.simulation import GroundTruth, sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 from needle_ros.process_pool import processes
@@ -175,9 +173,7 @@ class MeanPlan(MultiHypothesisLaw):
 class _Trial:
     """A needle with its target, inserted under one controller after the other."""
 
-    def __init__(
-        self, truth: simulation.GroundTruth, depths: FloatArray, sensor: str, seed: int
-    ) -> None:
+    def __init__(self, truth: GroundTruth, depths: FloatArray, sensor: str, seed: int) -> None:
         self.truth, self.depths = truth, depths
         self._sensor, self._seed = sensor, seed
         self.target = np.zeros(2)
@@ -191,28 +187,17 @@ class _Trial:
 
     def end(self, law: SteeringLaw) -> tuple[FloatArray, End]:
         """Return the final tip position and the end of the insertion."""
-        times, said = list[float](), list[str]()
-
-        def follow(tip: FloatArray | None) -> GuideSetpoint:
-            begin = perf_counter()
-            law.update(tip, law.step)
-            to = law.plan()
-            times.append(perf_counter() - begin)
-            if law.step < len(self.depths):
-                said.append(law.warning)
-            return to
-
-        look = _look(self._sensor, self._seed)
+        plant = self.truth.plant(self.depths)
         try:
-            done = simulation.insert(self.truth, self.depths, look, follow)
+            done = simulate_steering(law, plant, _sensor(self._sensor, self._seed))
         except SteeringFaultError as error:
             # The insertion stopped before the target depth.
             self.said = str(error)
             return np.full(2, inf), End(inf, 0.0, 0, 0.0, inf)
-        self.look, self.said = times[-1], next(filter(None, said), '')
-        tip = self.truth.tip(done.needle)
-        miss = float(np.hypot(*(tip - self.target)))
-        return tip, End(miss, done.way, done.turns, done.load, float(np.median(times[:-1])))
+        self.look, self.said = done.times[-1], done.warning
+        miss = float(np.hypot(*(plant.tip - self.target)))
+        time = float(np.median(done.times[:-1]))
+        return plant.tip, End(miss, done.travel, done.turns, done.load, time)
 
 
 def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[str, _Trial]:
@@ -220,7 +205,7 @@ def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[s
     rng = np.random.default_rng(seed)
     medium = list(MEDIA)[seed % len(MEDIA)]
     steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
-    truth = drawn(*nominal(medium), replace(TRUE, spread=spread), rng, seed)
+    truth = sample_truth(*nominal(medium), replace(TRUE, spread=spread), rng, seed)
     aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
     if bevel:
         load = bevel * (1.0 + spread * rng.uniform(-1.0, 1.0))
@@ -302,17 +287,17 @@ def turn(seed: int) -> SteeringOutcome:
     return SteeringOutcome(medium, reachable, ends, refused, False, False, one.look)
 
 
-def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
+def _sensor(name: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
     """Return a function for the mean of sensor readings; None if all are lost."""
     rng = np.random.default_rng([seed, 1])
-    sigma, count, lost = SENSORS[sensor]
+    sigma, count, lost = SENSORS[name]
 
-    def look(tip: FloatArray) -> FloatArray | None:
+    def sensor(tip: FloatArray) -> FloatArray | None:
         seen = int(rng.binomial(count, 1.0 - lost))
         noise = sigma / sqrt(max(seen, 1)) * rng.standard_normal(2)
         return np.asarray(tip + noise) if seen else None
 
-    return look
+    return sensor
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:

@@ -19,20 +19,23 @@ from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
     find_law,
-    GuideSetpoint,
     SteeringFaultError,
-    SteeringLaw,
 )
-from needle_controller.steering.simulation import GroundTruth, insert
+from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.simulation import (
+    GroundTruth,
+    simulate_steering,
+    SteeringPlant,
+    step_depths,
+)
 from needle_dynamics import (
     FloatArray,
     insert_batch,
     NeedleParameters,
-    SteeredNeedle,
     STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
@@ -91,7 +94,7 @@ class SteeringStudy(SteeringLimits):
     """Settings of the scenario that are the same for all samples; its limits are of the law."""
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
-    step: float = constant(5e-3, 'm', 'depth between two tip measurements', open_low=True)
+    step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
 
 
 class SteeringProtocol:
@@ -111,7 +114,7 @@ class SteeringProtocol:
         self._numbers = numbers = from_values(
             SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
         )
-        preset = settings.get('needle', 'bending_35mm')
+        preset = settings.get('needle', DEFAULT_STEERING_PRESET)
         needle, steering, _ = STEERING_PRESETS[
             one_of('settings: needle', preset, STEERING_PRESETS)
         ]
@@ -144,8 +147,7 @@ class SteeringProtocol:
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        steps = max(1, round(ways))
-        self._depths = np.linspace(0.0, numbers.depth, steps + 1)
+        self._depths = step_depths(numbers.depth, numbers.step)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
         self.quantities: Mapping[str, Variable] = {
@@ -259,15 +261,16 @@ class SteeringProtocol:
     ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
-        tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
+        tilt = row['tilt_x'], row['tilt_z']
         still, seen = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
-        def watch(one: SteeredNeedle) -> None:
+        def watch(plant: SteeringPlant) -> None:
+            one = plant.needle
             stamp = round(one.depth / _SPEED * NANOSECONDS)
             seen.append(
                 MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
             )
-            x, z = (one.tip[[0, 2]] + np.array(frame) * one.depth).tolist()
+            x, z = plant.tip.tolist()
             seen.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
 
         self._steered(self._truth(row, rng), row, rng, watch)
@@ -281,34 +284,28 @@ class SteeringProtocol:
         truth: GroundTruth,
         row: Mapping[str, float],
         rng: np.random.Generator,
-        watch: Callable[[SteeredNeedle], object] | None = None,
+        watch: Callable[[SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
         """Simulate one insertion under the law."""
-        target, said = (row['target_x'], row['target_z']), list[str]()
         try:
-            law = self._made(target)
+            law = build_law(
+                self._law, self._model, (row['target_x'], row['target_z']), self._numbers
+            )
         except OutOfReachError:
             return {'refused': 1.0}
 
-        def look(tip: FloatArray) -> FloatArray | None:
+        def sensor(tip: FloatArray) -> FloatArray | None:
             noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
             return None if lost else np.asarray(tip + row['look_noise'] * noise)
 
-        def follow(tip: FloatArray | None) -> GuideSetpoint:
-            law.update(tip, law.step)
-            to = law.plan()
-            if law.step < len(self._depths):
-                said.append(law.warning)
-            return to
-
-        figures = {'refused': 0.0, 'stopped': 0.0}
+        figures, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
         try:
-            done = insert(truth, self._depths, look, follow, watch)
+            done = simulate_steering(law, plant, sensor, watch)
         except SteeringFaultError:
             return {**figures, 'stopped': 1.0}
-        tip = truth.tip(done.needle)
+        tip = plant.tip
         figures |= {
-            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.way,
+            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.travel,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
         there = law.expected()
@@ -318,10 +315,6 @@ class SteeringProtocol:
                 'said_x': float(there.mean[0]),
                 'said_z': float(there.mean[1]),
                 'held': float(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE),
-                'warned': float(any(said)),
+                'warned': float(bool(done.warning)),
             }
         return figures
-
-    def _made(self, target: tuple[float, float]) -> SteeringLaw:
-        """Return the law of a target."""
-        return build_law(self._law, self._model, target, self._numbers)

@@ -45,5 +45,8 @@ class SteeringLimits:
         object.__setattr__(self, 'turns', int(self.turns))
 
 
+#: Default insertion from one tip measurement to the next [m].
+STEP_LENGTH: Final = 5e-3
+
 #: Default limits of simulations: only the position of the guide is limited.
 SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)

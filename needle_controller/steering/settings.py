@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from math import sqrt
 from typing import Final
 
-from needle_controller.steering.limits import SteeringLimits
+from needle_controller.steering.limits import SteeringLimits, STEP_LENGTH
 from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
@@ -25,7 +25,7 @@ class ExecutiveSettings(SteeringLimits):
     """Steps, tip measurements and limits of a steered insertion."""
 
     step_length: float = constant(
-        5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
+        STEP_LENGTH, 'm', 'insertion from one tip measurement to the next', open_low=True
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)

@@ -13,7 +13,7 @@ from needle_controller import (
     SteeringModel,
     SteeringPrior,
 )
-from needle_controller.steering.simulation import drawn, insert
+from needle_controller.steering.simulation import sample_truth, simulate_steering
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
 import numpy as np
@@ -188,6 +188,30 @@ class Plain:
         return GuideSetpoint(at.real, at.imag, self.roll)
 
 
+class Compared(MultiHypothesisLaw):
+    """The law, which compares each plan and its estimates with the plain formulas."""
+
+    def __init__(self, model: SteeringModel, target: FloatArray, limits: SteeringLimits) -> None:
+        self.plain = Plain(model, target, limits)
+        super().__init__(model, target, limits)
+
+    def update(self, tip: Any, at: int, noise: float = 0.0) -> None:
+        super().update(tip, at, noise)
+        self.plain.see(tip)
+
+    def plan(self) -> GuideSetpoint:
+        to, plain = super().plan(), self.plain
+        # Sums in another order.
+        assert_allclose(to, plain.plan(), rtol=0.0, atol=1e-12)
+        mean, covariance = plain.expected()
+        there = self.expected()
+        assert_allclose(there.mean, mean, rtol=0.0, atol=1e-11)
+        assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
+        assert_allclose(self.weights, plain.weights, rtol=1e-6, atol=1e-12)
+        assert self.chance == pytest.approx(plain.chance, abs=1e-9)
+        return to
+
+
 @pytest.mark.parametrize(
     'limits',
     [
@@ -204,33 +228,16 @@ def test_a_hundred_insertions_equal_the_plain_formulas(limits: SteeringLimits) -
     model = MODELS[0.8 if limits.turns else 0.0]
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        truth = drawn(NEEDLE, STEERING, TRUE, rng, seed)
+        truth = sample_truth(NEEDLE, STEERING, TRUE, rng, seed)
         load = model.push * (1.0 + 0.2 * rng.uniform(-1.0, 1.0))
         bevel = truth.bevel + np.array([0.0, load])
         steering = replace(truth.steering, bevel_load=(float(np.hypot(*bevel)),))
         truth = replace(truth, bevel=bevel, steering=steering)
         target = (4e-3 if limits.turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
-        ours = MultiHypothesisLaw(model, target, limits)
-        plain = Plain(model, target, limits)
+        law = Compared(model, target, limits)
 
-        def look(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
+        def sensor(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
             return np.asarray(tip + 4e-5 * rng.standard_normal(2))
 
-        def both(
-            tip: FloatArray | None, ours: MultiHypothesisLaw = ours, plain: Plain = plain
-        ) -> GuideSetpoint:
-            assert tip is not None
-            to = ours.next(tip)
-            plain.see(tip)
-            # Sums in another order.
-            assert_allclose(to, plain.plan(), rtol=0.0, atol=1e-12)
-            mean, covariance = plain.expected()
-            there = ours.expected()
-            assert_allclose(there.mean, mean, rtol=0.0, atol=1e-11)
-            assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
-            assert_allclose(ours.weights, plain.weights, rtol=1e-6, atol=1e-12)
-            assert ours.chance == pytest.approx(plain.chance, abs=1e-9)
-            return to
-
-        insert(truth, DEPTHS, look, both)
-        assert ours.turns == plain.turns
+        simulate_steering(law, truth.plant(DEPTHS), sensor)
+        assert law.turns == law.plain.turns

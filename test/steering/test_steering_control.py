@@ -16,6 +16,7 @@ from needle_controller import (
     OutOfReachError,
     SIMULATION_LIMITS,
     SteeringFaultError,
+    SteeringLaw,
     SteeringLimits,
     SteeringModel,
     SteeringPrior,
@@ -25,6 +26,7 @@ from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
+from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import (
     FloatArray,
     JobError,
@@ -56,22 +58,19 @@ def other(length: float, skin: float = 1.0) -> tuple[NeedleParameters, SteeringP
     )
 
 
-def steer(
-    controller: MultiHypothesisLaw | GuideLaw,
-    needle: SteeredNeedle,
-    noise: float = 1e-7,
-    seed: int = 0,
-) -> FloatArray:
-    """Insert a needle; return the final tip position. Each measurement has its own noise."""
+def sensor(noise: float, seed: int = 0) -> Callable[[FloatArray], FloatArray]:
+    """Return a sensor whose measurements each have their own noise [m]."""
     rng = np.random.default_rng(seed)
-    to = GuideSetpoint(0.0, 0.0)
-    begun = needle.roll
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            needle.move(guide=to[:2], roll=begun + to.roll)
-            needle.move(depth=depth)
-        to = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
-    return needle.tip[[0, 2]]
+    return lambda tip: np.asarray(tip + noise * rng.standard_normal(2))
+
+
+def steer(
+    law: SteeringLaw, needle: SteeredNeedle, noise: float = 1e-7, seed: int = 0
+) -> FloatArray:
+    """Insert a needle; return the final tip position."""
+    plant = SteeringPlant(needle, DEPTHS)
+    simulate_steering(law, plant, sensor(noise, seed))
+    return plant.tip
 
 
 @pytest.mark.parametrize(('length', 'skin'), [(1.0, 1.0), (0.8, 1.2)])
@@ -228,20 +227,21 @@ def test_warning_when_the_target_leaves_the_reachable_set() -> None:
 def faulty(change: dict[int, Any]) -> tuple[MultiHypothesisLaw, SteeredNeedle]:
     """Steer with some measurements replaced; a number is the offset of a measurement in x [m]."""
     controller, one = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), LIMITS), SteeredNeedle(*other(0.9))
-    guide, rng = (0.0, 0.0), np.random.default_rng(4)
+    plant, measured = SteeringPlant(one, DEPTHS), sensor(4e-5, 4)
     before: Any = None
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=guide)
-            one.move(depth=depth)
-        look: Any = one.tip[[0, 2]] + 4e-5 * rng.standard_normal(2)
-        if k in change:
-            what = change[k]
+
+    def sees(tip: FloatArray) -> Any:
+        nonlocal before
+        look: Any = measured(tip)
+        if plant.step in change:
+            what = change[plant.step]
             look = {'lost': None, 'same': before, 'nan': [np.nan, 0.0]}.get(what, look)
             if isinstance(what, float):
                 look = look + np.array([what, 0.0])
         before = look
-        guide = controller.next(look)[:2]
+        return look
+
+    simulate_steering(controller, plant, sees)
     return controller, one
 
 
@@ -288,23 +288,19 @@ def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
     tilt = (0.02 * rng.standard_normal(2)).tolist()
     one = SteeredNeedle(*other(1.0 + 0.25 * rng.uniform(-1.0, 1.0)), tilt=tilt)
     turn = np.array([[np.cos(0.1745), -np.sin(0.1745)], [np.sin(0.1745), np.cos(0.1745)]])
-    controller, guide = MultiHypothesisLaw(MODEL, target, LIMITS), (0.0, 0.0)
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=guide)
-            one.move(depth=depth)
-        tip = turn @ one.tip[[0, 2]]
-        said = ''
-        try:
-            guide = controller.next(tip + 4e-5 * rng.standard_normal(2))[:2]
-        except SteeringFaultError as error:
-            said = str(error)
-            break
+    controller, plant = MultiHypothesisLaw(MODEL, target, LIMITS), SteeringPlant(one, DEPTHS)
+    said = ''
+    try:
+        simulate_steering(
+            controller, plant, lambda tip: turn @ tip + 4e-5 * rng.standard_normal(2)
+        )
+    except SteeringFaultError as error:
+        said = str(error)
     if said:
         assert 'outside the model uncertainty' in said
-        assert depth <= 0.05
+        assert one.depth <= 0.05
     else:
-        assert np.hypot(*(tip - target)) < 5e-4
+        assert np.hypot(*(turn @ plant.tip - target)) < 5e-4
 
 
 def test_invalid_input_is_rejected() -> None:
@@ -429,17 +425,14 @@ def test_bevel_is_turned_towards_the_target(
 def test_guide_with_limited_steps_hits_the_target() -> None:
     """A third of its range per step; targets out of reach are rejected."""
     controller = MultiHypothesisLaw(MODEL, (3e-3, 2e-3), replace(LIMITS, guide_step=2e-3))
-    one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), GuideSetpoint(0.0, 0.0), [0.0]
-    rng = np.random.default_rng(1)
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=to[:2])
-            one.move(depth=depth)
-        before, to = to, controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
-        ways += [abs(to.x - before.x), abs(to.z - before.z)]
+    plant, guides = SteeringPlant(SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), DEPTHS), []
+    simulate_steering(
+        controller, plant, sensor(1e-5, 1), lambda at: guides.append(at.needle.guide)
+    )
+    ways = np.abs(np.diff([np.zeros(2), *guides], axis=0))
     # Rounding.
-    assert max(ways) <= 2e-3 * (1.0 + 1e-12)
-    assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 3e-4
+    assert ways.max() <= 2e-3 * (1.0 + 1e-12)
+    assert np.hypot(*(plant.tip - controller.target)) < 3e-4
     with pytest.raises(OutOfReachError):
         MultiHypothesisLaw(MODEL, (0.02, 0.0), replace(LIMITS, guide_step=1e-4))
 
@@ -449,19 +442,9 @@ def test_guide_load_stays_within_its_limit() -> None:
     target, loads, miss = (3e-3, 2e-3), {}, {}
     for limit in (np.inf, 2.0):
         controller = MultiHypothesisLaw(MODEL, target, replace(LIMITS, load_limit=limit))
-        one, to, felt = (
-            SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)),
-            GuideSetpoint(0.0, 0.0),
-            [0.0],
-        )
-        rng = np.random.default_rng(1)
-        for k, depth in enumerate(DEPTHS.tolist()):
-            if k:
-                one.move(guide=to[:2])
-                felt.append(float(np.abs(one.guide_load[0]).max()))
-                one.move(depth=depth)
-            to = controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
-        loads[limit], miss[limit] = max(felt), np.hypot(*(one.tip[[0, 2]] - target))
+        plant = SteeringPlant(SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)), DEPTHS)
+        loads[limit] = simulate_steering(controller, plant, sensor(1e-5, 1)).load
+        miss[limit] = np.hypot(*(plant.tip - target))
     assert loads[np.inf] > 3.5
     # The plan uses the nominal model until the bending length is identified.
     assert loads[2.0] < 3.0
