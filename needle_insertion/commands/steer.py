@@ -196,7 +196,7 @@ def _task(options: argparse.Namespace) -> _Task:
     )
 
 
-def _truth(
+def sample_needle(
     needle: NeedleParameters, steering: SteeringParameters, prior: SteeringPrior, seed: int
 ) -> GroundTruth:
     """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
@@ -237,7 +237,7 @@ def _run(options: argparse.Namespace) -> int:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
         raise
-    truth = _truth(needle, steering, prior, options.seed)
+    truth = sample_needle(needle, steering, prior, options.seed)
     noise = np.random.default_rng([options.seed, 1])
     shapes = list[FloatArray]()
 

@@ -81,14 +81,19 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode with a new needle; return the observation and an empty dict."""
+        """
+        Start an episode with a new needle; return the observation and an empty dict.
+
+        ``options`` may have ``truth``, a `GroundTruth`, and ``target``, x and z [m].
+        """
         super().reset(seed=seed, options=options)
-        rng = self.np_random
+        rng, given = self.np_random, options or {}
         truth = sample_truth(
             self._needle, self._steering, self._prior, rng, int(rng.integers(_SEEDS))
         )
-        self._plant = truth.plant(self._depths)
-        self._target = rng.uniform(-self._aside, self._aside, 2)
+        target = rng.uniform(-self._aside, self._aside, 2)
+        self._plant = given.get('truth', truth).plant(self._depths)
+        self._target = np.array(given.get('target', target))
         return self._observe(self._plant), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
