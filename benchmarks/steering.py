@@ -65,9 +65,6 @@ BEVEL, MOUNTED, TURNS, WITHIN = 0.8, 0.1, 6, 0.9
 #: Controllers of a needle with a bevel.
 TURNING: Final = ('guide and roll', 'roll', 'roll towards the target', 'open loop')
 
-#: 95 % quantile of chi-square with two degrees of freedom.
-_ELLIPSE: Final = 5.991
-
 #: Largest distance from the target without a warning [m].
 _MISSED: Final = 2e-3
 
@@ -245,9 +242,8 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     else:
         tip, ends['ours'] = one.end(ours)
         there = ours.expected()
-        off = tip - there.mean
         warned, look = bool(one.said), one.look
-        held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
+        held = there.contains(tip)
         ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMITS))[1]
     others: Mapping[str, SteeringLaw] = {
         'springs': SpringsLaw(model, target, LIMITS),

@@ -27,7 +27,8 @@ def main() -> None:
     for depth in DEPTHS:
         one.move(guide=guide)
         one.move(depth=float(depth))
-        guide = controller.next(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2))[:2]
+        controller.update(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2), controller.step)
+        guide = controller.plan()[:2]
     alone.move(depth=0.1)
 
     for name, tip in (('steered', one.tip), ('open loop', alone.tip)):

@@ -50,9 +50,6 @@ _OPEN_LOOP: Final = 'open_loop'
 #: Largest miss of a hit [m].
 HIT: Final = 1e-3
 
-#: Quantile 0.95 of the chi-squared distribution with two degrees of freedom.
-_ELLIPSE: Final = 5.991
-
 #: Insertion speed of a replay [m/s].
 _SPEED: Final = 0.01
 
@@ -310,11 +307,10 @@ class SteeringProtocol:
         }  # fmt: skip
         there = law.expected()
         if there is not None:
-            off = tip - there.mean
             figures |= {
                 'said_x': float(there.mean[0]),
                 'said_z': float(there.mean[1]),
-                'held': float(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE),
+                'held': float(there.contains(tip)),
                 'warned': float(bool(done.warning)),
             }
         return figures

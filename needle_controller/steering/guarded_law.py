@@ -24,9 +24,6 @@ import numpy as np
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
 
-#: Half of an interval of 95 % over the standard deviation.
-NORMAL: Final = 1.96
-
 
 class GuardedLaw:
     """
@@ -176,7 +173,7 @@ class GuardedLaw:
         there = self.expected
         if there is None:
             return 'the needle is at the target depth'
-        half = NORMAL * np.sqrt(np.diag(there.covariance))
+        half = there.half_width
         (x, z), off = there.mean, float(np.hypot(*(there.mean - self.law.target)))
         return (
             f'the tip is at x = {1e3 * x:.2f} ± {1e3 * half[0]:.2f} mm, z = {1e3 * z:.2f} ± '

@@ -30,6 +30,10 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
 DEFAULT_LAW: Final = 'multi_hypothesis'
 
 
+#: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
+_NORMAL, _CHI_SQUARED = 1.96, 5.991
+
+
 class SteeringFaultError(JobError):
     """The tip measurement is implausible, frozen or missing, or the law has failed."""
 
@@ -50,6 +54,24 @@ class TipEstimate:
 
     mean: FloatArray
     covariance: FloatArray
+
+    @property
+    def half_width(self) -> FloatArray:
+        """Half width of the 95 % intervals of x and z [m], shape (2,)."""
+        return np.asarray(_NORMAL * np.sqrt(np.diag(self.covariance)))
+
+    def contains(self, tip: FloatArray) -> bool:
+        """
+        Return whether the 95 % ellipse contains a position.
+
+        Parameters
+        ----------
+        tip : ndarray, shape (2,)
+            Position in x and z [m].
+
+        """
+        off = tip - self.mean
+        return bool(off @ np.linalg.solve(self.covariance, off) <= _CHI_SQUARED)
 
 
 class GuideSetpoint(NamedTuple):

@@ -64,9 +64,6 @@ _DRAWN: Final = 0.5
 #: Number of needle shapes in the picture.
 _SHOWN: Final = 4
 
-#: Half-width of a 95 % interval over the standard deviation.
-_NORMAL: Final = 1.96
-
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
@@ -212,7 +209,7 @@ def sample_needle(
 def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
     """Return the expected tip and the half width of its interval; None without prediction."""
     mean = None if there is None else there.mean.tolist()
-    half = None if there is None else (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist()
+    half = None if there is None else there.half_width.tolist()
     return {'expected tip [m]': mean, 'its interval of 95 % [m]': half}
 
 

@@ -143,7 +143,8 @@ def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
             if k:
                 needle.move(guide=there[:2])
                 needle.move(depth=DEPTHS[k].item())
-            pairs[i] = needle, follows, follows.next(needle.tip[[0, 2]] + look)
+            follows.update(needle.tip[[0, 2]] + look, k)
+            pairs[i] = needle, follows, follows.plan()
         (one, controller, to), *copies = pairs
         if k == 10:
             assert controller.step == 11
@@ -213,7 +214,8 @@ def test_warning_when_the_target_leaves_the_reachable_set() -> None:
         if k:
             one.move(depth=depth)
         try:
-            controller.next(one.tip[[0, 2]])
+            controller.update(one.tip[[0, 2]], k)
+            controller.plan()
         except SteeringFaultError:
             # Or the measurements are implausible for the commanded guide.
             first = first or k
@@ -334,11 +336,11 @@ def test_invalid_input_is_rejected() -> None:
         SteeringPrior(spread=-0.1)
     controller = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
-        controller.next([0.0, 0.0, 0.0])
+        controller.update([0.0, 0.0, 0.0], 0)
     done = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     steer(done, SteeredNeedle(*other(1.0)))
     with pytest.raises(JobError, match='all 20 steps are done'):
-        done.next([0.0, 0.0])
+        done.update([0.0, 0.0], done.step)
 
 
 def test_published_laws_behave_as_published() -> None:
@@ -360,7 +362,8 @@ def test_published_laws_behave_as_published() -> None:
     assert miss['Broyden'] < miss['open']
     # A missing measurement causes no motion.
     rests = BroydenLaw(MODEL, target, LIMITS)
-    assert rests.next(None) == GuideSetpoint(0.0, 0.0)
+    rests.update(None, 0)
+    assert rests.plan() == GuideSetpoint(0.0, 0.0)
 
 
 #: A nominal needle with a bevel.

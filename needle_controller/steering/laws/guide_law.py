@@ -74,11 +74,6 @@ class GuideLaw(ABC):
         x, z = guide.tolist()
         return GuideSetpoint(x, z, self.roll)
 
-    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
-        """Process a tip measurement at the present depth, and plan the next step."""
-        self.update(tip, self.step)
-        return self.plan()
-
     @abstractmethod
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
         """Return the guide for the next step [m] from a tip [m] measured at depth number at."""

@@ -146,7 +146,8 @@ class MultiHypothesisLaw:
     >>> softer = replace(nominal, tissue_stiffness=0.8 * nominal.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
-    ...     x, z, _ = control.next(needle.tip[[0, 2]])
+    ...     control.update(needle.tip[[0, 2]], control.step)
+    ...     x, z, _ = control.plan()
     ...     needle.move(guide=(x, z))
     ...     needle.move(depth=depth)
     >>> miss = np.hypot(*(needle.tip[[0, 2]] - control.target))
@@ -298,34 +299,6 @@ class MultiHypothesisLaw:
 
     # Steps.
 
-    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
-        """
-        Process a tip measurement, and return guide and roll for the next step.
-
-        Parameters
-        ----------
-        tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
-
-        Returns
-        -------
-        GuideSetpoint
-            Guide and roll; unchanged after the last measurement.
-
-        Raises
-        ------
-        ShapeError
-            If the measurement does not have two numbers.
-        JobError
-            If all steps are done.
-        SteeringFaultError
-            If the measurements are missing for too long, have frozen, or are implausible. The
-            needle must then stop.
-
-        """
-        self.update(tip, self.step)
-        return self.plan()
-
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
@@ -335,7 +308,7 @@ class MultiHypothesisLaw:
         Parameters
         ----------
         tip : array_like of shape (2,) or None
-            As for `next`.
+            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
         at : int
             Number of the depth, not greater than `step`.
         noise : float
@@ -345,8 +318,13 @@ class MultiHypothesisLaw:
         ------
         ParameterError
             If there is no such depth yet.
-        ShapeError, JobError, SteeringFaultError
-            As for `next`.
+        ShapeError
+            If the measurement does not have two numbers.
+        JobError
+            If all steps are done.
+        SteeringFaultError
+            If the measurements are missing for too long, have frozen, or are implausible. The
+            needle must then stop.
 
         """
         if self.step > self._model.steps:
@@ -379,7 +357,7 @@ class MultiHypothesisLaw:
         Returns
         -------
         GuideSetpoint
-            As from `next`.
+            Guide and roll; unchanged after the last measurement.
 
         """
         now, k, last = self._now, self.step, self._model.steps - 1
