@@ -20,31 +20,17 @@ from numpy.typing import ArrayLike
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GroundTruth:
-    """
-    Ground truth of a simulated needle, and the rotation of its sensor.
-
-    Attributes
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        Their constants for steering.
-    tilt : tuple of float
-        Tilt of the guide in x and z.
-    bevel : ndarray, shape (2,)
-        Load of the bevel in x and z [N].
-    frame : ndarray, shape (2,)
-        Rotation of the sensor's frame: shift of the tip in x and z per depth [rad].
-    seed : int
-        Seed of the noise of the path.
-
-    """
+    """Ground truth of a simulated needle, and the rotation of its sensor."""
 
     needle: NeedleParameters
     steering: SteeringParameters
+    #: Tilt of the guide in x and z [rad].
     tilt: tuple[float, float]
+    #: Load of the bevel in x and z [N], shape (2,).
     bevel: FloatArray
+    #: Rotation of the sensor's frame: shift of the tip in x and z per depth [rad], shape (2,).
     frame: FloatArray
+    #: Seed of the noise of the path.
     seed: int
 
     def plant(self, depths: FloatArray) -> SteeringPlant:
@@ -94,22 +80,8 @@ class SteeringPlant:
     """
     Simulated needle that is inserted in steps, and its tip in the frame of the sensor.
 
-    Parameters
-    ----------
-    needle : SteeredNeedle
-        The needle at the first depth.
-    depths : ndarray, shape (n + 1,)
-        Depths of the tip measurements [m].
-    frame : array_like, shape (2,)
-        As in `GroundTruth`.
-
-    Attributes
-    ----------
-    needle, depths
-        As given.
-    step : int
-        Number of the present depth.
-
+    The needle is at the first of the ``depths`` of the tip measurements [m], shape (n + 1,), and
+    ``step`` is the number of its present depth; ``frame`` as in `GroundTruth`.
     """
 
     def __init__(
@@ -139,28 +111,16 @@ class SteeringPlant:
 
 
 class SteeringRun(NamedTuple):
-    """
-    Simulated insertion under a steering law.
+    """Simulated insertion under a steering law."""
 
-    Attributes
-    ----------
-    travel : float
-        Distance traveled by the guide [m].
-    turns : int
-        Number of turns of the needle.
-    load : float
-        Largest force on the guide after a motion of the guide [N].
-    warning : str
-        First warning of the law before the last depth, with its depth; '' without one.
-    times : list of float
-        Computation time of the law at each depth [s].
-
-    """
-
+    #: Distance traveled by the guide [m], and number of turns of the needle.
     travel: float
     turns: int
+    #: Largest force on the guide after a motion of the guide [N].
     load: float
+    #: First warning of the law before the last depth, with its depth; '' without one.
     warning: str
+    #: Computation time of the law at each depth [s].
     times: list[float]
 
 
