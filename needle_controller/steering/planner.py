@@ -40,7 +40,7 @@ class PlannedInsertion(NamedTuple):
 
 
 class InsertionPlanner:
-    """Compute the steering law of an insertion, one at a time; arguments of `SteeringExecutive`."""
+    """Compute the law of an insertion, one at a time; arguments as for `SteeringExecutive`."""
 
     def __init__(
         self,
