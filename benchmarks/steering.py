@@ -7,30 +7,31 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from math import cos, inf, pi, sin, sqrt
 import os
-from time import perf_counter
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
-from needle_controller.steering import simulation
-from needle_controller.steering.law import GuideSetpoint, SteeringFaultError, SteeringLaw
+from needle_controller.steering.law import SteeringFaultError, SteeringLaw
 from needle_controller.steering.laws.broyden import BroydenLaw
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
+from needle_controller.steering.limits import SIMULATION_LIMITS
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.simulation import drawn
+from needle_controller.steering.simulation import GroundTruth, sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 from needle_ros.process_pool import processes
 import numpy as np
 from scipy.optimize import lsq_linear
 
-#: Steps [m], limit of the guide [m], depths of targets [steps], and their distance from the axis
-#: [m].
-STEP, LIMIT, DEPTHS, ASIDE = 5e-3, 6e-3, (12, 24), 6e-3
+#: Steps [m], depths of targets [steps], and their distance from the axis [m].
+STEP, DEPTHS, ASIDE = 5e-3, (12, 24), 6e-3
+
+#: Limits of the laws: 6 mm for the position of the guide.
+LIMITS: Final = SIMULATION_LIMITS
 
 #: Free length [m], and stiffness of the skin over the stiffness of the tissue [m].
 FREE, SKIN = 0.04, 0.02
@@ -63,9 +64,6 @@ BEVEL, MOUNTED, TURNS, WITHIN = 0.8, 0.1, 6, 0.9
 
 #: Controllers of a needle with a bevel.
 TURNING: Final = ('guide and roll', 'roll', 'roll towards the target', 'open loop')
-
-#: 95 % quantile of chi-square with two degrees of freedom.
-_ELLIPSE: Final = 5.991
 
 #: Largest distance from the target without a warning [m].
 _MISSED: Final = 2e-3
@@ -172,9 +170,7 @@ class MeanPlan(MultiHypothesisLaw):
 class _Trial:
     """A needle with its target, inserted under one controller after the other."""
 
-    def __init__(
-        self, truth: simulation.GroundTruth, depths: FloatArray, sensor: str, seed: int
-    ) -> None:
+    def __init__(self, truth: GroundTruth, depths: FloatArray, sensor: str, seed: int) -> None:
         self.truth, self.depths = truth, depths
         self._sensor, self._seed = sensor, seed
         self.target = np.zeros(2)
@@ -188,28 +184,17 @@ class _Trial:
 
     def end(self, law: SteeringLaw) -> tuple[FloatArray, End]:
         """Return the final tip position and the end of the insertion."""
-        times, said = list[float](), list[str]()
-
-        def follow(tip: FloatArray | None) -> GuideSetpoint:
-            begin = perf_counter()
-            law.update(tip, law.step)
-            to = law.plan()
-            times.append(perf_counter() - begin)
-            if law.step < len(self.depths):
-                said.append(law.warning)
-            return to
-
-        look = _look(self._sensor, self._seed)
+        plant = self.truth.plant(self.depths)
         try:
-            done = simulation.insert(self.truth, self.depths, look, follow)
+            done = simulate_steering(law, plant, _sensor(self._sensor, self._seed))
         except SteeringFaultError as error:
             # The insertion stopped before the target depth.
             self.said = str(error)
             return np.full(2, inf), End(inf, 0.0, 0, 0.0, inf)
-        self.look, self.said = times[-1], next(filter(None, said), '')
-        tip = self.truth.tip(done.needle)
-        miss = float(np.hypot(*(tip - self.target)))
-        return tip, End(miss, done.way, done.turns, done.load, float(np.median(times[:-1])))
+        self.look, self.said = done.times[-1], done.warning
+        miss = float(np.hypot(*(plant.tip - self.target)))
+        time = float(np.median(done.times[:-1]))
+        return plant.tip, End(miss, done.travel, done.turns, done.load, time)
 
 
 def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[str, _Trial]:
@@ -217,7 +202,7 @@ def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[s
     rng = np.random.default_rng(seed)
     medium = list(MEDIA)[seed % len(MEDIA)]
     steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
-    truth = drawn(*nominal(medium), replace(TRUE, spread=spread), rng, seed)
+    truth = sample_truth(*nominal(medium), replace(TRUE, spread=spread), rng, seed)
     aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
     if bevel:
         load = bevel * (1.0 + spread * rng.uniform(-1.0, 1.0))
@@ -245,26 +230,25 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     alone = one.known()
     causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
     drift = alone.causes[0, -1, :4] @ causes
-    could = LIMIT * np.abs(alone.guide[0, -1]).sum()
+    could = LIMITS.guide_limit * np.abs(alone.guide[0, -1]).sum()
     ends: dict[str, End] = {}
     warned = held = refused = False
     look = inf
     model = _model(medium, len(depths) - 1, sensor, spread)
     try:
-        ours = MultiHypothesisLaw(model, target, LIMIT)
+        ours = MultiHypothesisLaw(model, target, LIMITS)
     except OutOfReachError:
         refused = True
     else:
         tip, ends['ours'] = one.end(ours)
         there = ours.expected()
-        off = tip - there.mean
         warned, look = bool(one.said), one.look
-        held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
-        ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMIT))[1]
+        held = there.contains(tip)
+        ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMITS))[1]
     others: Mapping[str, SteeringLaw] = {
-        'springs': SpringsLaw(model, target, LIMIT),
-        'Broyden': BroydenLaw(model, target, LIMIT),
-        'open loop': OpenLoopLaw(model, target, LIMIT),
+        'springs': SpringsLaw(model, target, LIMITS),
+        'Broyden': BroydenLaw(model, target, LIMITS),
+        'open loop': OpenLoopLaw(model, target, LIMITS),
     }
     ends |= {name: one.end(law)[1] for name, law in others.items()}
     reachable = bool((np.abs(target - drift) <= could).all())
@@ -284,13 +268,14 @@ def turn(seed: int) -> SteeringOutcome:
     drift = alone.causes[0, -1, :3] @ causes
     model = _model(medium, len(depths) - 1, sensor, spread, BEVEL)
     laws: dict[str, SteeringLaw] = {
-        TURNING[2]: RollToTargetLaw(model, one.target, turns=len(depths)),
-        TURNING[3]: OpenLoopLaw(model, one.target),
+        TURNING[2]: RollToTargetLaw(model, one.target, replace(LIMITS, turns=len(depths))),
+        TURNING[3]: OpenLoopLaw(model, one.target, LIMITS),
     }
+    turned = replace(LIMITS, turns=TURNS)
     refused = False
     try:
-        laws[TURNING[0]] = MultiHypothesisLaw(model, one.target, LIMIT, TURNS)
-        laws[TURNING[1]] = MultiHypothesisLaw(model, one.target, 0.0, TURNS)
+        laws[TURNING[0]] = MultiHypothesisLaw(model, one.target, turned)
+        laws[TURNING[1]] = MultiHypothesisLaw(model, one.target, replace(turned, guide_limit=0.0))
     except OutOfReachError:
         refused = True
     ends = {name: one.end(law)[1] for name, law in laws.items()}
@@ -298,17 +283,17 @@ def turn(seed: int) -> SteeringOutcome:
     return SteeringOutcome(medium, reachable, ends, refused, False, False, one.look)
 
 
-def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
+def _sensor(name: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
     """Return a function for the mean of sensor readings; None if all are lost."""
     rng = np.random.default_rng([seed, 1])
-    sigma, count, lost = SENSORS[sensor]
+    sigma, count, lost = SENSORS[name]
 
-    def look(tip: FloatArray) -> FloatArray | None:
+    def sensor(tip: FloatArray) -> FloatArray | None:
         seen = int(rng.binomial(count, 1.0 - lost))
         noise = sigma / sqrt(max(seen, 1)) * rng.standard_normal(2)
         return np.asarray(tip + noise) if seen else None
 
-    return look
+    return sensor
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:
@@ -379,10 +364,11 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             rows,
             f'{needles} needles of each case, evenly of four media, seeds 0 to {needles - 1}; '
             f'targets within {1e3 * ASIDE:g} mm of the axis, {1e3 * STEP * DEPTHS[0]:g} to '
-            f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within {1e3 * LIMIT:g} mm, steps of '
-            f'{1e3 * STEP:g} mm. Statistics: targets that are reachable with all '
-            'parameters known except the path, and that ours did not reject. Way, turns and load '
-            'are means, of the load the mean of the largest value of each insertion.',
+            f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within '
+            f'{1e3 * LIMITS.guide_limit:g} mm, steps of {1e3 * STEP:g} mm. Statistics: targets '
+            'that are reachable with all parameters known except the path, and that ours did not '
+            'reject. Way, turns and load are means, of the load the mean of the largest value of '
+            'each insertion.',
         ),
         PageSection(
             'Ours',

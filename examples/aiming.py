@@ -6,7 +6,7 @@ The guide moves after each tip measurement. With a fixed guide the error is seve
 
 from dataclasses import replace
 
-from needle_controller import MultiHypothesisLaw, SteeringModel
+from needle_controller import MultiHypothesisLaw, SIMULATION_LIMITS, SteeringModel
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 import numpy as np
 
@@ -18,7 +18,7 @@ def main() -> None:
     """Insert to 100 mm in steps of 5 mm, to x = 2 mm and z = -3 mm."""
     needle, steering, _ = STEERING_PRESETS['bending_35mm']
     model = SteeringModel(needle, steering, DEPTHS)
-    controller = MultiHypothesisLaw(model, TARGET)
+    controller = MultiHypothesisLaw(model, TARGET, SIMULATION_LIMITS)
 
     softer = replace(needle, tissue_stiffness=0.6 * needle.tissue_stiffness)
     one, alone = (SteeredNeedle(softer, steering, tilt=(0.03, 0.02)) for _ in range(2))
@@ -27,7 +27,8 @@ def main() -> None:
     for depth in DEPTHS:
         one.move(guide=guide)
         one.move(depth=float(depth))
-        guide = controller.next(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2))[:2]
+        controller.update(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2), controller.step)
+        guide = controller.plan()[:2]
     alone.move(depth=0.1)
 
     for name, tip in (('steered', one.tip), ('open loop', alone.tip)):

@@ -4,7 +4,7 @@ Steering law outside the package: bring the tip to a line to the target, four st
 PYTHONPATH=examples needle steer --law steering_law:NominalLaw
 """
 
-from needle_controller import GuideSetpoint, SteeringModel
+from needle_controller import GuideSetpoint, SteeringLimits, SteeringModel
 from needle_dynamics import FloatArray
 import numpy as np
 
@@ -18,14 +18,12 @@ class NominalLaw:
         self,
         model: SteeringModel,
         target: FloatArray,
-        *,
-        position_limit: float,
-        step_limit: float,
-        **_limits: float,
+        limits: SteeringLimits,
+        roll: float,
     ) -> None:
         nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - 1.0))
         self.responses, self.depths = model.guide[nominal], model.depths
-        self.position_limit, self.step_limit = position_limit, step_limit
+        self.limits = limits
         self.guide = np.zeros((len(self.depths) - 1, 2))
         self.deviation, self.step = np.zeros(2), 0
         self.aim(target)
@@ -40,13 +38,14 @@ class NominalLaw:
     def plan(self) -> GuideSetpoint:
         k, self.step = self.step, self.step + 1
         if k < len(self.guide):
+            limit, step = self.limits.guide_limit, self.limits.guide_step
             past = self.guide[k - 1] if k else np.zeros(2)
             ahead = min(k + 4, len(self.guide))
             wanted = self.target * self.depths[ahead] / self.depths[-1] - self.deviation
             wanted -= self.responses[ahead] @ self.guide
             wanted /= self.responses[ahead, k:].sum()
-            wanted = np.clip(wanted, past - self.step_limit, past + self.step_limit)
-            self.guide[k] = np.clip(wanted, -self.position_limit, self.position_limit)
+            wanted = np.clip(wanted, past - step, past + step)
+            self.guide[k] = np.clip(wanted, -limit, limit)
         return GuideSetpoint(*self.guide[min(k, len(self.guide) - 1)])
 
     def expected(self) -> None:

@@ -56,6 +56,7 @@ from needle_controller.steering.law import (
     TipEstimate,
 )
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
+from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
@@ -65,6 +66,7 @@ __all__ = [
     'DEFAULT_GAINS',
     'LAWS',
     'REFERENCES',
+    'SIMULATION_LIMITS',
     'STEERING_LAWS',
     'Adaptive',
     'AdaptiveGains',
@@ -108,6 +110,7 @@ __all__ = [
     'SteeringExecutive',
     'SteeringFaultError',
     'SteeringLaw',
+    'SteeringLimits',
     'SteeringModel',
     'SteeringPrior',
     'TipEstimate',

@@ -20,7 +20,11 @@ from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.compiled_node import CompiledNode
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
-from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
+from needle_dynamics.steering.parameters import (
+    DEFAULT_STEERING_PRESET,
+    NEEDLES,
+    SteeringParameters,
+)
 from needle_ros import contract
 from needle_ros.errors import printable
 from needle_ros.event_log import Severity
@@ -40,9 +44,6 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-
-#: Default of the nominal needle and tissue.
-_PRESET = 'bending_35mm'
 
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _WATCH = 0.05
@@ -89,7 +90,7 @@ class SteeringNode(CompiledNode):
         # Fixed at start: it determines the other defaults.
         self.declare_parameter(
             'model.preset',
-            _PRESET,
+            DEFAULT_STEERING_PRESET,
             ParameterDescriptor(description=f'one of {", ".join(NEEDLES)}', read_only=True),
         )
         preset = str(self.get_parameter('model.preset').value)

@@ -28,13 +28,14 @@ def constant(
     low: float = 0.0,
     high: float = inf,
     open_low: bool = False,
+    unlimited: bool = False,
 ) -> Any:
     """
     Declare a numeric dataclass field with unit, description and valid range.
 
     A tuple as default declares an array field, whose elements all have the range. The unit is an
     SI unit, ``1`` for a pure number. The description becomes the description of the ROS parameter.
-    `open_low` excludes ``low`` itself.
+    `open_low` excludes ``low`` itself. With `unlimited` infinity is valid.
     """
     return field(
         default=default,
@@ -44,13 +45,14 @@ def constant(
             'low': low,
             'high': high,
             'open_low': open_low,
+            'unlimited': unlimited,
         },
     )
 
 
 def check_constants(values: object) -> None:
     """
-    Check that every numeric field of a dataclass is finite and within its range.
+    Check that every numeric field of a dataclass is within its range, and finite or unlimited.
 
     The message of the `ParameterError` contains the field, the value, and the valid range with its
     unit.
@@ -70,11 +72,13 @@ def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
     too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
-    if not isfinite(value) or too_low or value > meta['high']:
+    infinite = not isfinite(value) and not (meta['unlimited'] and value == inf)
+    if infinite or too_low or value > meta['high']:
+        finite = '' if meta['unlimited'] else 'finite, '
         sign = '>' if meta['open_low'] else '>='
         upper = f' and <= {meta["high"]:g}' if isfinite(meta['high']) else ''
         raise ParameterError(
-            f'{name} must be finite, {sign} {meta["low"]:g}{upper}'
+            f'{name} must be {finite}{sign} {meta["low"]:g}{upper}'
             f'{" " + meta["unit"] if meta["unit"] != "1" else ""}, got {value!r}'
         )
 

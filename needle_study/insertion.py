@@ -11,7 +11,9 @@ from needle_controller import (
     Axis,
     check_stability,
     DEFAULT_GAINS,
+    Guard,
     LAWS,
+    Measurement,
     Reference,
     ReferenceLimits,
     REFERENCES,
@@ -48,7 +50,7 @@ CONTROLLERS: Final = (*LAWS, OPEN_LOOP)
 #: Largest speed of a needle at rest [m/s].
 _REST: Final = 1e-5
 
-#: Limits of the guard of the node.
+#: Default limits of the guard.
 _LIMITS: Final = SafetyLimits()
 
 #: Most samples of an insertion.
@@ -191,6 +193,11 @@ class InsertionProtocol:
         )
         self._kind = REFERENCES[chosen['reference']]
         self._period = 1.0 / self._numbers.rate
+        self._limits = SafetyLimits(
+            speed=self._numbers.speed_limit,
+            tracking_error=self._numbers.error_limit,
+            tip_deflection=self._numbers.deflection_limit,
+        )
         self._law = self._made(
             chosen['controller'],
             gains,
@@ -365,18 +372,21 @@ class InsertionProtocol:
 
     def _stop(self, course: _Course) -> int | None:
         """Return the sample of the stop by the guard, or None."""
-        p, n = course.model.parameters, self._numbers
         depth, speed = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
-        above, below = p.minimum_depth - depth, depth - p.length
-        outside = np.maximum(above, below) > _LIMITS.depth_tolerance
-        beyond = [
-            (np.abs(speed) > n.speed_limit) | outside,
-            np.abs(course.goal - depth) > n.error_limit,
-            np.abs(course.tip) > n.deflection_limit,
-        ]
-        # A single sample may be a fault of the sensor.
-        twice = np.any([one[1:] & one[:-1] for one in beyond], axis=0)
-        return 1 + int(np.argmax(twice)) if twice.any() else None
+        samples = np.stack([depth, speed, course.goal - depth, course.tip], axis=1)
+        low, high = samples.min(axis=0), samples.max(axis=0)
+        # Limits are intervals: nearly always the extremes are within them, and so all samples.
+        extremes = np.stack([low, low, high, high])
+        return None if self._violated(extremes) is None else self._violated(samples)
+
+    def _violated(self, samples: FloatArray) -> int | None:
+        """Return the first row of depth, velocity, error and deflection that the guard rejects."""
+        guard = Guard(self._limits, (self._needle.minimum_depth, self._needle.length))
+        for k, (depth, speed, error, tip) in enumerate(samples.tolist()):
+            encoders = guard.encoders(Measurement(time=0.0, depth=depth, speed=speed))
+            if encoders or guard.tracking(error) or guard.tip(tip):
+                return k
+        return None
 
     def _open(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]

@@ -8,28 +8,37 @@ from functools import cached_property
 from math import nan
 from typing import Any, Final
 
-from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller import (
+    OutOfReachError,
+    SIMULATION_LIMITS,
+    SteeringLimits,
+    SteeringModel,
+    SteeringPrior,
+)
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
     find_law,
-    GuideSetpoint,
     SteeringFaultError,
-    SteeringLaw,
 )
-from needle_controller.steering.simulation import GroundTruth, insert
+from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.simulation import (
+    GroundTruth,
+    simulate_steering,
+    SteeringPlant,
+    step_depths,
+)
 from needle_dynamics import (
     FloatArray,
     insert_batch,
     NeedleParameters,
-    SteeredNeedle,
     STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
 from needle_study.reading import check_names, mapping, one_of
 from needle_study.scenario import MeasuredRun, Metric, Variable
@@ -40,9 +49,6 @@ _OPEN_LOOP: Final = 'open_loop'
 
 #: Largest miss of a hit [m].
 HIT: Final = 1e-3
-
-#: Quantile 0.95 of the chi-squared distribution with two degrees of freedom.
-_ELLIPSE: Final = 5.991
 
 #: Insertion speed of a replay [m/s].
 _SPEED: Final = 0.01
@@ -81,22 +87,11 @@ FIGURES: Final[Mapping[str, Metric]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringStudy:
-    """Settings of the scenario that are the same for all samples."""
+class SteeringStudy(SteeringLimits):
+    """Settings of the scenario that are the same for all samples; its limits are of the law."""
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
-    step: float = constant(5e-3, 'm', 'depth between two tip measurements', open_low=True)
-    guide_limit: float = constant(6e-3, 'm', 'largest displacement of the guide')
-    guide_step: float = constant(1.0, 'm', 'largest motion of the guide in a step', open_low=True)
-    load_limit: float = constant(
-        1e3, 'N', 'largest planned lateral force on the guide', open_low=True
-    )
-    turns: float = constant(0.0, '1', 'largest number of needle rotations')
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.turns != int(self.turns):
-            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
+    step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
 
 
 class SteeringProtocol:
@@ -113,8 +108,10 @@ class SteeringProtocol:
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
         given = {name: value for name, value in settings.items() if name not in _PARTS}
-        self._numbers = numbers = from_values(SteeringStudy, given, 'settings.')
-        preset = settings.get('needle', 'bending_35mm')
+        self._numbers = numbers = from_values(
+            SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
+        )
+        preset = settings.get('needle', DEFAULT_STEERING_PRESET)
         needle, steering, _ = STEERING_PRESETS[
             one_of('settings: needle', preset, STEERING_PRESETS)
         ]
@@ -147,8 +144,7 @@ class SteeringProtocol:
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        steps = max(1, round(ways))
-        self._depths = np.linspace(0.0, numbers.depth, steps + 1)
+        self._depths = step_depths(numbers.depth, numbers.step)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
         self.quantities: Mapping[str, Variable] = {
@@ -262,15 +258,16 @@ class SteeringProtocol:
     ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
-        tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
+        tilt = row['tilt_x'], row['tilt_z']
         still, seen = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
-        def watch(one: SteeredNeedle) -> None:
+        def watch(plant: SteeringPlant) -> None:
+            one = plant.needle
             stamp = round(one.depth / _SPEED * NANOSECONDS)
             seen.append(
                 MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
             )
-            x, z = (one.tip[[0, 2]] + np.array(frame) * one.depth).tolist()
+            x, z = plant.tip.tolist()
             seen.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
 
         self._steered(self._truth(row, rng), row, rng, watch)
@@ -284,56 +281,36 @@ class SteeringProtocol:
         truth: GroundTruth,
         row: Mapping[str, float],
         rng: np.random.Generator,
-        watch: Callable[[SteeredNeedle], object] | None = None,
+        watch: Callable[[SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
         """Simulate one insertion under the law."""
-        target, said = (row['target_x'], row['target_z']), list[str]()
         try:
-            law = self._made(target)
+            law = build_law(
+                self._law, self._model, (row['target_x'], row['target_z']), self._numbers
+            )
         except OutOfReachError:
             return {'refused': 1.0}
 
-        def look(tip: FloatArray) -> FloatArray | None:
+        def sensor(tip: FloatArray) -> FloatArray | None:
             noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
             return None if lost else np.asarray(tip + row['look_noise'] * noise)
 
-        def follow(tip: FloatArray | None) -> GuideSetpoint:
-            law.update(tip, law.step)
-            to = law.plan()
-            if law.step < len(self._depths):
-                said.append(law.warning)
-            return to
-
-        figures = {'refused': 0.0, 'stopped': 0.0}
+        figures, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
         try:
-            done = insert(truth, self._depths, look, follow, watch)
+            done = simulate_steering(law, plant, sensor, watch)
         except SteeringFaultError:
             return {**figures, 'stopped': 1.0}
-        tip = truth.tip(done.needle)
+        tip = plant.tip
         figures |= {
-            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.way,
+            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.travel,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
         there = law.expected()
         if there is not None:
-            off = tip - there.mean
             figures |= {
                 'said_x': float(there.mean[0]),
                 'said_z': float(there.mean[1]),
-                'held': float(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE),
-                'warned': float(any(said)),
+                'held': float(there.contains(tip)),
+                'warned': float(bool(done.warning)),
             }
         return figures
-
-    def _made(self, target: tuple[float, float]) -> SteeringLaw:
-        """Return the law of a target."""
-        numbers = self._numbers
-        return build_law(
-            self._law,
-            self._model,
-            target,
-            position_limit=numbers.guide_limit,
-            turns=int(numbers.turns),
-            load_limit=numbers.load_limit,
-            step_limit=numbers.guide_step,
-        )

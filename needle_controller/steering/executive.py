@@ -16,7 +16,7 @@ from typing import Final
 from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
-from needle_controller.steering.guarded_law import GuardedLaw, NORMAL
+from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import DESCRIPTIONS, InsertionStrategy
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
@@ -436,7 +436,7 @@ class SteeringExecutive(StateMachine):
             law=values,
         )
         if guarded.expected is not None:
-            half = NORMAL * np.sqrt(np.diag(guarded.expected.covariance))
+            half = guarded.expected.half_width
             status = replace(
                 status,
                 expected_tip=tuple(guarded.expected.mean.tolist()),

@@ -24,9 +24,6 @@ import numpy as np
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
 
-#: Half of an interval of 95 % over the standard deviation.
-NORMAL: Final = 1.96
-
 
 class GuardedLaw:
     """
@@ -157,7 +154,7 @@ class GuardedLaw:
                 f'{1e3 * to.z:.3f} mm and a roll of {to.roll:.3f} rad; the limit is '
                 f'{1e3 * settings.guide_limit:g} mm'
             )
-        widest = settings.farthest(float(np.diff(self.depths).max())) + _ROUNDING
+        widest = settings.limits(float(np.diff(self.depths).max())).guide_step + _ROUNDING
         change = max(abs(to.x - self._setpoint.x), abs(to.z - self._setpoint.z))
         if change > widest:
             raise SteeringFaultError(
@@ -176,7 +173,7 @@ class GuardedLaw:
         there = self.expected
         if there is None:
             return 'the needle is at the target depth'
-        half = NORMAL * np.sqrt(np.diag(there.covariance))
+        half = there.half_width
         (x, z), off = there.mean, float(np.hypot(*(there.mean - self.law.target)))
         return (
             f'the tip is at x = {1e3 * x:.2f} ± {1e3 * half[0]:.2f} mm, z = {1e3 * z:.2f} ± '

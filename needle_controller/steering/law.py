@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from math import inf, isfinite
+from math import isfinite
 from typing import Final, NamedTuple, Protocol
 
+from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
@@ -27,6 +28,10 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
 
 #: Law of the node, of `needle steer` and of studies, unless another one is set.
 DEFAULT_LAW: Final = 'multi_hypothesis'
+
+
+#: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
+_NORMAL, _CHI_SQUARED = 1.96, 5.991
 
 
 class SteeringFaultError(JobError):
@@ -49,6 +54,24 @@ class TipEstimate:
 
     mean: FloatArray
     covariance: FloatArray
+
+    @property
+    def half_width(self) -> FloatArray:
+        """Half width of the 95 % intervals of x and z [m], shape (2,)."""
+        return np.asarray(_NORMAL * np.sqrt(np.diag(self.covariance)))
+
+    def contains(self, tip: FloatArray) -> bool:
+        """
+        Return whether the 95 % ellipse contains a position.
+
+        Parameters
+        ----------
+        tip : ndarray, shape (2,)
+            Position in x and z [m].
+
+        """
+        off = tip - self.mean
+        return bool(off @ np.linalg.solve(self.covariance, off) <= _CHI_SQUARED)
 
 
 class GuideSetpoint(NamedTuple):
@@ -146,12 +169,8 @@ class LawClass(Protocol):
         self,
         model: SteeringModel,
         target: ArrayLike,
-        *,
-        position_limit: float,
-        turns: int,
-        load_limit: float,
+        limits: SteeringLimits,
         roll: float,
-        step_limit: float,
     ) -> SteeringLaw:
         """Create a law; parameters as for `build_law`."""
 
@@ -178,12 +197,8 @@ def build_law(
     name: str,
     model: SteeringModel,
     target: ArrayLike,
-    *,
-    position_limit: float = 6e-3,
-    turns: int = 0,
-    load_limit: float = inf,
+    limits: SteeringLimits,
     roll: float = 0.0,
-    step_limit: float = inf,
 ) -> SteeringLaw:
     """
     Construct a steering law by name.
@@ -196,16 +211,10 @@ def build_law(
         Nominal needle, depths of the measurements, and responses of the tip.
     target : array_like, shape (2,)
         Target position of the tip at the last depth, x and z [m].
-    position_limit : float
-        Largest position of the guide along x and along z [m].
-    turns : int
-        Allowed number of turns of the needle.
-    load_limit : float
-        Largest planned force of the guide along x and along z [N].
+    limits : SteeringLimits
+        Limits of the guide setpoints.
     roll : float
         Roll of the needle at the start [rad].
-    step_limit : float
-        Largest change of the guide from one step to the next along x and along z [m].
 
     Returns
     -------
@@ -222,15 +231,7 @@ def build_law(
     """
     of_class = find_law(name)
     try:
-        law = of_class(
-            model,
-            target,
-            position_limit=position_limit,
-            turns=turns,
-            load_limit=load_limit,
-            roll=roll,
-            step_limit=step_limit,
-        )
+        law = of_class(model, target, limits, roll)
     except NeedleError:
         raise
     # The constructor is any code of the user.
@@ -247,20 +248,11 @@ _MEMBERS: Final = (
 )  # fmt: skip
 
 
-def check_limits(
-    position_limit: float, turns: int, load_limit: float, roll: float, step_limit: float
-) -> None:
-    """Check the limits of a law; see `LawClass`."""
-    if not 0.0 <= position_limit < inf:
-        raise ParameterError(f'position_limit must be finite and >= 0, got {position_limit!r} m')
-    if not load_limit > 0.0:
-        raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
-    if not step_limit > 0.0:
-        raise ParameterError(f'step_limit must be > 0, got {step_limit!r} m')
-    if isinstance(turns, float) or turns < 0:
-        raise ParameterError(f'turns must be a whole number >= 0, got {turns!r}')
+def checked_roll(roll: float) -> float:
+    """Return the roll at the start [rad], if it is finite."""
     if not isfinite(roll):
         raise ParameterError(f'roll must be finite, got {roll!r} rad')
+    return roll
 
 
 def checked_target(target: ArrayLike) -> FloatArray:

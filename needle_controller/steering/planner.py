@@ -27,45 +27,20 @@ _MOST_STEPS: Final = 200
 
 
 class PlannedInsertion(NamedTuple):
-    """
-    Request of an insertion.
+    """Request of an insertion."""
 
-    Attributes
-    ----------
-    stamp : int
-        Stamp of its message [ns].
-    point : tuple of float
-        Target of the tip, x, y, z [m].
-    depths : ndarray, shape (n + 1,)
-        Depths of the tip measurements [m].
-    at : ndarray, shape (joints,)
-        Positions of the joints at its start [m, rad].
-
-    """
-
+    #: Stamp of its message [ns].
     stamp: int
+    #: Target of the tip, x, y, z [m].
     point: tuple[float, float, float]
+    #: Depths of the tip measurements [m], shape (n + 1,).
     depths: FloatArray
+    #: Positions of the joints at its start [m, rad].
     at: FloatArray
 
 
 class InsertionPlanner:
-    """
-    Compute the steering law of an insertion, one at a time.
-
-    Parameters
-    ----------
-    needle, steering, prior, settings, start, law
-        As for `SteeringExecutive`.
-
-    Attributes
-    ----------
-    job : Job or None
-        Computation under way.
-    request : PlannedInsertion or None
-        Its request.
-
-    """
+    """Compute the law of an insertion, one at a time; arguments as for `SteeringExecutive`."""
 
     def __init__(
         self,
@@ -78,6 +53,7 @@ class InsertionPlanner:
     ) -> None:
         self._needle, self._steering, self.prior = needle, steering, prior
         self._settings, self._start, self._law = settings, start, law
+        #: Computation under way, and its request.
         self.job: Job[SteeringLaw] | None = None
         self.request: PlannedInsertion | None = None
 
@@ -136,11 +112,8 @@ class InsertionPlanner:
                 self._law,
                 model,
                 (point[0], point[2]),
-                position_limit=settings.guide_limit,
-                turns=settings.turns,
-                load_limit=settings.load_limit,
+                settings.limits(float(point[1] - depths[0]) / steps),
                 roll=float(at[3]) if settings.turns else 0.0,
-                step_limit=settings.farthest(float(point[1] - depths[0]) / steps),
             )
 
         self.request, self.job = request, self._start(work)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from math import sqrt
 from typing import Final
 
+from needle_controller.steering.limits import SteeringLimits, STEP_LENGTH
 from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import constant
 import numpy as np
 
 #: Least number of guide commands within a step.
@@ -20,20 +21,13 @@ JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExecutiveSettings:
+class ExecutiveSettings(SteeringLimits):
     """Steps, tip measurements and limits of a steered insertion."""
 
     step_length: float = constant(
-        5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
+        STEP_LENGTH, 'm', 'insertion from one tip measurement to the next', open_low=True
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
-    guide_limit: float = constant(
-        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
-    )
-    guide_step: float = constant(
-        2e-3, 'm', 'largest change of the guide from one step to the next along x and along z',
-        open_low=True,
-    )  # fmt: skip
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
     acceleration: float = constant(
         0.1,
@@ -41,13 +35,7 @@ class ExecutiveSettings:
         'highest acceleration of needle and guide; not of the guide if continuous',
         open_low=True,
     )
-    turns: int = constant(0, '1', 'allowed number of turns of the needle')
     roll_speed: float = constant(2.0, 'rad/s', 'highest angular speed of the roll', open_low=True)
-    load_limit: float = constant(
-        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; the '
-        'reachable set is computed without it',
-        open_low=True,
-    )  # fmt: skip
     continuous: bool = field(
         default=False,
         metadata={
@@ -86,15 +74,12 @@ class ExecutiveSettings:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        check_constants(self)
+        SteeringLimits.__post_init__(self)
         if self.depth_tolerance >= 0.5 * self.step_length:
             raise ParameterError(
                 f'depth_tolerance must be < half of step_length {self.step_length:g} m, got '
                 f'{self.depth_tolerance:g} m'
             )
-        if self.turns != int(self.turns):
-            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
-        object.__setattr__(self, 'turns', int(self.turns))
         if not isinstance(self.continuous, bool):
             raise ParameterError(f'continuous must be true or false, got {self.continuous!r}')
         if self.continuous and self.turns:
@@ -113,9 +98,9 @@ class ExecutiveSettings:
         """Joints that are moved."""
         return JOINTS if self.turns else JOINTS[:-1]
 
-    def farthest(self, step: float) -> float:
+    def limits(self, step: float) -> SteeringLimits:
         """
-        Return the largest change of the guide per step along each axis [m].
+        Return the limits of the steering law.
 
         Parameters
         ----------
@@ -123,10 +108,16 @@ class ExecutiveSettings:
             Insertion distance of a step [m].
 
         """
-        if not self.continuous:
-            return self.guide_step
-        # Both axes at once, at the peak of the insertion speed.
-        return min(self.guide_step, sqrt(0.5) * self.guide_speed * step / self.speed)
+        change = self.guide_step
+        if self.continuous:
+            # Both axes at once, at the peak of the insertion speed.
+            change = min(change, sqrt(0.5) * self.guide_speed * step / self.speed)
+        return SteeringLimits(
+            guide_limit=self.guide_limit,
+            guide_step=change,
+            load_limit=self.load_limit,
+            turns=self.turns,
+        )
 
     @property
     def tolerances(self) -> FloatArray:

@@ -1,61 +1,53 @@
-"""Simulated needle that differs from the nominal model, and its insertion under a controller."""
+"""Simulated needle that differs from the nominal model, and its insertion under a steering law."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import hypot
+from time import perf_counter
 from typing import NamedTuple
 
-from needle_controller.steering.law import GuideSetpoint
+from needle_controller.steering.law import GuideSetpoint, SteeringLaw
 from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GroundTruth:
-    """
-    Ground truth of a simulated needle, and the rotation of its sensor.
-
-    Attributes
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        Their constants for steering.
-    tilt : tuple of float
-        Tilt of the guide in x and z.
-    bevel : ndarray, shape (2,)
-        Load of the bevel in x and z [N].
-    frame : ndarray, shape (2,)
-        Rotation of the sensor's frame: shift of the tip in x and z per depth [rad].
-    seed : int
-        Seed of the noise of the path.
-
-    """
+    """Ground truth of a simulated needle, and the rotation of its sensor."""
 
     needle: NeedleParameters
     steering: SteeringParameters
+    #: Tilt of the guide in x and z [rad].
     tilt: tuple[float, float]
+    #: Load of the bevel in x and z [N], shape (2,).
     bevel: FloatArray
+    #: Rotation of the sensor's frame: shift of the tip in x and z per depth [rad], shape (2,).
     frame: FloatArray
+    #: Seed of the noise of the path.
     seed: int
 
-    def start(self) -> SteeredNeedle:
-        """Return the needle before the insertion."""
+    def plant(self, depths: FloatArray) -> SteeringPlant:
+        """Return the needle before an insertion to depths [m], shape (n + 1,)."""
         roll = float(np.arctan2(*self.bevel))
-        return SteeredNeedle(self.needle, self.steering, tilt=self.tilt, roll=roll, seed=self.seed)
+        needle = SteeredNeedle(
+            self.needle, self.steering, tilt=self.tilt, roll=roll, seed=self.seed
+        )
+        return SteeringPlant(needle, depths, self.frame)
 
-    def tip(self, one: SteeredNeedle) -> FloatArray:
-        """Return the tip position of a needle in the frame of the sensor, x and z [m]."""
-        return np.asarray(one.tip[[0, 2]] + self.frame * one.depth)
+
+def step_depths(depth: float, step: float) -> FloatArray:
+    """Return the depths of steps of about a length, from the skin to a depth [m]."""
+    return np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
 
 
-def drawn(
+def sample_truth(
     needle: NeedleParameters,
     steering: SteeringParameters,
     prior: SteeringPrior,
@@ -84,53 +76,82 @@ def drawn(
     )
 
 
-class Inserted(NamedTuple):
+class SteeringPlant:
     """
-    Result of an insertion.
+    Simulated needle that is inserted in steps, and its tip in the frame of the sensor.
 
-    Attributes
-    ----------
-    needle : SteeredNeedle
-        The needle at the end.
-    way : float
-        Distance moved by the guide [m].
-    turns : int
-        Number of turns of the needle.
-    load : float
-        Largest force on the guide after a motion of the guide [N].
-
+    The needle is at the first of the ``depths`` of the tip measurements [m], shape (n + 1,), and
+    ``step`` is the number of its present depth; ``frame`` as in `GroundTruth`.
     """
 
-    needle: SteeredNeedle
-    way: float
+    def __init__(
+        self, needle: SteeredNeedle, depths: FloatArray, frame: ArrayLike = (0.0, 0.0)
+    ) -> None:
+        self.needle, self.depths, self.step = needle, depths, 0
+        self._roll, self._frame = needle.roll, np.array(frame)
+
+    @property
+    def tip(self) -> FloatArray:
+        """Position of the tip in the frame of the sensor, x and z [m]."""
+        return np.asarray(self.needle.tip[[0, 2]] + self._frame * self.needle.depth)
+
+    @property
+    def done(self) -> bool:
+        """Whether the needle is at the last depth."""
+        return self.step == len(self.depths) - 1
+
+    def guide(self, to: GuideSetpoint) -> None:
+        """Move guide and roll, while the depth is constant."""
+        self.needle.move(guide=to[:2], roll=self._roll + to.roll)
+
+    def insert(self) -> None:
+        """Insert the needle to the next depth."""
+        self.needle.move(depth=float(self.depths[self.step + 1]))
+        self.step += 1
+
+
+class SteeringRun(NamedTuple):
+    """Simulated insertion under a steering law."""
+
+    #: Distance traveled by the guide [m], and number of turns of the needle.
+    travel: float
     turns: int
+    #: Largest force on the guide after a motion of the guide [N].
     load: float
+    #: First warning of the law before the last depth, with its depth; '' without one.
+    warning: str
+    #: Computation time of the law at each depth [s].
+    times: list[float]
 
 
-def insert(
-    truth: GroundTruth,
-    depths: FloatArray,
-    look: Callable[[FloatArray], FloatArray | None],
-    controller: Callable[[FloatArray | None], GuideSetpoint],
-    watch: Callable[[SteeredNeedle], object] | None = None,
-) -> Inserted:
+def simulate_steering(
+    law: SteeringLaw,
+    plant: SteeringPlant,
+    sensor: Callable[[FloatArray], FloatArray | None],
+    watch: Callable[[SteeringPlant], object] | None = None,
+) -> SteeringRun:
     """
-    Insert a needle in steps: measure the tip, move guide and roll, then insert.
+    Insert a simulated needle in steps: measure the tip, plan, move guide and roll, insert.
 
-    ``depths`` are the depths of the measurements [m], shape (n + 1,). ``look`` returns the
-    measurement of the tip, shape (2,), or None; ``controller`` takes it and returns guide and roll
-    for the next step. ``watch`` is called with the needle after each step.
+    ``sensor`` returns a measurement of the tip, shape (2,) [m], or None. ``watch`` is called after
+    each step. Raises `SteeringFaultError` if the law stops the insertion.
     """
-    one = truth.start()
-    begun, to, way, turns, load = one.roll, GuideSetpoint(0.0, 0.0), 0.0, 0, 0.0
-    for k, depth in enumerate(depths.tolist()):
-        if k:
-            one.move(guide=to[:2], roll=begun + to.roll)
-            load = max(load, hypot(*one.guide_load[0].tolist()))
-            one.move(depth=depth)
-            if watch is not None:
-                watch(one)
-        before, to = to, controller(look(truth.tip(one)))
-        way += hypot(to.x - before.x, to.z - before.z)
+    to, travel, turns, load = GuideSetpoint(0.0, 0.0), 0.0, 0, 0.0
+    warning, times = '', list[float]()
+    while True:
+        tip = sensor(plant.tip)
+        begin = perf_counter()
+        law.update(tip, plant.step)
+        before, to = to, law.plan()
+        times.append(perf_counter() - begin)
+        travel += hypot(to.x - before.x, to.z - before.z)
         turns += to.roll != before.roll
-    return Inserted(one, way, turns, load)
+        if plant.done:
+            return SteeringRun(travel, turns, load, warning, times)
+        if not warning and (new := law.warning):
+            warning = f'at a depth of {1e3 * plant.depths[plant.step]:.4g} mm: {new}'
+        plant.guide(to)
+        load = max(load, hypot(*plant.needle.guide_load[0].tolist()))
+        plant.insert()
+        if watch is not None:
+            watch(plant)

@@ -6,22 +6,33 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 import json
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 import sys
 from typing import Any, Final, NamedTuple
 
-from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller import (
+    OutOfReachError,
+    SIMULATION_LIMITS,
+    SteeringModel,
+    SteeringPrior,
+)
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
     find_law,
-    GuideSetpoint,
     STEERING_LAWS,
     TipEstimate,
 )
+from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
-from needle_controller.steering.simulation import drawn, GroundTruth, insert
+from needle_controller.steering.simulation import (
+    GroundTruth,
+    sample_truth,
+    simulate_steering,
+    SteeringPlant,
+    step_depths,
+)
 from needle_dynamics import (
     FloatArray,
     NeedleParameters,
@@ -30,6 +41,7 @@ from needle_dynamics import (
     STEERING_PRESETS,
     SteeringParameters,
 )
+from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
 from needle_insertion.commands.common import check_file, constants, Subcommand
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
@@ -40,8 +52,8 @@ from needle_ros.files import write_whole
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-#: Default target [m], step [m] and limit of the guide [m].
-TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
+#: Default target [m].
+TARGET = '0.004,0.1,-0.002'
 
 #: Constants of needle and tissue with an effect here; unknown disturbances are in the prior.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
@@ -51,9 +63,6 @@ _DRAWN: Final = 0.5
 
 #: Number of needle shapes in the picture.
 _SHOWN: Final = 4
-
-#: Half-width of a 95 % interval over the standard deviation.
-_NORMAL: Final = 1.96
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,8 +79,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--needle',
         choices=tuple(STEERING_PRESETS),
-        default='bending_35mm',
-        help='nominal model of needle and tissue (default bending_35mm)',
+        default=DEFAULT_STEERING_PRESET,
+        help=f'nominal model of needle and tissue (default {DEFAULT_STEERING_PRESET})',
     )
     parser.add_argument(
         '--law',
@@ -98,24 +107,28 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--step',
         type=float,
-        default=STEP,
+        default=STEP_LENGTH,
         metavar='M',
-        help=f'depth per step (default {STEP:g} m)',
+        help=f'depth per step (default {STEP_LENGTH:g} m)',
     )
     parser.add_argument(
         '--limit',
         type=float,
-        default=LIMIT,
+        default=SIMULATION_LIMITS.guide_limit,
         metavar='M',
-        help=f'largest displacement of the guide along x and z (default {LIMIT:g} m)',
+        help='largest displacement of the guide along x and z '
+        f'(default {SIMULATION_LIMITS.guide_limit:g} m)',
     )
     parser.add_argument(
-        '--turns', type=int, default=0, help='largest number of needle rotations (default 0)'
+        '--turns',
+        type=int,
+        default=SIMULATION_LIMITS.turns,
+        help='largest number of needle rotations (default 0)',
     )
     parser.add_argument(
         '--load-limit',
         type=float,
-        default=inf,
+        default=SIMULATION_LIMITS.load_limit,
         metavar='N',
         help='largest planned lateral force on the guide (default: no limit)',
     )
@@ -172,21 +185,22 @@ def _task(options: argparse.Namespace) -> _Task:
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
     given = {**asdict(SteeringPrior()), **constants(options.prior)}
-    steps = max(1, round(target[1] / options.step))
     return _Task(
         target,
         *made(options.needle, options.set),
         from_values(SteeringPrior, given),
-        np.linspace(0.0, target[1], steps + 1),
+        step_depths(target[1], options.step),
     )
 
 
-def _truth(
+def sample_needle(
     needle: NeedleParameters, steering: SteeringParameters, prior: SteeringPrior, seed: int
 ) -> GroundTruth:
     """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
     nearer = {name: _DRAWN * getattr(prior, name) for name in ('tilt', 'frame', 'bevel')}
-    found = drawn(needle, steering, replace(prior, **nearer), np.random.default_rng(seed), seed)
+    found = sample_truth(
+        needle, steering, replace(prior, **nearer), np.random.default_rng(seed), seed
+    )
     bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
     load = float(np.hypot(*bevel))
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
@@ -195,7 +209,7 @@ def _truth(
 def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
     """Return the expected tip and the half width of its interval; None without prediction."""
     mean = None if there is None else there.mean.tolist()
-    half = None if there is None else (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist()
+    half = None if there is None else there.half_width.tolist()
     return {'expected tip [m]': mean, 'its interval of 95 % [m]': half}
 
 
@@ -209,34 +223,31 @@ def _run(options: argparse.Namespace) -> int:
             options.law,
             model,
             aim,
-            position_limit=options.limit,
-            turns=options.turns,
-            load_limit=options.load_limit,
+            replace(
+                SIMULATION_LIMITS,
+                guide_limit=options.limit,
+                turns=options.turns,
+                load_limit=options.load_limit,
+            ),
         )
     except OutOfReachError as error:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
         raise
-    truth = _truth(needle, steering, prior, options.seed)
+    truth = sample_needle(needle, steering, prior, options.seed)
     noise = np.random.default_rng([options.seed, 1])
-    shapes, warnings = list[FloatArray](), list[str]()
+    shapes = list[FloatArray]()
 
-    def look(tip: FloatArray) -> FloatArray:
+    def sensor(tip: FloatArray) -> FloatArray:
         return np.asarray(tip + prior.noise * noise.standard_normal(2))
 
-    def follow(tip: FloatArray | None) -> GuideSetpoint:
-        depth = depths[law.step]
-        law.update(tip, law.step)
-        to = law.plan()
-        if law.warning and not warnings and depth < target[1]:
-            warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {law.warning}')
-        return to
+    def watch(plant: SteeringPlant) -> None:
+        shapes.append(_line(plant.needle.shape))
 
-    done = insert(truth, depths, look, follow, lambda one: shapes.append(_line(one.shape)))
-    ours = done.needle
-    alone = truth.start()
-    alone.move(depth=float(target[1]))
-    tip, other = truth.tip(ours), truth.tip(alone)
+    ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
+    done = simulate_steering(law, ours, sensor, watch)
+    alone.insert()
+    tip, other = ours.tip, alone.tip
     found: dict[str, Any] = {
         'target [m]': aim.tolist(),
         'tip [m]': tip.tolist(),
@@ -244,20 +255,23 @@ def _run(options: argparse.Namespace) -> int:
         **_expected(law.expected()),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
-        'way of the guide [m]': done.way,
+        'way of the guide [m]': done.travel,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
         'bending length over the nominal one': law.status().get('bending_length_ratio'),
-        'warnings': warnings,
+        'warnings': [done.warning] if done.warning else [],
     }
-    for words in warnings:
-        sys.stderr.write(f'warning: {words}\n')
+    if done.warning:
+        sys.stderr.write(f'warning: {done.warning}\n')
     if options.output is not None:
         at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
         # In the frame of the needle, to which the sensor frame is rotated.
         mark = target - np.array([truth.frame[0], 0.0, truth.frame[1]]) * target[1]
         figure = draw_needle(
-            [shapes[k] for k in at.tolist()], _line(ours.path), mark, _line(alone.shape)
+            [shapes[k] for k in at.tolist()],
+            _line(ours.needle.path),
+            mark,
+            _line(alone.needle.shape),
         )
         write_whole(options.output, png(figure))
     if options.json:
@@ -265,7 +279,7 @@ def _run(options: argparse.Namespace) -> int:
         return 0
     sys.stdout.write(
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
-        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.way:.1f} mm in total '
+        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.travel:.1f} mm in total '
         f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
         f'{_text(found)}\n'
     )

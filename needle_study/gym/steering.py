@@ -6,9 +6,12 @@ from typing import Any, ClassVar, Final
 
 import gymnasium
 from gymnasium import spaces
-from needle_controller import SteeringPrior
-from needle_controller.steering.simulation import drawn, GroundTruth
-from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
+from needle_controller import SIMULATION_LIMITS, SteeringPrior
+from needle_controller.steering.law import GuideSetpoint
+from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.simulation import sample_truth, SteeringPlant, step_depths
+from needle_dynamics import FloatArray, STEERING_PRESETS
+from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
 from needle_ros.errors import ParameterError
 from needle_study.gym.pushed import BOUND
 import numpy as np
@@ -48,11 +51,11 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     def __init__(
         self,
-        needle: str = 'bending_35mm',
+        needle: str = DEFAULT_STEERING_PRESET,
         *,
         depth: float = 0.1,
-        step: float = 5e-3,
-        guide_limit: float = 6e-3,
+        step: float = STEP_LENGTH,
+        guide_limit: float = SIMULATION_LIMITS.guide_limit,
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
     ) -> None:
@@ -69,43 +72,47 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         reach = self._needle.length - self._steering.free_length
         if depth > reach:
             raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
-        self._depths = np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
+        self._depths = step_depths(depth, step)
         self._limit, self._aside, self._prior = guide_limit, aside, prior
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
-        self._truth: GroundTruth | None = None
+        self._plant: SteeringPlant | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode with a new needle; return the observation and an empty dict."""
+        """
+        Start an episode with a new needle; return the observation and an empty dict.
+
+        ``options`` may have ``truth``, a `GroundTruth`, and ``target``, x and z [m].
+        """
         super().reset(seed=seed, options=options)
-        rng = self.np_random
-        self._truth = drawn(
+        rng, given = self.np_random, options or {}
+        truth = sample_truth(
             self._needle, self._steering, self._prior, rng, int(rng.integers(_SEEDS))
         )
-        self._one, self._at = self._truth.start(), 0
-        self._target = rng.uniform(-self._aside, self._aside, 2)
-        return self._observe(self._truth, self._one), {}
+        target = rng.uniform(-self._aside, self._aside, 2)
+        self._plant = given.get('truth', truth).plant(self._depths)
+        self._target = np.array(given.get('target', target))
+        return self._observe(self._plant), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Move the guide, then the needle; the action is clipped to [-1, 1]."""
-        truth = self._truth
-        if truth is None or self._at == len(self._depths) - 1:
+        plant = self._plant
+        if plant is None or plant.done:
             raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')
         x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
-        self._one.move(guide=(x, z))
-        self._at += 1
-        self._one.move(depth=float(self._depths[self._at]))
-        seen = self._observe(truth, self._one)
-        if self._at < len(self._depths) - 1:
+        plant.guide(GuideSetpoint(x, z))
+        plant.insert()
+        seen = self._observe(plant)
+        if not plant.done:
             return seen, 0.0, False, False, {}
-        miss = float(np.hypot(*(truth.tip(self._one) - self._target)))
+        miss = float(np.hypot(*(plant.tip - self._target)))
         return seen, -1e3 * miss, True, False, {'miss': miss}
 
-    def _observe(self, truth: GroundTruth, one: SteeredNeedle) -> FloatArray:
-        seen = truth.tip(one) + self._prior.noise * self.np_random.standard_normal(2)
-        depth = one.depth / self._depths[-1]
-        lengths = np.concatenate([seen, self._target, one.guide]) / self._limit
+    def _observe(self, plant: SteeringPlant) -> FloatArray:
+        seen = plant.tip + self._prior.noise * self.np_random.standard_normal(2)
+        depth = plant.needle.depth / self._depths[-1]
+        lengths = np.concatenate([seen, self._target, plant.needle.guide]) / self._limit
         numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)
         return np.asarray(numbers, dtype=np.float32)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from needle_controller import build_law, GuideSetpoint, SteeringModel
+from needle_controller import build_law, GuideSetpoint, SteeringLimits, SteeringModel
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError
 from needle_study.study import made
@@ -29,7 +29,7 @@ class FaultyLaw:
     warning = ''
     plans: Any = None
 
-    def __init__(self, _model: SteeringModel, target: Any, **_limits: Any) -> None:
+    def __init__(self, _model: SteeringModel, target: Any, *_limits: Any) -> None:
         self.step, self.target = 0, np.array(target)
 
     def aim(self, target: Any) -> None:
@@ -95,7 +95,7 @@ def test_invalid_law_is_rejected_in_one_line(
     name: str, complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ParameterError, match=complaint):
-        build_law(name, SteeringModel(NEEDLE, STEERING, [0.0, 0.01]), (0.0, 0.0))
+        build_law(name, SteeringModel(NEEDLE, STEERING, [0.0, 0.01]), (0.0, 0.0), SteeringLimits())
     assert main(['steer', '--law', name]) == 2
     said = capsys.readouterr().err
     assert said.startswith('error: law ')

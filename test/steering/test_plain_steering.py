@@ -6,8 +6,14 @@ from dataclasses import replace
 from math import inf, sqrt, tau
 from typing import Any
 
-from needle_controller import GuideSetpoint, MultiHypothesisLaw, SteeringModel, SteeringPrior
-from needle_controller.steering.simulation import drawn, insert
+from needle_controller import (
+    GuideSetpoint,
+    MultiHypothesisLaw,
+    SteeringLimits,
+    SteeringModel,
+    SteeringPrior,
+)
+from needle_controller.steering.simulation import sample_truth, simulate_steering
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
 import numpy as np
@@ -31,15 +37,13 @@ class Plain:
         self,
         model: SteeringModel,
         target: FloatArray,
-        limit: float,
-        turns: int,
-        load_limit: float,
-        step_limit: float,
+        limits: SteeringLimits,
     ) -> None:
+        limit = limits.guide_limit
         self.model, self.goal, self.limit = model, complex(*target), limit
-        self.turns, self.load_limit, self.roll, self.step = turns, load_limit, 0.0, 0
+        self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0
         n, m = model.steps, len(model.prior_covariance)
-        self.ways = np.minimum(step_limit * np.arange(1, n + 1), 2.0 * limit)
+        self.ways = np.minimum(limits.guide_step * np.arange(1, n + 1), 2.0 * limit)
         self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
         self.mean = np.zeros((len(model.lengths), m), complex)
         self.mean[:, 3] = 1j * model.push
@@ -184,50 +188,56 @@ class Plain:
         return GuideSetpoint(at.real, at.imag, self.roll)
 
 
+class Compared(MultiHypothesisLaw):
+    """The law, which compares each plan and its estimates with the plain formulas."""
+
+    def __init__(self, model: SteeringModel, target: FloatArray, limits: SteeringLimits) -> None:
+        self.plain = Plain(model, target, limits)
+        super().__init__(model, target, limits)
+
+    def update(self, tip: Any, at: int, noise: float = 0.0) -> None:
+        super().update(tip, at, noise)
+        self.plain.see(tip)
+
+    def plan(self) -> GuideSetpoint:
+        to, plain = super().plan(), self.plain
+        # Sums in another order.
+        assert_allclose(to, plain.plan(), rtol=0.0, atol=1e-12)
+        mean, covariance = plain.expected()
+        there = self.expected()
+        assert_allclose(there.mean, mean, rtol=0.0, atol=1e-11)
+        assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
+        assert_allclose(self.weights, plain.weights, rtol=1e-6, atol=1e-12)
+        assert self.chance == pytest.approx(plain.chance, abs=1e-9)
+        return to
+
+
 @pytest.mark.parametrize(
-    ('limit', 'turns', 'load_limit', 'step_limit'),
+    'limits',
     [
-        (6e-3, 0, inf, inf),
-        (6e-3, 0, inf, 2e-3),
-        (6e-3, 0, 2.0, inf),
-        (6e-3, 3, 1e3, 3e-3),
-        (0.0, 4, inf, inf),
+        SteeringLimits(guide_step=inf, load_limit=inf),
+        SteeringLimits(load_limit=inf),
+        SteeringLimits(guide_step=inf, load_limit=2.0),
+        SteeringLimits(turns=3, load_limit=1e3, guide_step=3e-3),
+        SteeringLimits(guide_limit=0.0, turns=4, guide_step=inf, load_limit=inf),
     ],
+    ids=str,
 )
-def test_a_hundred_insertions_equal_the_plain_formulas(
-    limit: float, turns: int, load_limit: float, step_limit: float
-) -> None:
+def test_a_hundred_insertions_equal_the_plain_formulas(limits: SteeringLimits) -> None:
     """The same motions, to a millionth of a micrometer, and the same estimates; twenty each."""
-    model = MODELS[0.8 if turns else 0.0]
+    model = MODELS[0.8 if limits.turns else 0.0]
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        truth = drawn(NEEDLE, STEERING, TRUE, rng, seed)
+        truth = sample_truth(NEEDLE, STEERING, TRUE, rng, seed)
         load = model.push * (1.0 + 0.2 * rng.uniform(-1.0, 1.0))
         bevel = truth.bevel + np.array([0.0, load])
         steering = replace(truth.steering, bevel_load=(float(np.hypot(*bevel)),))
         truth = replace(truth, bevel=bevel, steering=steering)
-        target = (4e-3 if turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
-        ours = MultiHypothesisLaw(model, target, limit, turns, load_limit, step_limit=step_limit)
-        plain = Plain(model, target, limit, turns, load_limit, step_limit)
+        target = (4e-3 if limits.turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
+        law = Compared(model, target, limits)
 
-        def look(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
+        def sensor(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
             return np.asarray(tip + 4e-5 * rng.standard_normal(2))
 
-        def both(
-            tip: FloatArray | None, ours: MultiHypothesisLaw = ours, plain: Plain = plain
-        ) -> GuideSetpoint:
-            assert tip is not None
-            to = ours.next(tip)
-            plain.see(tip)
-            # Sums in another order.
-            assert_allclose(to, plain.plan(), rtol=0.0, atol=1e-12)
-            mean, covariance = plain.expected()
-            there = ours.expected()
-            assert_allclose(there.mean, mean, rtol=0.0, atol=1e-11)
-            assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
-            assert_allclose(ours.weights, plain.weights, rtol=1e-6, atol=1e-12)
-            assert ours.chance == pytest.approx(plain.chance, abs=1e-9)
-            return to
-
-        insert(truth, DEPTHS, look, both)
-        assert ours.turns == plain.turns
+        simulate_steering(law, truth.plant(DEPTHS), sensor)
+        assert law.turns == law.plain.turns

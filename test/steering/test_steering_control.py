@@ -14,7 +14,10 @@ from needle_controller import (
     GuideSetpoint,
     MultiHypothesisLaw,
     OutOfReachError,
+    SIMULATION_LIMITS,
     SteeringFaultError,
+    SteeringLaw,
+    SteeringLimits,
     SteeringModel,
     SteeringPrior,
 )
@@ -23,6 +26,7 @@ from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
+from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import (
     FloatArray,
     JobError,
@@ -37,6 +41,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
+LIMITS = SIMULATION_LIMITS
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
 DEPTHS = np.linspace(0.0, 0.1, 21)
@@ -53,22 +58,19 @@ def other(length: float, skin: float = 1.0) -> tuple[NeedleParameters, SteeringP
     )
 
 
-def steer(
-    controller: MultiHypothesisLaw | GuideLaw,
-    needle: SteeredNeedle,
-    noise: float = 1e-7,
-    seed: int = 0,
-) -> FloatArray:
-    """Insert a needle; return the final tip position. Each measurement has its own noise."""
+def sensor(noise: float, seed: int = 0) -> Callable[[FloatArray], FloatArray]:
+    """Return a sensor whose measurements each have their own noise [m]."""
     rng = np.random.default_rng(seed)
-    to = GuideSetpoint(0.0, 0.0)
-    begun = needle.roll
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            needle.move(guide=to[:2], roll=begun + to.roll)
-            needle.move(depth=depth)
-        to = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
-    return needle.tip[[0, 2]]
+    return lambda tip: np.asarray(tip + noise * rng.standard_normal(2))
+
+
+def steer(
+    law: SteeringLaw, needle: SteeredNeedle, noise: float = 1e-7, seed: int = 0
+) -> FloatArray:
+    """Insert a needle; return the final tip position."""
+    plant = SteeringPlant(needle, DEPTHS)
+    simulate_steering(law, plant, sensor(noise, seed))
+    return plant.tip
 
 
 @pytest.mark.parametrize(('length', 'skin'), [(1.0, 1.0), (0.8, 1.2)])
@@ -117,7 +119,7 @@ def test_target_is_hit_within_the_prior_uncertainty(
     """With almost no noise within 0.2 mm; open loop misses by millimeters."""
     needle, steering = other(length, skin)
     one = SteeredNeedle(needle, replace(steering, bevel_load=(bevel,)), tilt=tilt, roll=roll)
-    controller = MultiHypothesisLaw(MODEL, target)
+    controller = MultiHypothesisLaw(MODEL, target, LIMITS)
     tip = steer(controller, one)
     # Half the distance of the compared positions, and the remaining uncertainty.
     assert np.hypot(*(tip - target)) < 2e-4
@@ -129,7 +131,7 @@ def test_target_is_hit_within_the_prior_uncertainty(
 @pytest.mark.parametrize('again', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])  # noqa: S301
 def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
     """Of needle and controller, half way in; they end at the same tip as the originals."""
-    one, controller = SteeredNeedle(*other(0.9)), MultiHypothesisLaw(MODEL, (2e-3, 1e-3))
+    one, controller = SteeredNeedle(*other(0.9)), MultiHypothesisLaw(MODEL, (2e-3, 1e-3), LIMITS)
     to, copies = (
         GuideSetpoint(0.0, 0.0),
         list[tuple[SteeredNeedle, MultiHypothesisLaw, GuideSetpoint]](),
@@ -141,7 +143,8 @@ def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
             if k:
                 needle.move(guide=there[:2])
                 needle.move(depth=DEPTHS[k].item())
-            pairs[i] = needle, follows, follows.next(needle.tip[[0, 2]] + look)
+            follows.update(needle.tip[[0, 2]] + look, k)
+            pairs[i] = needle, follows, follows.plan()
         (one, controller, to), *copies = pairs
         if k == 10:
             assert controller.step == 11
@@ -161,7 +164,9 @@ def test_both_planes_are_equivalent() -> None:
     }
     for name, turn in turns.items():
         one = SteeredNeedle(*other(0.9), tilt=turn((0.01, -0.02)))
-        tips[name] = turn(steer(MultiHypothesisLaw(MODEL, turn((2e-3, 1e-3))), one).tolist())
+        tips[name] = turn(
+            steer(MultiHypothesisLaw(MODEL, turn((2e-3, 1e-3)), LIMITS), one).tolist()
+        )
     # The effect of the noise.
     assert_allclose(tips['swapped'], tips['as it is'], atol=2e-5)
     assert_allclose(tips['mirrored'], tips['as it is'], atol=2e-5)
@@ -169,7 +174,7 @@ def test_both_planes_are_equivalent() -> None:
 
 def test_bending_length_is_identified() -> None:
     """The remaining hypotheses are near the truth, and weights are a distribution."""
-    controller = MultiHypothesisLaw(MODEL, (3e-3, -2e-3))
+    controller = MultiHypothesisLaw(MODEL, (3e-3, -2e-3), LIMITS)
     assert_allclose(controller.weights, 1.0 / len(MODEL.lengths))
     steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
     weights = controller.weights
@@ -182,7 +187,7 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
     """The same measurement with four times its noise; a future depth is rejected."""
     left = []
     for noise in (0.0, 1.6e-4):
-        controller = MultiHypothesisLaw(MODEL, (0.0, 0.0))
+        controller = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
         controller.update((1e-4, 0.0), 0, noise)
         left.append(controller.expected(0).covariance[0, 0])
     assert left[1] > 8.0 * left[0]
@@ -194,14 +199,14 @@ def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
     with pytest.raises(
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
     ):
-        MultiHypothesisLaw(MODEL, (0.04, 0.0))
+        MultiHypothesisLaw(MODEL, (0.04, 0.0), LIMITS)
     with pytest.raises(OutOfReachError, match=r'reachable are x = 0\.00 ± \d'):
-        MultiHypothesisLaw(MODEL, (8e-3, 0.0), position_limit=1e-4)
+        MultiHypothesisLaw(MODEL, (8e-3, 0.0), replace(LIMITS, guide_limit=1e-4))
 
 
 def test_warning_when_the_target_leaves_the_reachable_set() -> None:
     """A stuck guide leaves the needle to its drift; the warning is before the end."""
-    controller = MultiHypothesisLaw(MODEL, (0.0, 4e-3))
+    controller = MultiHypothesisLaw(MODEL, (0.0, 4e-3), LIMITS)
     assert controller.warning == ''
     one = SteeredNeedle(*other(1.0), tilt=(0.0, -0.05))
     first = None
@@ -209,7 +214,8 @@ def test_warning_when_the_target_leaves_the_reachable_set() -> None:
         if k:
             one.move(depth=depth)
         try:
-            controller.next(one.tip[[0, 2]])
+            controller.update(one.tip[[0, 2]], k)
+            controller.plan()
         except SteeringFaultError:
             # Or the measurements are implausible for the commanded guide.
             first = first or k
@@ -222,21 +228,22 @@ def test_warning_when_the_target_leaves_the_reachable_set() -> None:
 
 def faulty(change: dict[int, Any]) -> tuple[MultiHypothesisLaw, SteeredNeedle]:
     """Steer with some measurements replaced; a number is the offset of a measurement in x [m]."""
-    controller, one = MultiHypothesisLaw(MODEL, (2e-3, 1e-3)), SteeredNeedle(*other(0.9))
-    guide, rng = (0.0, 0.0), np.random.default_rng(4)
+    controller, one = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), LIMITS), SteeredNeedle(*other(0.9))
+    plant, measured = SteeringPlant(one, DEPTHS), sensor(4e-5, 4)
     before: Any = None
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=guide)
-            one.move(depth=depth)
-        look: Any = one.tip[[0, 2]] + 4e-5 * rng.standard_normal(2)
-        if k in change:
-            what = change[k]
+
+    def sees(tip: FloatArray) -> Any:
+        nonlocal before
+        look: Any = measured(tip)
+        if plant.step in change:
+            what = change[plant.step]
             look = {'lost': None, 'same': before, 'nan': [np.nan, 0.0]}.get(what, look)
             if isinstance(what, float):
                 look = look + np.array([what, 0.0])
         before = look
-        guide = controller.next(look)[:2]
+        return look
+
+    simulate_steering(controller, plant, sees)
     return controller, one
 
 
@@ -283,23 +290,19 @@ def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
     tilt = (0.02 * rng.standard_normal(2)).tolist()
     one = SteeredNeedle(*other(1.0 + 0.25 * rng.uniform(-1.0, 1.0)), tilt=tilt)
     turn = np.array([[np.cos(0.1745), -np.sin(0.1745)], [np.sin(0.1745), np.cos(0.1745)]])
-    controller, guide = MultiHypothesisLaw(MODEL, target), (0.0, 0.0)
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=guide)
-            one.move(depth=depth)
-        tip = turn @ one.tip[[0, 2]]
-        said = ''
-        try:
-            guide = controller.next(tip + 4e-5 * rng.standard_normal(2))[:2]
-        except SteeringFaultError as error:
-            said = str(error)
-            break
+    controller, plant = MultiHypothesisLaw(MODEL, target, LIMITS), SteeringPlant(one, DEPTHS)
+    said = ''
+    try:
+        simulate_steering(
+            controller, plant, lambda tip: turn @ tip + 4e-5 * rng.standard_normal(2)
+        )
+    except SteeringFaultError as error:
+        said = str(error)
     if said:
         assert 'outside the model uncertainty' in said
-        assert depth <= 0.05
+        assert one.depth <= 0.05
     else:
-        assert np.hypot(*(tip - target)) < 5e-4
+        assert np.hypot(*(turn @ plant.tip - target)) < 5e-4
 
 
 def test_invalid_input_is_rejected() -> None:
@@ -309,30 +312,35 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ParameterError, match=r'depths must be in \[0, 0\.16\] m'):
         SteeringModel(NEEDLE, STEERING, [0.0, 0.17])
     with pytest.raises(ShapeError, match=r'target must be x and z, got shape \(3,\)'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.1, 0.0))
+        MultiHypothesisLaw(MODEL, (0.0, 0.1, 0.0), LIMITS)
     with pytest.raises(ParameterError, match='target must be finite'):
-        MultiHypothesisLaw(MODEL, (0.0, np.inf))
-    with pytest.raises(ParameterError, match='position_limit must be finite and >= 0'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), position_limit=-1.0)
-    with pytest.raises(ParameterError, match='position_limit and turns cannot both be 0'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), position_limit=0.0)
-    with pytest.raises(ParameterError, match='step_limit must be > 0'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), step_limit=0.0)
-    with pytest.raises(ParameterError, match='turns must be a whole number >= 0, got -1'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), turns=-1)
+        MultiHypothesisLaw(MODEL, (0.0, np.inf), LIMITS)
+    with pytest.raises(ParameterError, match='guide_limit must be finite, >= 0 m'):
+        SteeringLimits(guide_limit=-1.0)
+    with pytest.raises(ParameterError, match='guide_limit and turns cannot both be 0'):
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), SteeringLimits(guide_limit=0.0))
+    with pytest.raises(ParameterError, match='guide_step must be > 0 m'):
+        SteeringLimits(guide_step=0.0)
+    for invalid in (np.nan, -np.inf):
+        with pytest.raises(ParameterError, match='load_limit must be > 0 N'):
+            SteeringLimits(load_limit=invalid)
+    with pytest.raises(ParameterError, match='turns must be a whole number'):
+        SteeringLimits(turns=0.5)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match='turns must be finite, >= 0, got -1'):
+        SteeringLimits(turns=-1)
     with pytest.raises(ParameterError, match='roll must be finite'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), roll=np.nan)
-    with pytest.raises(ParameterError, match='load_limit must be > 0'):
-        MultiHypothesisLaw(MODEL, (0.0, 0.0), load_limit=0.0)
+        MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS, roll=np.nan)
+    with pytest.raises(ParameterError, match='load_limit must be > 0 N'):
+        SteeringLimits(load_limit=0.0)
     with pytest.raises(ParameterError, match='spread must be finite'):
         SteeringPrior(spread=-0.1)
-    controller = MultiHypothesisLaw(MODEL, (0.0, 0.0))
+    controller = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
-        controller.next([0.0, 0.0, 0.0])
-    done = MultiHypothesisLaw(MODEL, (0.0, 0.0))
+        controller.update([0.0, 0.0, 0.0], 0)
+    done = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     steer(done, SteeredNeedle(*other(1.0)))
     with pytest.raises(JobError, match='all 20 steps are done'):
-        done.next([0.0, 0.0])
+        done.update([0.0, 0.0], done.step)
 
 
 def test_published_laws_behave_as_published() -> None:
@@ -340,10 +348,10 @@ def test_published_laws_behave_as_published() -> None:
     target = (3e-3, -2e-3)
     miss = {}
     controllers: Mapping[str, MultiHypothesisLaw | GuideLaw] = {
-        'open': OpenLoopLaw(MODEL, target),
-        'springs': SpringsLaw(MODEL, target),
-        'Broyden': BroydenLaw(MODEL, target),
-        'ours': MultiHypothesisLaw(MODEL, target),
+        'open': OpenLoopLaw(MODEL, target, LIMITS),
+        'springs': SpringsLaw(MODEL, target, LIMITS),
+        'Broyden': BroydenLaw(MODEL, target, LIMITS),
+        'ours': MultiHypothesisLaw(MODEL, target, LIMITS),
     }
     for name, controller in controllers.items():
         one = SteeredNeedle(*other(0.9), tilt=(0.02, 0.01))
@@ -353,8 +361,9 @@ def test_published_laws_behave_as_published() -> None:
     assert miss['ours'] < 1e-4 < miss['springs'] < miss['open']
     assert miss['Broyden'] < miss['open']
     # A missing measurement causes no motion.
-    rests = BroydenLaw(MODEL, target)
-    assert rests.next(None) == GuideSetpoint(0.0, 0.0)
+    rests = BroydenLaw(MODEL, target, LIMITS)
+    rests.update(None, 0)
+    assert rests.plan() == GuideSetpoint(0.0, 0.0)
 
 
 #: A nominal needle with a bevel.
@@ -400,9 +409,11 @@ def test_bevel_is_turned_towards_the_target(
     steering = replace(steering, bevel_load=(0.8 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0)),))
     miss = {}
     controllers: dict[str, MultiHypothesisLaw | GuideLaw] = {
-        'ours': MultiHypothesisLaw(BEVEL_MODEL, target, limit, turns),
-        'towards': RollToTargetLaw(BEVEL_MODEL, target, turns=len(DEPTHS)),
-        'rests': OpenLoopLaw(BEVEL_MODEL, target),
+        'ours': MultiHypothesisLaw(
+            BEVEL_MODEL, target, replace(LIMITS, guide_limit=limit, turns=turns)
+        ),
+        'towards': RollToTargetLaw(BEVEL_MODEL, target, replace(LIMITS, turns=len(DEPTHS))),
+        'rests': OpenLoopLaw(BEVEL_MODEL, target, LIMITS),
     }
     for name, controller in controllers.items():
         one = SteeredNeedle(needle, steering, tilt=(5e-3, -5e-3))
@@ -416,40 +427,27 @@ def test_bevel_is_turned_towards_the_target(
 
 def test_guide_with_limited_steps_hits_the_target() -> None:
     """A third of its range per step; targets out of reach are rejected."""
-    controller = MultiHypothesisLaw(MODEL, (3e-3, 2e-3), step_limit=2e-3)
-    one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), GuideSetpoint(0.0, 0.0), [0.0]
-    rng = np.random.default_rng(1)
-    for k, depth in enumerate(DEPTHS.tolist()):
-        if k:
-            one.move(guide=to[:2])
-            one.move(depth=depth)
-        before, to = to, controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
-        ways += [abs(to.x - before.x), abs(to.z - before.z)]
+    controller = MultiHypothesisLaw(MODEL, (3e-3, 2e-3), replace(LIMITS, guide_step=2e-3))
+    plant, guides = SteeringPlant(SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), DEPTHS), []
+    simulate_steering(
+        controller, plant, sensor(1e-5, 1), lambda at: guides.append(at.needle.guide)
+    )
+    ways = np.abs(np.diff([np.zeros(2), *guides], axis=0))
     # Rounding.
-    assert max(ways) <= 2e-3 * (1.0 + 1e-12)
-    assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 3e-4
+    assert ways.max() <= 2e-3 * (1.0 + 1e-12)
+    assert np.hypot(*(plant.tip - controller.target)) < 3e-4
     with pytest.raises(OutOfReachError):
-        MultiHypothesisLaw(MODEL, (0.02, 0.0), step_limit=1e-4)
+        MultiHypothesisLaw(MODEL, (0.02, 0.0), replace(LIMITS, guide_step=1e-4))
 
 
 def test_guide_load_stays_within_its_limit() -> None:
     """Without a limit the guide load is twice as large; the target is still hit."""
     target, loads, miss = (3e-3, 2e-3), {}, {}
     for limit in (np.inf, 2.0):
-        controller = MultiHypothesisLaw(MODEL, target, load_limit=limit)
-        one, to, felt = (
-            SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)),
-            GuideSetpoint(0.0, 0.0),
-            [0.0],
-        )
-        rng = np.random.default_rng(1)
-        for k, depth in enumerate(DEPTHS.tolist()):
-            if k:
-                one.move(guide=to[:2])
-                felt.append(float(np.abs(one.guide_load[0]).max()))
-                one.move(depth=depth)
-            to = controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
-        loads[limit], miss[limit] = max(felt), np.hypot(*(one.tip[[0, 2]] - target))
+        controller = MultiHypothesisLaw(MODEL, target, replace(LIMITS, load_limit=limit))
+        plant = SteeringPlant(SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)), DEPTHS)
+        loads[limit] = simulate_steering(controller, plant, sensor(1e-5, 1)).load
+        miss[limit] = np.hypot(*(plant.tip - target))
     assert loads[np.inf] > 3.5
     # The plan uses the nominal model until the bending length is identified.
     assert loads[2.0] < 3.0

@@ -42,19 +42,20 @@ class BroydenLaw(GuideLaw):
     moves with the guide, deeper against it, and a wrong sign drives the guide to its limit,
     without any further correction.
 
-    Parameters as for `GuideLaw`; ``position_limit`` must not be 0.
+    Parameters as for `GuideLaw`; ``guide_limit`` must not be 0.
     """
 
     def prepare(self, model: SteeringModel) -> None:
         """Compute the first matrix from a simulated insertion."""
-        if self.limit == 0.0:
-            raise ParameterError('position_limit cannot be 0: nothing would move')
+        limit = self.limits.guide_limit
+        if limit == 0.0:
+            raise ParameterError('guide_limit cannot be 0: nothing would move')
         #: Derivatives of x and z of the tip by x and z of the guide and the depth.
         self._matrix = np.zeros((2, 3))
         self._before: tuple[FloatArray, FloatArray] | None = None
         earlier = SteeredNeedle(model.needle, model.steering)
         for k, depth in enumerate(self.depths.tolist()):
-            guide = 0.5 * self.limit * np.array([sin(2.0 * k), sin(3.0 * k)])
+            guide = 0.5 * limit * np.array([sin(2.0 * k), sin(3.0 * k)])
             earlier.move(depth=depth, guide=guide.tolist())
             self._learn(earlier.tip[[0, 2]], np.array([*guide, depth]))
         self._before = None
@@ -75,6 +76,7 @@ class BroydenLaw(GuideLaw):
         if depth < _HELD:
             return self.guides[-1]
         ahead = self.depths[self.step + 1] - depth
+        limit = self.limits.guide_limit
         across, along = self._matrix[:, :2], self._matrix[:, 2]
         wanted = self.target - tip - along * ahead + across @ guide
-        return np.asarray(lsq_linear(across, wanted, (-self.limit, self.limit)).x)
+        return np.asarray(lsq_linear(across, wanted, (-limit, limit)).x)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from math import inf
 
-from needle_controller.steering.law import check_limits, checked_target, GuideSetpoint, TipEstimate
+from needle_controller.steering.law import checked_roll, checked_target, GuideSetpoint, TipEstimate
+from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import ShapeError
@@ -28,19 +28,14 @@ class GuideLaw(ABC):
         self,
         model: SteeringModel,
         target: ArrayLike,
-        position_limit: float = 6e-3,
-        turns: int = 0,
-        load_limit: float = inf,
+        limits: SteeringLimits,
         roll: float = 0.0,
-        step_limit: float = inf,
     ) -> None:
-        check_limits(position_limit, turns, load_limit, roll, step_limit)
-        self.depths = model.depths
-        self.limit, self.turns, self.roll = position_limit, turns, roll
+        self.depths, self.limits = model.depths, limits
+        self.turns, self.roll = limits.turns, checked_roll(roll)
         self.step = 0
         #: Position of the guide at each depth so far [m]; the last one is the present setpoint.
         self.guides = [np.zeros(2)]
-        self._step_limit = step_limit
         self._newest: tuple[FloatArray, int] | None = None
         self.aim(target)
         self.prepare(model)
@@ -69,22 +64,15 @@ class GuideLaw(ABC):
 
     def plan(self) -> GuideSetpoint:
         """Return guide and roll for the next step, and advance to it; unchanged at the end."""
-        guide = self.guides[-1]
+        guide, most, change = self.guides[-1], self.limits.guide_limit, self.limits.guide_step
         if self._newest is not None and self.step < len(self.depths) - 1:
-            wanted = np.clip(
-                self.choose(*self._newest), guide - self._step_limit, guide + self._step_limit
-            )
-            guide = np.clip(wanted, -self.limit, self.limit)
+            wanted = np.clip(self.choose(*self._newest), guide - change, guide + change)
+            guide = np.clip(wanted, -most, most)
         self._newest = None
         self.guides.append(guide)
         self.step += 1
         x, z = guide.tolist()
         return GuideSetpoint(x, z, self.roll)
-
-    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
-        """Process a tip measurement at the present depth, and plan the next step."""
-        self.update(tip, self.step)
-        return self.plan()
 
     @abstractmethod
     def choose(self, tip: FloatArray, at: int) -> FloatArray:

@@ -21,7 +21,7 @@ turn is left, the later load of the bevel may have any direction.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import cos, inf, nan, sin
+from math import cos, nan, sin
 from typing import NamedTuple
 
 from needle_controller.compiled.steering import (
@@ -42,12 +42,13 @@ from needle_controller.compiled.steering import (
     weights,
 )
 from needle_controller.steering.law import (
-    check_limits,
+    checked_roll,
     checked_target,
     GuideSetpoint,
     SteeringFaultError,
     TipEstimate,
 )
+from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError, ShapeError
@@ -107,16 +108,10 @@ class MultiHypothesisLaw:
         Hypotheses, with the depths of the tip measurements.
     target : array_like, shape (2,)
         Target position of the tip at the last depth, x and z in the frame of the sensor [m].
-    position_limit : float
-        Largest position of the guide along x and along z [m]; 0 for a fixed guide.
-    turns : int
-        Allowed number of turns of the needle.
-    load_limit : float
-        Largest force of the guide on needle and tissue that is planned, along x and along z [N].
+    limits : SteeringLimits
+        Limits of the guide setpoints.
     roll : float
         Roll of the needle at the start [rad].
-    step_limit : float
-        Largest change of the guide from one step to the next along x and along z [m].
 
     Attributes
     ----------
@@ -132,7 +127,7 @@ class MultiHypothesisLaw:
     Raises
     ------
     ShapeError, ParameterError
-        If the target is not two finite numbers, or a limit is not valid.
+        If the target is not two finite numbers, the roll is not finite, or nothing can move.
     OutOfReachError
         If the target is out of reach; the message contains the reachable set.
 
@@ -142,15 +137,17 @@ class MultiHypothesisLaw:
 
     >>> from dataclasses import replace
     >>> import numpy as np
-    >>> from needle_controller import MultiHypothesisLaw, SteeringModel
+    >>> from needle_controller import MultiHypothesisLaw, SteeringLimits, SteeringModel
     >>> from needle_dynamics import SteeredNeedle, STEERING_PRESETS
     >>> nominal, steering, _ = STEERING_PRESETS['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
-    >>> control = MultiHypothesisLaw(SteeringModel(nominal, steering, depths), (2e-3, -1e-3))
+    >>> model = SteeringModel(nominal, steering, depths)
+    >>> control = MultiHypothesisLaw(model, (2e-3, -1e-3), SteeringLimits())
     >>> softer = replace(nominal, tissue_stiffness=0.8 * nominal.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
-    ...     x, z, _ = control.next(needle.tip[[0, 2]])
+    ...     control.update(needle.tip[[0, 2]], control.step)
+    ...     x, z, _ = control.plan()
     ...     needle.move(guide=(x, z))
     ...     needle.move(depth=depth)
     >>> miss = np.hypot(*(needle.tip[[0, 2]] - control.target))
@@ -163,15 +160,12 @@ class MultiHypothesisLaw:
         self,
         model: SteeringModel,
         target: ArrayLike,
-        position_limit: float = 6e-3,
-        turns: int = 0,
-        load_limit: float = inf,
+        limits: SteeringLimits,
         roll: float = 0.0,
-        step_limit: float = inf,
     ) -> None:
-        check_limits(position_limit, turns, load_limit, roll, step_limit)
-        if position_limit == 0.0 and turns == 0:
-            raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
+        roll, limit, turns = checked_roll(roll), limits.guide_limit, limits.turns
+        if limit == 0.0 and turns == 0:
+            raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
         from needle_dynamics.compiled.boxed import Boxed
 
         count, size = len(model.lengths), len(model.prior_covariance)
@@ -182,9 +176,9 @@ class MultiHypothesisLaw:
         self._model = model
         self._now = Steering(
             responses=model.responses,
-            limit=float(position_limit),
-            load_limit=float(load_limit),
-            ways=np.minimum(step_limit * np.arange(1.0, model.steps + 1.0), 2.0 * position_limit),
+            limit=float(limit),
+            load_limit=float(limits.load_limit),
+            ways=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
             covariance=covariance,
@@ -305,34 +299,6 @@ class MultiHypothesisLaw:
 
     # Steps.
 
-    def next(self, tip: Sequence[float] | FloatArray | None) -> GuideSetpoint:
-        """
-        Process a tip measurement, and return guide and roll for the next step.
-
-        Parameters
-        ----------
-        tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
-
-        Returns
-        -------
-        GuideSetpoint
-            Guide and roll; unchanged after the last measurement.
-
-        Raises
-        ------
-        ShapeError
-            If the measurement does not have two numbers.
-        JobError
-            If all steps are done.
-        SteeringFaultError
-            If the measurements are missing for too long, have frozen, or are implausible. The
-            needle must then stop.
-
-        """
-        self.update(tip, self.step)
-        return self.plan()
-
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
@@ -342,7 +308,7 @@ class MultiHypothesisLaw:
         Parameters
         ----------
         tip : array_like of shape (2,) or None
-            As for `next`.
+            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
         at : int
             Number of the depth, not greater than `step`.
         noise : float
@@ -352,8 +318,13 @@ class MultiHypothesisLaw:
         ------
         ParameterError
             If there is no such depth yet.
-        ShapeError, JobError, SteeringFaultError
-            As for `next`.
+        ShapeError
+            If the measurement does not have two numbers.
+        JobError
+            If all steps are done.
+        SteeringFaultError
+            If the measurements are missing for too long, have frozen, or are implausible. The
+            needle must then stop.
 
         """
         if self.step > self._model.steps:
@@ -386,7 +357,7 @@ class MultiHypothesisLaw:
         Returns
         -------
         GuideSetpoint
-            As from `next`.
+            Guide and roll; unchanged after the last measurement.
 
         """
         now, k, last = self._now, self.step, self._model.steps - 1

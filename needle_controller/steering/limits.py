@@ -1,0 +1,52 @@
+"""Limits of a steering law, as parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringLimits:
+    """
+    Limits of the guide setpoints of a steering law.
+
+    The defaults are for a robot: a force on tissue and a motion without a limit are never implied.
+
+    Raises
+    ------
+    ParameterError
+        If a limit is not a number or is outside its range.
+
+    """
+
+    guide_limit: float = constant(
+        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
+    )
+    guide_step: float = constant(
+        2e-3, 'm', 'largest change of the guide from one step to the next along x and along z',
+        open_low=True, unlimited=True,
+    )  # fmt: skip
+    load_limit: float = constant(
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; the '
+        'reachable set is computed without it',
+        open_low=True, unlimited=True,
+    )  # fmt: skip
+    turns: int = constant(0, '1', 'allowed number of turns of the needle')
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if self.turns != int(self.turns):
+            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
+        object.__setattr__(self, 'turns', int(self.turns))
+
+
+#: Default insertion from one tip measurement to the next [m].
+STEP_LENGTH: Final = 5e-3
+
+#: Default limits of simulations: only the position of the guide is limited.
+SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)
