@@ -36,11 +36,7 @@ class Application:
         return all(answer is None or answer.done() for answer in self._answers.values())
 
     def outcome(self) -> tuple[bool, str]:
-        """
-        Return whether each existing node set all parameters that it can change, and a message.
-
-        The message lists for each node the parameters that it set and those that it rejected.
-        """
+        """Return whether each existing node set all that it can, and a message by node."""
         outcomes = [self._of_node(name, answer) for name, answer in self._answers.items()]
         verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
         return bool(verdicts) and all(verdicts), '; '.join(words for _, words in outcomes)

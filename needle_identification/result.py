@@ -22,11 +22,9 @@ NODES: Final = ('plant', 'controller')
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     """
-    Return identified parameters as parameters of the nodes plant and controller.
+    Return identified constants of the model as parameters of plant and controller, in SI units.
 
-    Keys are names such as ``model.coulomb_friction``; values are in SI units. Only determined
-    parameters that are constants of the model are included. A mean outside the range of its
-    parameter, which can only be within its error of the limit, is set to the limit.
+    A mean outside the range of its parameter, by less than its error, is set to the limit.
     """
     # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters

@@ -14,25 +14,11 @@ from needle_identification.stiffness.summary import StiffnessSummary
 
 
 class Status(NamedTuple):
-    """
-    A result as a message and values.
+    """A result as a message and values; ``source`` is ``recordings`` or ``live``."""
 
-    Attributes
-    ----------
-    name, message : str
-        Parameter or recording, and the result as text.
-    values : mapping
-        Values by name; None if not applicable.
-    is_determined : bool
-        Whether the data determine the parameter.
-    source : str
-        Source of a parameter: ``recordings`` or ``live``.
-
-    """
-
-    name: str
+    name: str  # parameter or recording
     message: str
-    values: Mapping[str, object]
+    values: Mapping[str, object]  # None if not applicable
     is_determined: bool = True
     source: str = ''
 

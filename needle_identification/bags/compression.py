@@ -52,12 +52,7 @@ def read_up_to(stream: Any, length: int) -> bytes:
 
 
 def decompress(compression: str, data: bytes, size: int) -> bytes:
-    """
-    Decompress data (``zstd``, ``lz4``, or '' for none) up to `size` bytes.
-
-    Truncated data are decompressed up to their end. Raises a ValueError for an unknown
-    compression.
-    """
+    """Decompress data (``zstd``, ``lz4`` or '') up to `size` bytes, also if truncated."""
     if compression == 'zstd':
         with _zstd_stream(data) as stream:
             return read_up_to(stream, size)

@@ -34,19 +34,7 @@ def factor() -> float:
 
 
 class Budget:
-    """
-    Remaining decompressed size of a file.
-
-    Attributes
-    ----------
-    name : str
-        Name of the file.
-    largest : int
-        Largest record [bytes].
-    largest_message : int
-        Largest message that was compressed individually [bytes].
-
-    """
+    """Remaining decompressed size of a file, and its largest record and message [bytes]."""
 
     def __init__(self, file: Path) -> None:
         times = factor()

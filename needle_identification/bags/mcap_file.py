@@ -109,11 +109,7 @@ def indexed_topics(file: Path) -> set[BagTopic] | None:
 
 
 def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
-    """
-    Read an MCAP file, compressed or not; yield the messages of the selected topics.
-
-    Raises a RecordingError if it is not an MCAP file.
-    """
+    """Read an MCAP file, compressed or not; yield the messages of the selected topics."""
     channels = _Channels()
     loose = bytearray()
     is_complete = False

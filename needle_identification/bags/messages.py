@@ -96,12 +96,7 @@ def _message_file(type_name: str) -> Path:
 
 
 def definition_of(type_name: str) -> tuple[str, str]:
-    """
-    Return the definition (``ros2msg``) and the type hash of a message type, as stored in a bag.
-
-    Raises a RecordingError if the type is neither in ROS 2 Jazzy nor installed, or its definition
-    is not readable.
-    """
+    """Return the definition (``ros2msg``) and the type hash of a message type."""
     try:
         store = _installed(type_name)
         definition, _ = store.generate_msgdef(type_name, ros_version=2)

@@ -30,11 +30,7 @@ _STEPS_PER_CALL: Final = 10**5
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
-    """
-    Read a ``.db3`` file, compressed or not; yield the messages of the selected topics.
-
-    At a damaged part it raises a sqlite3.Error, after yielding the messages before this part.
-    """
+    """Read a ``.db3`` file; raise sqlite3.Error after the messages before a damaged part."""
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())

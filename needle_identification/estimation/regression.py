@@ -194,17 +194,12 @@ class Regression:
 
 
 class _Solution(NamedTuple):
-    """
-    Parameters (k,), inverse normal matrix (k, k), influence and scores of each sample (n, k).
+    """Parameters, and the change and the contribution of each sample in their equations."""
 
-    The influence is the change of the normal equations with the response of the sample; the scores
-    are the contribution of the sample to these equations, and sum to zero.
-    """
-
-    values: FloatArray
-    inverse: FloatArray
-    influence: FloatArray
-    scores: FloatArray
+    values: FloatArray  # (k,)
+    inverse: FloatArray  # of the normal matrix (k, k)
+    influence: FloatArray  # (n, k)
+    scores: FloatArray  # (n, k), sums to zero
 
 
 def regress(
@@ -384,11 +379,10 @@ def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
     """
-    Weight each sample by the inverse of the noise variance measured in its group.
+    Weight each sample by the inverse of the noise variance about the mean of its group.
 
-    The variance of a group is about its own mean, which excludes a misfit of the model. The noise
-    of all groups enters with the weight of a few correlation windows, because a group of few
-    samples may have a small variance by chance.
+    The noise of all groups enters with the weight of a few correlation windows, because a group of
+    few samples may have a small variance by chance.
     """
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
@@ -441,11 +435,9 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
     """
-    Return a basis of the directions that regressors determine, and the undetermined parameters.
+    Return a basis (k, r) of the directions that regressors determine, and unknown parameters.
 
-    Inputs are the singular values of the regressors of unit norm, (k,), largest first, and their
-    directions, one per row (k, k). Returned are the directions that are not null, one per column
-    (k, r), and a mask of the undetermined parameters, (k,).
+    Inputs are the singular values (k,) of regressors of unit norm, and directions (k, k) by row.
     """
     null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
@@ -472,12 +464,10 @@ def independent_span(correlation: int) -> float:
 
 def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
     """
-    Return the covariance (k, k) of the sum of correlated scores (n, k).
+    Return the covariance (k, k) of the sum of correlated scores (n, k), zero where unused.
 
-    The scores are summed over all positions of a triangular window. This weights their
-    autocovariances with the autocorrelation of the window, the Parzen kernel, which is flat at lag
-    zero and gives no negative variance. Unused samples have score zero, which preserves the time
-    between the others.
+    The triangular window weights their autocovariances with its autocorrelation, the Parzen
+    kernel, which is flat at lag zero and gives no negative variance.
     """
     window = _window(correlation)
     padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))

@@ -69,12 +69,7 @@ def breakaway_force(
 def _push(
     design: Design, span: tuple[int, int, int], least: float
 ) -> tuple[float, float, float] | None:
-    """
-    Return breakaway force, standard error and half width of the interval [N] for one rest.
-
-    ``span`` holds the sample indices at which the rest begins, the motion begins and the motion
-    ends; ``least`` is the smallest rise of the force [N].
-    """
+    """Return breakaway force, error and half interval [N]; span: rest, motion, its end."""
     signals = design.signals
     cutoff = signals.settings.cutoff
     correlation = ceil(_WINDOW_PART * CORRELATION_LENGTH / cutoff / signals.period)

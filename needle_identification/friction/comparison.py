@@ -66,11 +66,7 @@ class CandidateFit:
 
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
-    """
-    Fit each unused term in addition, and leave out each chosen term.
-
-    ``among`` is the number of recordings over which the probability of a false alarm is kept.
-    """
+    """Add each unused term, leave out each chosen term; among: number of recordings."""
     settings = design.signals.settings
     chosen = settings.terms
     samples = _independent_samples(design, fit)
@@ -196,8 +192,7 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     """
     Test whether additional terms lower the prediction error of held-out samples.
 
-    Folds consist of consecutive strokes and rests, so that fitting autocorrelated noise gives a
-    term no advantage.
+    Folds consist of consecutive strokes, so that fitting autocorrelated noise is no advantage.
     """
     used = design.used
     settings = design.signals.settings

@@ -40,38 +40,18 @@ _LONGEST_SETTLING: Final = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Design:
-    """
-    Motion delayed by the lag of the force, and the samples of the regression.
-
-    Attributes
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    speed, acceleration, depth : ndarray, shape (n,)
-        Velocity [m/s], acceleration [m/s^2] and insertion depth [m], delayed by the lag.
-    fresh : ndarray of bool, shape (n,)
-        Whether the needle is at its largest insertion depth so far.
-    regime : ndarray, shape (n,)
-        Sign of the velocity; 0 at rest.
-    change, used : ndarray of bool, shape (n,)
-        Where the regime changes or samples are lost, and samples to use.
-    stroke : ndarray of int, shape (n,)
-        Index of the stroke or rest of each sample.
-    lag_column : ndarray, shape (n, 1) or (n, 0)
-        Derivative of the force by the lag [N/s]; no column if the lag is not estimated.
-
-    """
+    """Motion delayed by the lag of the force, and the samples of the regression, (n,) each."""
 
     signals: FilteredSignals
-    speed: FloatArray
-    acceleration: FloatArray
-    depth: FloatArray
-    fresh: BoolArray
-    regime: FloatArray
-    change: BoolArray
-    used: BoolArray
-    stroke: IntArray
-    lag_column: FloatArray
+    speed: FloatArray  # [m/s], delayed
+    acceleration: FloatArray  # [m/s^2], delayed
+    depth: FloatArray  # insertion depth [m], delayed
+    fresh: BoolArray  # at the largest insertion depth so far
+    regime: FloatArray  # sign of the velocity; 0 at rest
+    change: BoolArray  # where the regime changes or samples are lost
+    used: BoolArray  # samples to use
+    stroke: IntArray  # index of the stroke or rest
+    lag_column: FloatArray  # (n, 1) derivative of the force by the lag [N/s], or (n, 0)
 
     @property
     def estimates_lag(self) -> bool:
@@ -104,9 +84,8 @@ class Design:
         """
         Test whether enough samples lie where a term has an effect.
 
-        ``stribeck`` acts near rest; at higher speeds it is nearly zero, and only velocity noise
-        would support it. ``cutting`` acts in new tissue; without motion into old tissue it is an
-        offset.
+        At higher speeds only velocity noise would support ``stribeck``; without motion into old
+        tissue ``cutting`` is an offset.
         """
         if term == 'cutting':
             inward = self.used & (self.speed > 0.0)
@@ -136,11 +115,7 @@ class Design:
         return replace(self, lag_column=column[:, np.newaxis])
 
     def solve(self, terms: Sequence[str], estimator: str) -> Regression:
-        """
-        Fit terms to the force; the last coefficient is the remaining lag [s] if it is estimated.
-
-        Raises `IdentificationError` for too few samples, or velocity noise above its variation.
-        """
+        """Fit terms to the force; the last coefficient is the remaining lag [s], if any."""
         signals = self.signals
         noise_of = {
             'viscous_friction': signals.speed_noise,
@@ -184,8 +159,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     """
     Select samples in steady regimes, outside the filter windows around changes.
 
-    ``lag`` is the lag of the force [s]; ``settling_lag`` [s] is the lag of the sensor filters, for
-    which additional samples are left out.
+    ``settling_lag`` [s] is the lag of the sensor filters, for which more samples are left out.
     """
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])

@@ -52,43 +52,20 @@ _LARGEST_GRID: Final = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilteredSignals:
-    """
-    Filtered force and motion.
-
-    Attributes
-    ----------
-    settings : FrictionSettings
-        Settings of the identification.
-    time, force, depth : ndarray, shape (n,)
-        Evenly spaced time [s], filtered force [N], and insertion depth [m].
-    period : float
-        Sampling period after resampling [s].
-    motion : BSpline
-        Filtered velocity [m/s] as a function of time [s].
-    lost : ndarray of bool, shape (n,)
-        Samples within a gap of the recording, or with a saturated force.
-    half_filter, margin : int
-        Half the length of the filter, and distance from a change of the filtered velocity within
-        which the change may affect the filtered force [samples].
-    speed_noise, acceleration_noise : float
-        Standard deviations of the noise of filtered velocity [m/s] and acceleration [m/s^2].
-    cut_off : float
-        Fraction of samples with a saturated force; these samples count as lost.
-
-    """
+    """Filtered force and motion; arrays have shape (n,)."""
 
     settings: FrictionSettings
-    time: FloatArray
-    force: FloatArray
-    depth: FloatArray
-    period: float
-    motion: BSpline
-    lost: BoolArray
-    half_filter: int
-    margin: int
-    speed_noise: float
-    acceleration_noise: float
-    cut_off: float
+    time: FloatArray  # evenly spaced [s]
+    force: FloatArray  # [N]
+    depth: FloatArray  # insertion depth [m]
+    period: float  # after resampling [s]
+    motion: BSpline  # velocity [m/s] as a function of time [s]
+    lost: BoolArray  # in a gap of the recording, or saturated
+    half_filter: int  # half the length of the filter [samples]
+    margin: int  # reach of a change of the velocity in the force [samples]
+    speed_noise: float  # standard deviation after the filter [m/s]
+    acceleration_noise: float  # likewise [m/s^2]
+    cut_off: float  # fraction of samples with a saturated force
 
     @property
     def correlation(self) -> int:
@@ -102,12 +79,7 @@ class FilteredSignals:
 
 
 def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
-    """
-    Filter force and motion of a recording.
-
-    Without recorded velocity, the insertion depth is differentiated by the same filter. Raises
-    `IdentificationError` if the recording is too short or its stamps are too uneven.
-    """
+    """Filter force and motion; without recorded velocity, the depth is differentiated."""
     time = recording.time
     if len(time) < 3:
         raise IdentificationError(f'too short: {len(time)} samples')
@@ -159,7 +131,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
 
 def cut_off(force: FloatArray) -> BoolArray:
     """
-    Mark samples at which the force sensor is saturated, shape (n,).
+    Mark samples, (n,), at which the force sensor is saturated.
 
     The largest or smallest value is a limit if it is held for much longer than any other value.
     """

@@ -25,9 +25,8 @@ def parameter_estimates(
     """
     Return the coefficients of the terms, then derived ratios.
 
-    The first columns of ``fit`` are the columns of the terms. ``mean_speed`` [m/s] is the speed
-    for the ratio of withdrawal to insertion; ``period`` [s] is the sampling period, the largest
-    difference between the stamps of force and motion.
+    ``mean_speed`` [m/s] is the speed for the ratio of withdrawal to insertion; ``period`` [s] is
+    the largest difference between the stamps of force and motion.
     """
     columns = columns_of(settings.terms, settings)
     at = {column.name: k for k, column in enumerate(columns)}

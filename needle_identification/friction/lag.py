@@ -49,8 +49,8 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     """
     Search for the lag of the force, without the term inertia, which resembles a lag.
 
-    Returns the coarse lag, within half the filter length [s], or 0 if no lag fits much better; and
-    the lag of least misfit [s], or None if the motion does not determine it.
+    Returns the coarse lag [s], or 0 if no lag fits much better; and the lag of least misfit [s],
+    or None if the motion does not determine it.
     """
     terms = signals.settings.terms
     lag = coarse = _coarse_lag(signals)
@@ -111,12 +111,7 @@ def _acceleration_is_noise(design: Design) -> bool:
 
 
 def lag_estimate(lag: float | None, design: Design, fit: Regression) -> ParameterEstimate:
-    """
-    Return the lag [s] and its error, including the error of the spline.
-
-    The last coefficient of ``fit`` is the remaining lag. The lag is undetermined if it was not
-    estimated, or if the acceleration is within the filter error of velocity steps.
-    """
+    """Return the lag [s] and its error; undetermined if the needle accelerates only by steps."""
     used = float(np.sqrt(np.mean(design.acceleration[design.used] ** 2)))
     accelerates = used > _SMALLEST_ACCELERATION * float(np.max(np.abs(design.acceleration)))
     if lag is None or not design.estimates_lag or not accelerates:

@@ -32,12 +32,11 @@ _MAX_WAITING: Final = 20_000
 
 class LiveFriction:
     """
-    Estimate friction from messages as they arrive.
+    Estimate friction from messages as they arrive, with the motion at the stamps of the force.
 
-    Motion is interpolated to the stamps of the force. Samples that are not finite, out of order,
-    or within a gap of the motion are discarded and counted. Estimation restarts when the clock is
-    set back. ``forgetting`` is the time of steady motion after which the weight of a sample is 1 /
-    e [s]; ``samples`` counts the paired force samples.
+    Samples that are not finite, out of order, or within a gap of the motion are discarded and
+    counted. Estimation restarts when the clock is set back. ``forgetting`` is the time of steady
+    motion in which the weight of a sample falls to 1 / e [s].
     """
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:

@@ -166,29 +166,13 @@ def _check(search: Search) -> None:
 
 
 class _Errors(NamedTuple):
-    """
-    Errors of all constants: search variables, then the linear constants of each medium.
+    """Errors of the search variables, then of the linear constants of each medium."""
 
-    Attributes
-    ----------
-    errors : ndarray, shape (k,)
-        Standard errors.
-    units : ndarray, shape (k,)
-        Standard errors for unit variance of the samples.
-    freedom : list of int
-        Degrees of freedom of each medium.
-    values : list of ndarray
-        Linear constants of each medium.
-    left : list of ndarray
-        Residuals of each medium [m].
-
-    """
-
-    errors: FloatArray
-    units: FloatArray
-    freedom: list[int]
-    values: list[FloatArray]
-    left: list[FloatArray]
+    errors: FloatArray  # (k,) standard errors
+    units: FloatArray  # (k,) the same for unit variance of the samples
+    freedom: list[int]  # degrees of freedom by medium
+    values: list[FloatArray]  # linear constants by medium
+    left: list[FloatArray]  # residuals by medium [m]
 
 
 def _errors(search: Search, x: FloatArray) -> _Errors:

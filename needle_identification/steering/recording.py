@@ -100,10 +100,9 @@ class SteeringRecording:
 
 def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """
-    Return a mask of plausible tip samples, shape (n,), and messages about the others.
+    Return a mask (n,) of tip samples that are neither frozen nor implausible, and messages.
 
-    ``depth`` (n,) is from the robot; ``guide`` and ``tip`` (n, 2) are x and z [m] relative to
-    their start, NaN if missing. Frozen and implausible measurements are rejected.
+    ``guide`` and ``tip`` (n, 2) are x and z [m] relative to their start, NaN if missing.
     """
     there = np.isfinite(tip).all(axis=1)
     same = np.zeros(len(depth), dtype=np.bool_)
@@ -131,13 +130,7 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
 def recorded_insertion(
     path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
 ) -> SteeringRecording:
-    """
-    Create a recording from values of a file, without implausible samples.
-
-    ``values`` has shape (n,) each: ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z``
-    [m], optionally ``roll`` [rad]; finite except for the tip. Raises `RecordingError` if the depth
-    is positive out of the tissue, or no tip position is present.
-    """
+    """Create a recording from values of a file by role, (n,) each, without implausible samples."""
     losses, depth = list(losses), values['depth']
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')

@@ -20,8 +20,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
     """
     Return a ROS parameter file for plant, controller and steering node, errors as comments.
 
-    The data determine lengths, not forces: the bending stiffness is the default. Raises
-    `IdentificationError` for several media or an undetermined bending length.
+    The data determine lengths, not forces: the bending stiffness is the default.
     """
     if len(found.media) > 1:
         raise IdentificationError(

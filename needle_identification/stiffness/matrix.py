@@ -36,48 +36,21 @@ _LARGEST_NOISE: Final = 3.0
 
 
 class MatrixFit(NamedTuple):
-    """
-    Stiffness matrix with errors.
+    """Stiffness matrix with errors."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (2, 2)
-        Stiffness matrix K [N/m]; undetermined columns are nan.
-    known : ndarray of bool, shape (2,)
-        Columns that the presses determine.
-    factors : ndarray, shape (2, 2, 2)
-        Factors A of the covariance R_rs A_r A_s^T of rows r and s of K.
-    correlation : ndarray, shape (2, 2)
-        Correlation R of the residuals of the rows.
-    degrees_of_freedom : float
-        Degrees of freedom of each row.
-    residual : ndarray, shape (m, 2)
-        Force minus K d [N].
-    scatter : float
-        Scatter of the presses about the matrix over their noise [1].
-    condition : float
-        Condition number of the displacements.
-
-    """
-
-    matrix: FloatArray
-    known: BoolArray
-    factors: FloatArray
-    correlation: FloatArray
-    degrees_of_freedom: float
-    residual: FloatArray
-    scatter: float
-    condition: float
+    matrix: FloatArray  # (2, 2) K [N/m]; undetermined columns are nan
+    known: BoolArray  # (2,) columns that the presses determine
+    factors: FloatArray  # (2, 2, 2) A; R_rs A_r A_s^T is the covariance of rows r, s of K
+    correlation: FloatArray  # (2, 2) R, of the residuals of the rows
+    degrees_of_freedom: float  # of each row
+    residual: FloatArray  # (m, 2) force minus K d [N]
+    scatter: float  # of the presses about the matrix over their noise [1]
+    condition: float  # of the displacements
 
     def derived(
         self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
     ) -> ParameterEstimate:
-        """
-        Return a quantity derived from the matrix, with propagated errors.
-
-        ``gradient`` (2, 2) are its derivatives by the entries of the matrix. The quantity is
-        undetermined if a required entry is.
-        """
+        """Return a quantity with its gradient (2, 2) by K; undetermined if a required entry is."""
         parameter = ParameterEstimate(name=name, symbol=symbol, unit=unit)
         if not self.known[np.any(gradient != 0.0, axis=0)].all() or not isfinite(value):
             return parameter
@@ -109,11 +82,9 @@ _UNKNOWN: Final = MatrixFit(
 
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """
-    Solve F = K d over the presses with indices ``chosen`` (m,).
+    Solve F = K d over the presses with indices ``chosen`` (m,), by row of K.
 
-    The rows of K are solved separately, with the noise of force and displacement and of their
-    zeros. Standard errors are computed from the scatter of the presses about K. The estimator
-    ``weighted`` uses the noise of each press.
+    Standard errors are computed from the scatter of the presses about K.
     """
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
@@ -173,9 +144,8 @@ def _deviation(
     """
     Return standard deviation, degrees of freedom, and used values of residuals.
 
-    The scatter of all presses is more accurate than the noise of each of a few presses. For
-    ``huber`` it is computed from the clipped residuals, P. J. Huber, "Robust Statistics", 1981,
-    section 7.6; each clipped residual reduces the degrees of freedom by 1.
+    For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
+    reduces the degrees of freedom by 1.
     """
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual

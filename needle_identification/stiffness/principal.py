@@ -19,9 +19,8 @@ def principal_estimates(
     """
     Return larger and smaller principal stiffness [N/m], and direction of the larger [rad].
 
-    If both agree within their errors, the larger is biased upward and the smaller downward: their
-    intervals then include the interval of their mean, and the direction (from x toward z) is
-    undetermined.
+    If both agree within their errors, they are biased apart: their intervals then include the
+    interval of their mean, and the direction (from x toward z) is undetermined.
     """
     k = fit.matrix
     half, shear = (k[0, 0] - k[1, 1]) / 2.0, (k[0, 1] + k[1, 0]) / 2.0
