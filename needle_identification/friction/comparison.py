@@ -10,7 +10,6 @@ from math import log, nan
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.memory import divided
 from needle_identification.estimation.regression import Regression, score_covariance
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
@@ -71,12 +70,7 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
     chosen = settings.terms
     samples = _independent_samples(design, fit)
     level = SIGNIFICANCE / among
-    used = design.used
-    screening = Screening(
-        design.regressors(chosen)[used],
-        design.signals.force[used],
-        divided(used, design.signals.correlation),
-    )
+    screening = design.screening()
     singles = [(term,) for term in _candidates(design)]
     found = _added(design, screening, singles, samples, level)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())

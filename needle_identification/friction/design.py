@@ -15,7 +15,9 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.memory import divided, Parts
 from needle_identification.estimation.regression import independent_span, regress, Regression
+from needle_identification.estimation.screening import Screening
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
@@ -43,6 +45,7 @@ class Design:
     """Motion delayed by the lag of the force, and the samples of the regression, (n,) each."""
 
     signals: FilteredSignals
+    lag: float  # of the force [s]
     speed: FloatArray  # [m/s], delayed
     acceleration: FloatArray  # [m/s^2], delayed
     depth: FloatArray  # insertion depth [m], delayed
@@ -63,6 +66,16 @@ class Design:
         """Whether there are enough samples for standard errors."""
         needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
         return bool(np.count_nonzero(self.used) >= needed)
+
+    @property
+    def parts(self) -> Parts:
+        """Parts of the used samples with the correlation length of the noise."""
+        return divided(self.used, self.signals.correlation)
+
+    def screening(self) -> Screening:
+        """Return the least squares fit of the chosen terms, for additional terms on trial."""
+        x = self.regressors(self.signals.settings.terms)
+        return Screening(x[self.used], self.signals.force[self.used], self.parts)
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
         """Return the regressors of terms and of an estimated lag, shape (n, k)."""
@@ -185,6 +198,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
         used &= maximum_filter1d(large.astype(np.uint8), size) == 0
     return Design(
         signals=signals,
+        lag=lag,
         speed=speed,
         acceleration=acceleration,
         depth=depth,

@@ -65,6 +65,7 @@ class FilteredSignals:
     margin: int  # reach of a change of the velocity in the force [samples]
     speed_noise: float  # standard deviation after the filter [m/s]
     acceleration_noise: float  # likewise [m/s^2]
+    from_positions: bool  # velocity differentiated from the depth
     cut_off: float  # fraction of samples with a saturated force
 
     @property
@@ -104,14 +105,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     taps = filter_taps(settings.cutoff, period)
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
-    derivative = 1 if recording.speed is None else 0
+    from_positions = recording.speed is None
     measured = recording.depth if recording.speed is None else recording.speed
     raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
-    motion = _filtered_speed(grid, raw, taps, step, derivative)
+    motion = _filtered_speed(grid, raw, taps, step, from_positions)
     impulse = np.zeros(8 * half + 8 * step + 17)
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
-    response = _filtered_speed(around, impulse, taps, 1, derivative)
+    response = _filtered_speed(around, impulse, taps, 1, from_positions)
     noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
     return FilteredSignals(
         settings=settings,
@@ -125,6 +126,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         margin=max(1, ceil(2 * (half - 1) / step)),
         speed_noise=noise * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
+        from_positions=from_positions,
         cut_off=float(cut.mean()),
     )
 
@@ -175,15 +177,15 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
 
 
 def _filtered_speed(
-    time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, derivative: int
+    time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, from_depth: bool
 ) -> BSpline:
-    """Return the filtered velocity as a spline of time, from velocity or (derivative 1) depth."""
+    """Return the filtered velocity as a spline of time, from velocity or from depth."""
     from scipy.interpolate import make_interp_spline
 
-    start = raw[0] if derivative else 0.0
+    start = raw[0] if from_depth else 0.0
     smooth = _smooth(raw - start, taps)
-    spline = make_interp_spline(time, smooth, k=5 if derivative else 3)
-    if derivative:
+    spline = make_interp_spline(time, smooth, k=5 if from_depth else 3)
+    if from_depth:
         spline = make_interp_spline(time[::step], spline(time[::step], 1), k=3)
     elif step > 1:
         spline = make_interp_spline(time[::step], smooth[::step], k=3)
