@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Final
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_identification.application import Application
 from needle_identification.estimation.estimate import Statistic, statistic
+from needle_identification.friction.estimate import summarize
 from needle_identification.friction.identify import identify_friction
-from needle_identification.friction.live import LiveFriction
+from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
-from needle_identification.friction.summary import summarize
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
@@ -24,9 +24,9 @@ from needle_identification.recordings.reading import (
 from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status import live_statuses, sentence, Status, summary_statuses
+from needle_identification.stiffness.estimate import summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.summary import summarize_stiffness
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls

@@ -11,8 +11,8 @@ from typing import Final
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import UNKNOWN
-from needle_identification.friction.summary import FrictionSummary
-from needle_identification.stiffness.summary import StiffnessSummary
+from needle_identification.friction.estimate import FrictionSummary
+from needle_identification.stiffness.estimate import StiffnessSummary
 from needle_ros.files import write_whole
 import yaml
 

@@ -7,10 +7,8 @@ from typing import NamedTuple
 
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import measured
-from needle_identification.friction.estimate import FrictionEstimate
-from needle_identification.friction.summary import FrictionSummary
-from needle_identification.stiffness.estimate import StiffnessEstimate
-from needle_identification.stiffness.summary import StiffnessSummary
+from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary
+from needle_identification.stiffness.estimate import StiffnessEstimate, StiffnessSummary
 
 
 class Status(NamedTuple):

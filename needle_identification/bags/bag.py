@@ -10,8 +10,8 @@ import sqlite3
 from typing import Any, Final, NamedTuple
 
 from needle_identification.bags.batch import MessageBatch, Tally
+from needle_identification.bags.compression import Budget
 from needle_identification.bags.files import files_of, form_of
-from needle_identification.bags.limits import Budget
 from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
 from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic

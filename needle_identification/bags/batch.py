@@ -7,8 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.compression import DAMAGED, decompress
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import Budget, DAMAGED, decompress
 from needle_identification.bags.topics import BagTopic
 import numpy as np
 from numpy.typing import NDArray

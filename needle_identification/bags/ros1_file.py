@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
-from needle_identification.bags.compression import DAMAGED, decompress
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import Budget, DAMAGED, decompress
 from needle_identification.bags.topics import make_topic
 from needle_identification.errors import RecordingError
 from rosbags.convert.converter import generate_message_converter

@@ -12,8 +12,7 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
-from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
-from needle_identification.bags.limits import factor
+from needle_identification.bags.compression import BLOCK, COMPRESSED, factor, open_file, read_up_to
 from needle_identification.bags.topics import BagTopic, make_topic
 from needle_identification.errors import RecordingError
 

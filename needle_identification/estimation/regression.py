@@ -117,14 +117,9 @@ class Regression:
         """Whether the residuals are rounding errors only."""
         return 1.0 - self.determination < _ROUNDING
 
-    def interval(self, level: float = 0.95) -> FloatArray:
+    def interval(self) -> FloatArray:
         """
-        Return the confidence intervals of the parameters (Student's t).
-
-        Parameters
-        ----------
-        level : float
-            Confidence level.
+        Return the 95 % confidence intervals of the parameters (Student's t).
 
         Returns
         -------
@@ -132,11 +127,11 @@ class Regression:
             Lower and upper limits; infinite where not determined.
 
         """
-        half_widths = stdtrit(self.degrees_of_freedom, 0.5 + level / 2.0) * self.errors
+        half_widths = stdtrit(self.degrees_of_freedom, 0.975) * self.errors
         centers = np.where(self.determined, self.values, 0.0)
         return np.column_stack([centers - half_widths, centers + half_widths])
 
-    def wald(self, which: Sequence[int]) -> tuple[float, float]:
+    def wald(self, which: Sequence[int]) -> float:
         """
         Test whether parameters are all zero (Wald test).
 
@@ -147,8 +142,8 @@ class Regression:
 
         Returns
         -------
-        statistic, p_value : float
-            Wald statistic and its p-value, from the F distribution.
+        float
+            The p-value, from the F distribution.
 
         """
         at = list(which)
@@ -162,7 +157,7 @@ class Regression:
         else:
             found = float(values @ np.linalg.solve(covariance, values))
         freedom = float(self.degrees_of_freedom[at].min())
-        return found, float(fdtrc(len(at), freedom, found / len(at)))
+        return float(fdtrc(len(at), freedom, found / len(at)))
 
     def differs(self, whole: Regression, count: int) -> float:
         """

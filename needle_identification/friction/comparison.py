@@ -136,7 +136,7 @@ def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial
         if other.determined[which].all():
             return trial._replace(
                 values=other.values[which], errors=other.errors[which],
-                p_value=other.wald(which)[1],
+                p_value=other.wald(which),
             )  # fmt: skip
     return trial._replace(determined=False, p_value=1.0)
 
@@ -230,7 +230,7 @@ def _removed(
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
         return CandidateFit(terms=terms, words=words)
-    p_value = fit.wald(which)[1]
+    p_value = fit.wald(which)
     supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
     return CandidateFit(

@@ -5,19 +5,6 @@ With the tip past the tissue, the axial row of equation (16) of the paper is fri
 with optional further terms:
 
 .. math:: f_y(t + \tau) = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + ...
-
-Modules:
-
-================  =================================================================================
-`filtering`       force and motion through one zero-phase filter, on an even time base
-`lag`             the lag tau of the force
-`design`          samples in steady motion, regressors (`terms`), and the regression
-`intervals`       parameters with standard errors and confidence intervals
-`breakaway`       breakaway force
-`punctures`       drops of the force on entering new tissue
-`comparison`      alternative sets of terms
-`checks`          errors and warnings
-================  =================================================================================
 """
 
 from __future__ import annotations

@@ -23,8 +23,7 @@ from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.bags.compression import BLOCK, DAMAGED
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps

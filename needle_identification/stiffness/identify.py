@@ -2,15 +2,7 @@ r"""
 Identify the tissue stiffness in the plane of deflection, section 3.2.2.3 of the paper.
 
 The end-effector presses the tissue with force F and displaces it by d; the reaction is -F. For
-each force level the stiffness matrix K of F = K d is fitted to the presses. Modules:
-
-============  =====================================================================================
-`plateaus`    holds and rests: intervals of steady force and position
-`presses`     displacement and force of each hold relative to the rests
-`matrix`      the stiffness matrix with its errors
-`spring`      whether the tissue is a spring
-`principal`   principal stiffnesses
-============  =====================================================================================
+each force level the stiffness matrix K of F = K d is fitted to the presses.
 """
 
 from __future__ import annotations
@@ -24,10 +16,14 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
-from needle_identification.stiffness.matrix import ENTRIES, fit_matrix, MatrixFit
+from needle_identification.stiffness.matrix import (
+    ENTRIES,
+    fit_matrix,
+    MatrixFit,
+    principal_estimates,
+)
 from needle_identification.stiffness.plateaus import find_plateaus
 from needle_identification.stiffness.presses import find_presses, Presses
-from needle_identification.stiffness.principal import principal_estimates
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.spring import spring_estimates
 import numpy as np
