@@ -41,25 +41,6 @@ class ParameterEstimate:
     interval: tuple[float, float] = (-inf, inf)
     determined: bool = False
 
-    def with_value(self, value: float, error: float, half_width: float) -> ParameterEstimate:
-        """
-        Return a determined copy, with an interval symmetric about the value.
-
-        Parameters
-        ----------
-        value, error, half_width : float
-            Estimate, standard error and half the width of the 95 % interval, in the unit of
-            the parameter.
-
-        Returns
-        -------
-        ParameterEstimate
-            Estimate with the new value.
-
-        """
-        interval = (value - half_width, value + half_width)
-        return replace(self, value=value, error=error, interval=interval, determined=True)
-
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.value, self.error, self.unit)}>'
 
@@ -97,6 +78,20 @@ class Statistic:
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
+
+
+def with_value(
+    unknown: ParameterEstimate, value: float, error: float, low: float, high: float
+) -> ParameterEstimate:
+    """Return a determined copy with a value, its standard error and its 95 % interval."""
+    return replace(unknown, value=value, error=error, interval=(low, high), determined=True)
+
+
+def with_half_width(
+    unknown: ParameterEstimate, value: float, error: float, half_width: float
+) -> ParameterEstimate:
+    """Return a determined copy, with an interval symmetric about the value."""
+    return with_value(unknown, value, error, value - half_width, value + half_width)
 
 
 _Named = TypeVar('_Named', ParameterEstimate, Statistic)

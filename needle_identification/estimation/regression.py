@@ -28,7 +28,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -131,61 +130,34 @@ class Regression:
         centers = np.where(self.determined, self.values, 0.0)
         return np.column_stack([centers - half_widths, centers + half_widths])
 
-    def wald(self, which: Sequence[int]) -> float:
-        """
-        Test whether parameters are all zero (Wald test).
 
-        Parameters
-        ----------
-        which : sequence of int
-            Indices of the parameters, all determined.
+def wald_test(fit: Regression, at: list[int]) -> float:
+    """Return the p-value that the parameters with these indices, all determined, are zero."""
+    values = fit.values[at]
+    covariance = fit.covariance[np.ix_(at, at)]
+    if fit.memory is not None:
+        more = fit.memory.far[at] / fit.memory.inflation[at]
+        covariance = covariance * np.outer(more, more)
+    if not covariance.any():
+        found = np.inf if values.any() else 0.0
+    else:
+        found = float(values @ np.linalg.solve(covariance, values))
+    freedom = float(fit.degrees_of_freedom[at].min())
+    return float(fdtrc(len(at), freedom, found / len(at)))
 
-        Returns
-        -------
-        float
-            The p-value, from the F distribution.
 
-        """
-        at = list(which)
-        values = self.values[at]
-        covariance = self.covariance[np.ix_(at, at)]
-        if self.memory is not None:
-            more = self.memory.far[at] / self.memory.inflation[at]
-            covariance = covariance * np.outer(more, more)
-        if not covariance.any():
-            found = np.inf if values.any() else 0.0
-        else:
-            found = float(values @ np.linalg.solve(covariance, values))
-        freedom = float(self.degrees_of_freedom[at].min())
-        return float(fdtrc(len(at), freedom, found / len(at)))
+def hausman_test(part: Regression, whole: Regression, count: int) -> float:
+    """
+    Return the p-value that the first parameters agree in fits to some and to all samples.
 
-    def differs(self, whole: Regression, count: int) -> float:
-        """
-        Test whether this fit to a part of the samples contradicts the fit to all samples.
-
-        If the model holds for all samples, the parameters differ by at most their errors in this
-        fit (Hausman's test; including the errors of ``whole`` would increase the power, but not
-        the safety).
-
-        Parameters
-        ----------
-        whole : Regression
-            Fit of the same parameters to these samples and others.
-        count : int
-            Number of parameters to compare, from the first.
-
-        Returns
-        -------
-        float
-            The p-value, from the F distribution; 1 if no parameter is determined in both.
-
-        """
-        at = np.flatnonzero(self.determined[:count] & whole.determined[:count])
-        if not len(at) or not np.diag(self.covariance)[at].all():
-            return 1.0
-        off = self.values[at] - whole.values[at]
-        found = float(off @ np.linalg.solve(self.covariance[np.ix_(at, at)], off)) / len(at)
-        return float(fdtrc(len(at), float(self.degrees_of_freedom[at].min()), found))
+    Including the errors of ``whole`` would increase the power, but not the safety.
+    """
+    at = np.flatnonzero(part.determined[:count] & whole.determined[:count])
+    if not len(at) or not np.diag(part.covariance)[at].all():
+        return 1.0
+    off = part.values[at] - whole.values[at]
+    found = float(off @ np.linalg.solve(part.covariance[np.ix_(at, at)], off)) / len(at)
+    return float(fdtrc(len(at), float(part.degrees_of_freedom[at].min()), found))
 
 
 class _Solution(NamedTuple):

@@ -13,7 +13,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import regress
 from needle_identification.friction.design import Design
 from needle_identification.friction.filtering import CORRELATION_LENGTH
@@ -63,7 +63,7 @@ def breakaway_force(
             value -= bias * parameter.value
             error = hypot(error, bias * parameter.error)
             half_width = hypot(half_width, bias * (parameter.interval[1] - parameter.value))
-    return _UNKNOWN.with_value(value, error, half_width)
+    return with_half_width(_UNKNOWN, value, error, half_width)
 
 
 def _push(

@@ -10,7 +10,7 @@ from math import log, nan
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.regression import Regression, score_covariance
+from needle_identification.estimation.regression import Regression, score_covariance, wald_test
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
 from needle_identification.friction.settings import TERMS
@@ -136,7 +136,7 @@ def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial
         if other.determined[which].all():
             return trial._replace(
                 values=other.values[which], errors=other.errors[which],
-                p_value=other.wald(which),
+                p_value=wald_test(other, which),
             )  # fmt: skip
     return trial._replace(determined=False, p_value=1.0)
 
@@ -230,7 +230,7 @@ def _removed(
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
         return CandidateFit(terms=terms, words=words)
-    p_value = fit.wald(which)
+    p_value = wald_test(fit, which)
     supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
     return CandidateFit(

@@ -16,7 +16,7 @@ from math import nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.regression import Regression
+from needle_identification.estimation.regression import hausman_test, Regression
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
 from needle_identification.friction.breakaway import breakaway_force
 from needle_identification.friction.checks import (
@@ -198,7 +198,7 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
     except IdentificationError:
         # Too few samples remain.
         return None
-    if fit.differs(whole, count) >= _TRANSITIONS_DIFFER:
+    if hausman_test(fit, whole, count) >= _TRANSITIONS_DIFFER:
         return None
     remark = (
         f'within {_TRANSITION:g} s of starts, stops and reversals the force does not follow the '

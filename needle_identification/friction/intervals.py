@@ -7,11 +7,14 @@ Student's t. Ratios have intervals by the delta method.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot, sqrt
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import (
+    ParameterEstimate,
+    with_half_width,
+    with_value,
+)
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of
@@ -35,14 +38,9 @@ def parameter_estimates(
     for k, column in enumerate(columns):
         parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
         if fit.determined[k]:
-            low, high = intervals[k]
-            parameter = replace(
-                parameter,
-                value=float(fit.values[k]),
-                error=float(fit.errors[k]),
-                interval=(float(low), float(high)),
-                determined=True,
-            )
+            low, high = intervals[k].tolist()
+            value, error = float(fit.values[k]), float(fit.errors[k])
+            parameter = with_value(parameter, value, error, low, high)
         found.append(parameter)
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
@@ -63,7 +61,8 @@ def parameter_estimates(
 def _widened(mass: ParameterEstimate, largest: float) -> ParameterEstimate:
     """Add the error by a lag that resembles a mass, uniform within +- ``largest`` [kg]."""
     low, high = mass.interval
-    return mass.with_value(
+    return with_half_width(
+        mass,
         mass.value,
         hypot(mass.error, largest / sqrt(3.0)),
         hypot(0.5 * (high - low), 0.95 * largest),
@@ -80,4 +79,4 @@ def _ratio(fit: Regression, rows: FloatArray, name: str, symbol: str) -> Paramet
     gradient = (rows[1, taken] - more / base * rows[0, taken]) / base
     error = sqrt(float(gradient @ fit.covariance[np.ix_(taken, taken)] @ gradient))
     half_width = error * float(stdtrit(fit.degrees_of_freedom[taken].min(), 0.975))
-    return parameter.with_value(1.0 + float(more / base), error, half_width)
+    return with_half_width(parameter, 1.0 + float(more / base), error, half_width)

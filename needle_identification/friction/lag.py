@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import hypot
 from typing import Final
 
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
@@ -122,4 +122,5 @@ def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:
     spline = _SPLINE_ERROR * period * (design.signals.settings.cutoff * period) ** 4
     value, low, high = design.lag + np.array([fit.values[-1], *fit.interval()[-1]])
     half_width = hypot(0.5 * (high - low), float(ndtri(0.975)) * spline)
-    return _UNKNOWN.with_value(float(value), hypot(float(fit.errors[-1]), spline), half_width)
+    error = hypot(float(fit.errors[-1]), spline)
+    return with_half_width(_UNKNOWN, float(value), error, half_width)

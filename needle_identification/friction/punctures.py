@@ -13,7 +13,7 @@ from math import hypot, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.memory import stretches
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design
@@ -109,6 +109,6 @@ def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Pun
     place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
     return Puncture(
         time=float(signals.time[at]),
-        depth=_DEPTH.with_value(float(design.depth[at]), place, half_width * place),
-        drop=_DROP.with_value(drop, error, half_width * error),
+        depth=with_half_width(_DEPTH, float(design.depth[at]), place, half_width * place),
+        drop=with_half_width(_DROP, drop, error, half_width * error),
     )

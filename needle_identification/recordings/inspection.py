@@ -18,7 +18,7 @@ from needle_identification.recordings.reading import first_names, read_indentati
 from needle_identification.recordings.samples import (
     are_gaps,
     AXES,
-    each_joint,
+    EachJoint,
     Gathering,
     Samples,
     SignalSource,
@@ -240,19 +240,16 @@ def _presses(path: Path) -> bool:
 
 def _joints(bag: Bag, topics: Sequence[BagTopic]) -> Mapping[BagTopic, list[str]]:
     """Return the joint names of each JointState topic, from its first messages."""
-    states = [topic for topic in topics if topic.type_name == wire.JOINT_STATE]
     return {
         topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
-        for topic in states
+        for topic in topics
+        if topic.type_name == wire.JOINT_STATE
     }
 
 
 def _source(topic: BagTopic, axes: Sequence[str]) -> SignalSource:
-    return (
-        each_joint(axes)
-        if topic.type_name == wire.JOINT_STATE
-        else source_of(topic.type_name, axes)
-    )
+    is_joint = topic.type_name == wire.JOINT_STATE
+    return EachJoint(*axes) if is_joint else source_of(topic.type_name, axes)
 
 
 def _content(topic: BagTopic, count: int, axes: Sequence[str], samples: Samples) -> Content:
@@ -286,11 +283,9 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
                 best = explained, size, force, motion
     if best is None or best[0] < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
-        why = (
-            f'no varying {" or ".join(lacking)}'
-            if lacking
-            else ('no force depends on the direction of a motion')
-        )
+        why = 'no force depends on the direction of a motion'
+        if lacking:
+            why = f'no varying {" or ".join(lacking)}'
         return [f'no friction found: {why}'], ''
     explained, size, force, motion = best
     what = (

@@ -130,13 +130,26 @@ class _Joint(SignalSource):
         return ''
 
 
-class _PlaneJoints(SignalSource):
-    """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
-
-    columns = width = 3
+class EachJoint(SignalSource):
+    """Positions of joints by name; nan where missing in a message."""
 
     def __init__(self, *joints: str) -> None:
+        self.columns = self.width = len(joints)
         self._joints = joints
+
+    def __call__(self, template: wire.Template) -> list[int] | None:
+        positions, names = template.arrays[0], template.names
+        return [
+            _element(positions, names.index(joint)) if joint in names else -1
+            for joint in self._joints
+        ]
+
+
+class _PlaneJoints(EachJoint):
+    """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
+
+    def __init__(self, *joints: str) -> None:
+        super().__init__(*joints)
         self._seen: set[str] = set()
         self._is_used = self._is_flat = False
 
@@ -147,11 +160,7 @@ class _PlaneJoints(SignalSource):
             return None
         self._is_used = True
         self._is_flat |= self._joints[2] not in template.names
-        positions = template.arrays[0]
-        return [
-            _element(positions, template.names.index(joint)) if joint in template.names else -1
-            for joint in self._joints
-        ]
+        return super().__call__(template)
 
     def _measured(self, numbers: FloatArray) -> FloatArray:
         if self._is_flat:
@@ -166,26 +175,6 @@ class _PlaneJoints(SignalSource):
 
     def _losses(self) -> list[str]:
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
-
-
-class _EachJoint(SignalSource):
-    """Positions of joints by name; nan where missing in a message."""
-
-    def __init__(self, *joints: str) -> None:
-        self.columns = self.width = len(joints)
-        self._joints = joints
-
-    def __call__(self, template: wire.Template) -> list[int]:
-        positions, names = template.arrays[0], template.names
-        return [
-            _element(positions, names.index(joint)) if joint in names else -1
-            for joint in self._joints
-        ]
-
-
-def each_joint(joints: Sequence[str]) -> SignalSource:
-    """Return a source of the positions of joints."""
-    return _EachJoint(*joints)
 
 
 def _listing(names: Set[str]) -> str:

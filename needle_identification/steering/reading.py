@@ -24,7 +24,7 @@ from needle_identification.recordings.reading import (
     signed_axis,
     Wanted,
 )
-from needle_identification.recordings.samples import each_joint, source_of
+from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import (
     column_values,
     guessed,
@@ -137,7 +137,7 @@ def read_steering_recording(
     tilts = [name for name in _TILTS if name in seen]
     sources = {
         tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
-        motion: each_joint([*(name for _, name in joints.values()), *tilts]),
+        motion: EachJoint(*(name for _, name in joints.values()), *tilts),
     }
     gathered, _ = read_samples(bag, sources, time)
     _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))

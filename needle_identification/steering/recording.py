@@ -9,7 +9,8 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import RecordingError
-from needle_ros.errors import ShapeError, shown
+from needle_identification.recordings.recording import freeze
+from needle_ros.errors import ShapeError
 import numpy as np
 
 #: Number of equal consecutive tip measurements that indicate a frozen sensor.
@@ -66,20 +67,7 @@ class SteeringRecording:
     losses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'name', shown(self.name))
-        object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
-        count = np.shape(self.depth)
-        for field, rest in (('depth', ()), ('guide', (2,)), ('roll', ()), ('tip', (2,))):
-            values = np.array(getattr(self, field), dtype=np.float64)
-            if len(count) != 1 or values.shape != count + rest:
-                raise ShapeError(
-                    f'{self.name}: {field} must have shape {("n", *rest)}, with the n of depth, '
-                    f'got {values.shape} and {count}'
-                )
-            if field != 'tip' and not np.isfinite(values).all():
-                raise ShapeError(f'{self.name}: {field} must be finite')
-            values.setflags(write=False)
-            object.__setattr__(self, field, values)
+        freeze(self, 'depth', 'tip', guide=2, roll=None, tip=2)
         if (self.depth < 0.0).any():
             raise ShapeError(f'{self.name}: depth must be >= 0, got {self.depth.min():.4g} m')
 

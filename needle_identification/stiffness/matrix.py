@@ -14,7 +14,7 @@ from math import atan2, hypot, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import regress
 from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise
@@ -58,7 +58,8 @@ class MatrixFit(NamedTuple):
             return parameter
         variance, freedom = self.variance_of(gradient)
         error = sqrt(variance)
-        return parameter.with_value(value, error, error * float(stdtrit(freedom, 0.975)))
+        half_width = error * float(stdtrit(freedom, 0.975))
+        return with_half_width(parameter, value, error, half_width)
 
     def variance_of(self, gradient: FloatArray) -> tuple[float, float]:
         """Return variance and degrees of freedom (Satterthwaite) of a quantity by its gradient."""

@@ -235,7 +235,7 @@ def test_invalid_input_is_reported() -> None:
     blind = replace(short, name='run 7', tip=np.full((3, 2), np.nan))
     with pytest.raises(IdentificationError, match='run 7: no valid sample of the tip'):
         identify_steering([blind])
-    with pytest.raises(ShapeError, match=r"guide must have shape \('n', 2\)"):
+    with pytest.raises(ShapeError, match=r'guide must have the shape \(n, 2\)'):
         replace(short, guide=np.zeros((2, 2)))
     with pytest.raises(ShapeError, match='depth must be >= 0'):
         replace(short, depth=np.array([0.0, -0.01, 0.0]))
