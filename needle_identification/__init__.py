@@ -14,12 +14,7 @@ from typing import TYPE_CHECKING
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from needle_identification.bags.bag import (
-        Bag,
-        message_counts,
-        read_topic,
-        Recorded,
-    )
+    from needle_identification.bags.bag import Bag, message_counts, read_topic, Recorded
     from needle_identification.bags.messages import deserialize, encode, message_type
     from needle_identification.bags.topics import BagTopic, OfferedQos
     from needle_identification.bags.writer import BagWriter, COMPRESSIONS

@@ -155,20 +155,17 @@ class IdentificationNode(BaseNode):
             self._timer = self.create_timer(1.0, self._publish_live)
 
     def about(self) -> str:
-        """Return the identified quantity and its sources."""
         live = (contract.JOINT_STATES.name, contract.BASE_WRENCH.name) if self._is_live else ()
         heard = f', and live from {" and ".join(live)}' if live else ''
         return f'{self._what} from {len(self._bags)} recordings at ~/identify{heard}'
 
     def deactivate(self) -> None:
-        """Unsubscribe."""
         if self._is_live:
             self.destroy_timer(self._timer)
             for subscription in self._listening:
                 self.destroy_subscription(subscription)
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Set the recordings of the next identification."""
         self._bags = [name for name in changes['bags'] if name]
 
     def diagnose(self) -> Diagnosis[IdentificationStatus]:
@@ -211,9 +208,7 @@ class IdentificationNode(BaseNode):
                 self._estimates(
                     partial(read_friction_recording, **reading),
                     partial(
-                        identify_friction,
-                        settings=self._friction_settings,
-                        among=len(self._bags),
+                        identify_friction, settings=self._friction_settings, among=len(self._bags)
                     ),
                 )
             )
@@ -361,7 +356,6 @@ def _message_of(result: Status) -> DiagnosticStatus:
 
 
 def main() -> int:
-    """Run the node; return its exit status."""
     return run(IdentificationNode)
 
 

@@ -53,7 +53,6 @@ class MessageBatch(NamedTuple):
         return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
 
     def messages(self) -> Iterator[tuple[int, bytes]]:
-        """Iterate over receive times [ns] and serialized messages."""
         for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
             yield int(received), self.data[begin:end].tobytes()
 

@@ -113,7 +113,6 @@ class Budget:
             )
 
     def too_large(self, what: str, size: int) -> str:
-        """Return the message for an item of `size` bytes, above `largest`."""
         return (
             f'a {what} of {size} bytes, at most {_bytes(self.largest)} are read; {FACTOR}=10 '
             'raises this limit tenfold'

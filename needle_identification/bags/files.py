@@ -29,7 +29,6 @@ def form_of(file: Path) -> str:
 
 
 def _uncompressed(file: Path) -> Path:
-    """Return the file name without the suffix of its compression."""
     return file.with_suffix('') if file.suffix in COMPRESSED else file
 
 

@@ -83,7 +83,6 @@ def _message_in(kind: Any) -> str | None:
 
 
 def _message_file(type_name: str) -> Path:
-    """Return the .msg file of a type in the sourced workspaces."""
     package, _, name = type_name.partition('/msg/')
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         path = Path(prefix) / 'share' / package / 'msg' / f'{name}.msg'

@@ -87,7 +87,6 @@ class BagPlayback:
 
     @property
     def position(self) -> int:
-        """Present recorded time [ns]."""
         if self.is_paused or self.is_ended or self._settings.rate == 0.0:
             return self._at
         elapsed = max(0.0, time.monotonic() - self._since)
@@ -98,7 +97,6 @@ class BagPlayback:
         return (position - self._origin) / NANOSECONDS
 
     def pause(self, paused: bool) -> None:
-        """Pause or resume the recorded time."""
         self._set_position(self.position)
         self.is_paused = paused
 
@@ -174,7 +172,6 @@ class BagPlayback:
         return taken
 
     def finish(self, *, loop: bool) -> None:
-        """Restart or end playback at the end of the recording."""
         if loop:
             self.loops += 1
             self._rewind()

@@ -46,9 +46,7 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
     known = {name for name in old.fielddefs if name in new.fielddefs}
     topics = {
         connection.id: make_topic(
-            connection.topic,
-            connection.msgtype,
-            'cdr' if connection.msgtype in known else 'ros1',
+            connection.topic, connection.msgtype, 'cdr' if connection.msgtype in known else 'ros1'
         )
         for connection in reader.connections
     }

@@ -70,7 +70,6 @@ def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
 
 
 def _topics(database: sqlite3.Connection) -> dict[int, BagTopic]:
-    """Return the topics by their key in the database."""
     definitions: dict[Any, tuple[Any, Any]] = {}
     with suppress(sqlite3.Error):
         # Older recordings lack this table.

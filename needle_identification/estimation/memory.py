@@ -76,12 +76,10 @@ class Parts:
 
     @property
     def sizes(self) -> FloatArray:
-        """Number of samples of each part, shape (m,)."""
         return np.diff(self.limits, axis=1)[:, 0].astype(np.float64)
 
     @property
     def centers(self) -> FloatArray:
-        """Middle of each part [samples], shape (m,)."""
         return np.asarray(self.limits.mean(axis=1))
 
     def sums(self, values: FloatArray) -> FloatArray:

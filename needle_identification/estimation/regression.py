@@ -59,7 +59,7 @@ _PRIOR: Final = 5.0
 _HUBER_LIMIT: Final = 1.345
 
 #: Standard deviation of normal noise over its median absolute deviation.
-_DEVIATION_OVER_MEDIAN: Final = 1.4826
+DEVIATION_OVER_MEDIAN: Final = 1.4826
 
 _MAX_ITERATIONS: Final = 100
 
@@ -334,7 +334,6 @@ def _checked(
 
 
 def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:
-    """Solve weighted least squares."""
     root = np.sqrt(weights)[:, np.newaxis]
     values: FloatArray = np.asarray(np.linalg.lstsq(root * x, root[:, 0] * y, rcond=None)[0])
     influence = weights[:, np.newaxis] * x
@@ -376,7 +375,7 @@ def _huber(x: FloatArray, y: FloatArray, used: BoolArray) -> _Solution:
     limit = np.inf
     for _ in range(_MAX_ITERATIONS):
         size = np.abs(y - x @ values)
-        limit = _HUBER_LIMIT * max(_DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
+        limit = _HUBER_LIMIT * max(DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
         weights = np.where(size > limit, limit / np.maximum(size, limit), 1.0) * used
         last, values = values, _weighted(x, y, weights).values
         if np.linalg.norm(values - last) <= _ROUNDING * np.linalg.norm(values):

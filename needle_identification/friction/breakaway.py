@@ -124,7 +124,6 @@ def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
 
 
 def _misfit(time: FloatArray, values: FloatArray) -> float:
-    """Return the residual sum of squares of a straight line fit."""
     centered, rest = time - time.mean(), values - values.mean()
     total = float(centered @ centered)
     explained = float(centered @ rest) ** 2 / total if total else 0.0

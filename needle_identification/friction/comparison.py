@@ -91,7 +91,6 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
 
 
 def _candidates(design: Design) -> list[str]:
-    """Return the terms that could be added."""
     settings = design.signals.settings
     chosen = set(settings.terms)
     # The user must give the boundaries of layers.

@@ -58,12 +58,10 @@ class Design:
 
     @property
     def estimates_lag(self) -> bool:
-        """Whether the regression includes the lag."""
         return self.lag_column.size > 0
 
     @property
     def is_enough(self) -> bool:
-        """Whether there are enough samples for standard errors."""
         needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
         return bool(np.count_nonzero(self.used) >= needed)
 

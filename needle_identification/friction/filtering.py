@@ -75,7 +75,6 @@ class FilteredSignals:
 
     @property
     def moving_speed(self) -> float:
-        """Speed above which the needle counts as moving [m/s]."""
         return max(self.settings.moving_speed, _CLEARLY * self.speed_noise)
 
 

@@ -18,14 +18,8 @@ from typing import Final, NamedTuple
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import hausman_test, Regression
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
+from needle_identification.friction import checks
 from needle_identification.friction.breakaway import breakaway_force
-from needle_identification.friction.checks import (
-    check_friction,
-    fit_warnings,
-    missing_term,
-    noise_bias,
-    noise_words,
-)
 from needle_identification.friction.comparison import CandidateFit, compare_terms
 from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
@@ -161,8 +155,8 @@ def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | No
 def _noise_remark(chosen: _Candidate) -> str:
     """Describe the effect of velocity noise if it is relevant."""
     design = chosen.design
-    if bias := noise_bias(design, chosen.fit):
-        return noise_words(design, bias)
+    if bias := checks.noise_bias(design, chosen.fit):
+        return checks.noise_words(design, bias)
     signals, usual = design.signals, float(np.median(np.abs(design.speed[design.used])))
     if signals.moving_speed < _HIDDEN * usual:
         return ''
@@ -175,9 +169,9 @@ def _noise_remark(chosen: _Candidate) -> str:
 def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Choose the estimator total if noise of the velocity biases the viscous friction."""
     signals = chosen.design.signals
-    bias = noise_bias(chosen.design, chosen.fit)
+    bias = checks.noise_bias(chosen.design, chosen.fit)
     if bias and signals.settings.allows_total:
-        remark = f'{noise_words(chosen.design, bias)}: took estimator total'
+        remark = f'{checks.noise_words(chosen.design, bias)}: took estimator total'
         settings = replace(signals.settings, estimator='total')
         with suppress(IdentificationError):
             return _fitted(replace(signals, settings=settings), *chosen.remarks, remark)
@@ -220,7 +214,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     settings, used = signals.settings, design.used
     mean_speed = float(np.mean(np.abs(design.speed[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
-    check_friction(parameters)
+    checks.check_friction(parameters)
     lag = lag_estimate(design, fit)
     tests: tuple[ResidualTest, ...] = ()
     comparison: tuple[CandidateFit, ...] = ()
@@ -234,9 +228,9 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
             parameters=len(fit.values),
         )
         comparison = compare_terms(design, fit, among)
-    missing = missing_term(settings.terms, comparison)
+    missing = checks.missing_term(settings.terms, comparison)
     doubts = [missing] if missing else [test.words for test in tests if test.failed]
-    warnings = fit_warnings(design, fit, parameters, lag, chosen.coarse)
+    warnings = checks.fit_warnings(design, fit, parameters, lag, chosen.coarse)
     return FrictionEstimate(
         name=name,
         terms=settings.terms,

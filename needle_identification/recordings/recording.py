@@ -40,8 +40,6 @@ def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | No
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class _AnyRecording:
-    """Common fields and checks of recordings."""
-
     name: str = 'recording'
     time: FloatArray
     force: FloatArray

@@ -61,8 +61,6 @@ class SignalSource(ABC):
 
 
 class _Vector(SignalSource):
-    """Components of the first vector of a message."""
-
     def __init__(self, *axes: str) -> None:
         self.columns = self.width = len(axes)
         self._offsets = [8 * AXES.index(axis) for axis in axes]

@@ -109,7 +109,6 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
 
 
 def is_table(path: Path | str) -> bool:
-    """Return whether a file is read as a table, by its suffix."""
     return Path(path).suffix.lower() in TABLES
 
 
@@ -388,7 +387,6 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    """Make column names unique."""
     seen: set[str] = set()
     for k, name in enumerate(names):
         unique = name if name and name not in seen else f'{name}{k + 1}'

@@ -144,8 +144,6 @@ def identify_steering(
 
 
 class _Fit(NamedTuple):
-    """Search, best variables, and cost."""
-
     search: Search
     x: FloatArray
     cost: float
@@ -245,10 +243,7 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
     media, column = [], len(x)
     for k, (medium, members) in enumerate(search.members.items()):
         at = len(x) - _LENGTHS * (len(search.media) - k)
-        found = [
-            length('bending_length', at, quantiles[k]),
-            length('skin', at + 1, quantiles[k]),
-        ]
+        found = [length('bending_length', at, quantiles[k]), length('skin', at + 1, quantiles[k])]
         names = [name for term in search.terms for name in TERMS[term]]
         for j, name in enumerate(names):
             value, error = float(e.values[k][j]), float(e.errors[column + j])

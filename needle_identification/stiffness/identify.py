@@ -124,7 +124,6 @@ def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> S
 def _level(
     presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
-    """Collect the results of a level."""
     k_zz = float(fit.matrix[1, 1])
     curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
     first, second, angle = principal_estimates(fit)
@@ -160,7 +159,6 @@ def _level(
 
 
 def _unit(row: int, column: int) -> FloatArray:
-    """Return the gradient of an entry of the matrix."""
     gradient = np.zeros((2, 2))
     gradient[row, column] = 1.0
     return gradient
