@@ -46,13 +46,13 @@ def parameter_estimates(
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:
             found[at['moving_mass']] = _widened(mass, viscous.value * period)
+    rows = np.zeros((2, len(fit.values)))
     if 'withdrawal_coulomb' in at:
-        rows = np.zeros((2, len(fit.values)))
         rows[0, [at['coulomb_friction'], at['viscous_friction']]] = 1.0, mean_speed
         rows[1, [at['withdrawal_coulomb'], at['withdrawal_viscous']]] = 1.0, mean_speed
         found.append(_ratio(fit, rows, 'withdrawal_friction', 'f_out / f_in'))
     if 'stribeck_friction' in at and 'coulomb_friction' in at:
-        rows = np.zeros((2, len(fit.values)))
+        rows[:] = 0.0
         rows[[0, 1], [at['coulomb_friction'], at['stribeck_friction']]] = 1.0
         found.append(_ratio(fit, rows, 'breakaway_friction', 'mu_b / mu_s'))
     return tuple(found)

@@ -146,7 +146,7 @@ def _read(
 def _run(options: argparse.Namespace) -> int:
     # A large import, which the other subcommands do not need.
     from needle_identification import identify_steering, SteeringSettings
-    from needle_identification.steering.result import steering_yaml
+    from needle_identification.result import steering_yaml
 
     if options.output is not None:
         check_file(options.output)

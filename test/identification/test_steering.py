@@ -22,9 +22,9 @@ from needle_identification import (
 )
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
+from needle_identification.result import steering_yaml
 from needle_identification.steering.reading import STEERING_ROLES
 from needle_identification.steering.recording import credible
-from needle_identification.steering.result import steering_yaml
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
