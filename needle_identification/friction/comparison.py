@@ -80,13 +80,8 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
         both = _added(design, screening, pairs, samples, level)
         found += [one for one in both if one.supported]
     for term in chosen:
-        rest = tuple(other for other in chosen if other != term)
-        if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
-            names = [column.name for column in columns_of(chosen, settings)]
-            which = [names.index(column.name) for column in columns_of([term], settings)]
-            misfit = screening.misfit_without(which) / screening.misfit
-            difference = samples * log(misfit) - len(which) * log(samples)
-            found.append(_removed(rest, term, fit, which, difference))
+        if len(chosen) > 1 and not ('direction' in chosen and term in ('coulomb', 'viscous')):
+            found.append(_removed(design, fit, screening, term, samples))
     return tuple(found)
 
 
@@ -224,12 +219,19 @@ def _independent_samples(design: Design, fit: Regression) -> float:
 
 
 def _removed(
-    terms: tuple[str, ...], term: str, fit: Regression, which: list[int], difference: float
+    design: Design, fit: Regression, screening: Screening, term: str, samples: float
 ) -> CandidateFit:
+    """Compare with the fit without a term."""
+    settings = design.signals.settings
+    terms = tuple(other for other in settings.terms if other != term)
+    names = [column.name for column in columns_of(settings.terms, settings)]
+    which = [names.index(column.name) for column in columns_of([term], settings)]
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
         return CandidateFit(terms=terms, words=words)
     p_value = wald_test(fit, which)
+    misfit = screening.misfit_without(which) / screening.misfit
+    difference = samples * log(misfit) - len(which) * log(samples)
     supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
     return CandidateFit(

@@ -58,7 +58,10 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):
         design = select_samples(signals, lag, abs(lag))
-        if not design.is_enough or _acceleration_is_noise(design):
+        if not design.is_enough:
+            return coarse, None
+        power = float(np.mean(design.acceleration[design.used] ** 2))
+        if power * _LARGEST_NOISE <= signals.acceleration_noise**2:
             return coarse, None
         design = design.with_lag_column()
         x, used = design.regressors(terms)[design.used], design.used
@@ -105,11 +108,6 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     x = regressors(motion, settings.terms, settings)
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))
-
-
-def _acceleration_is_noise(design: Design) -> bool:
-    power = float(np.mean(design.acceleration[design.used] ** 2))
-    return power * _LARGEST_NOISE <= design.signals.acceleration_noise**2
 
 
 def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:

@@ -193,7 +193,6 @@ class _Signal(NamedTuple):
     axis: str
     stamps: IntArray
     values: FloatArray
-    speed: bool
 
 
 def _bag(path: Path) -> Inspection:
@@ -268,7 +267,7 @@ def _signals(topic: BagTopic, axes: Sequence[str], samples: Samples) -> Iterator
     for k, axis in enumerate(axes):
         values = samples.values[:, k]
         if np.isfinite(values).all() and np.ptp(values) > 0.0:
-            yield _Signal(topic, axis, samples.stamps, values, topic.type_name in _SPEEDS)
+            yield _Signal(topic, axis, samples.stamps, values)
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
@@ -321,7 +320,7 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     every = max(1, len(motion.stamps) // _TRIED)
     time = 1e-9 * (motion.stamps[::every] - start)
     values = motion.values[::every]
-    speed = values if motion.speed else np.gradient(values, time)
+    speed = values if motion.topic.type_name in _SPEEDS else np.gradient(values, time)
     read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
     moving = np.abs(speed) > _MOVING * np.quantile(np.abs(speed), 0.99)
     moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))

@@ -12,7 +12,7 @@ from itertools import pairwise
 from math import hypot, nan, sqrt
 from typing import Final
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import BoolArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
@@ -131,11 +131,13 @@ def _level(
     residual = float((fit.residual**2).sum())
     variation = float(((force - force.mean(axis=0)) ** 2).sum())
     is_known = fit.known.any()
+    # Gradients of the entries of the matrix.
+    units = np.eye(4).reshape(4, 2, 2)
     return LevelEstimate(
         force=float(np.hypot(*force.T).mean()),
         parameters=tuple(
-            fit.derived(name, name, 'N/m', float(fit.matrix[index]), _unit(*index))
-            for name, index in zip(ENTRIES, np.ndindex(2, 2), strict=True)
+            fit.derived(name, name, 'N/m', float(value), unit)
+            for name, value, unit in zip(ENTRIES, fit.matrix.ravel(), units, strict=True)
         ),
         curl=curl,
         spring=spring,
@@ -148,7 +150,7 @@ def _level(
             'k_a',
             'N/m^2',
             k_zz / settings.contact_length,
-            _unit(1, 1) / settings.contact_length,
+            units[3] / settings.contact_length,
         ),
         presses=len(force),
         directions=len(np.unique(presses.direction[chosen])),
@@ -156,12 +158,6 @@ def _level(
         determination=1.0 - residual / variation if is_known and variation > 0.0 else nan,
         condition=fit.condition,
     )
-
-
-def _unit(row: int, column: int) -> FloatArray:
-    gradient = np.zeros((2, 2))
-    gradient[row, column] = 1.0
-    return gradient
 
 
 def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
