@@ -14,12 +14,7 @@ from typing import TYPE_CHECKING
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from needle_identification.bags.bag import (
-        Bag,
-        message_counts,
-        read_topic,
-        Recorded,
-    )
+    from needle_identification.bags.bag import Bag, message_counts, read_topic, Recorded
     from needle_identification.bags.messages import deserialize, encode, message_type
     from needle_identification.bags.topics import BagTopic, OfferedQos
     from needle_identification.bags.writer import BagWriter, COMPRESSIONS
@@ -29,12 +24,16 @@ if TYPE_CHECKING:
     from needle_identification.estimation.regression import regress, Regression
     from needle_identification.estimation.residual_tests import ResidualTest
     from needle_identification.friction.comparison import CandidateFit
-    from needle_identification.friction.estimate import Fit, FrictionEstimate
+    from needle_identification.friction.estimate import (
+        Fit,
+        FrictionEstimate,
+        FrictionSummary,
+        summarize,
+    )
     from needle_identification.friction.identify import identify_friction
     from needle_identification.friction.punctures import Puncture
     from needle_identification.friction.recursive import RecursiveFriction
     from needle_identification.friction.settings import FrictionSettings, TERMS
-    from needle_identification.friction.summary import FrictionSummary, summarize
     from needle_identification.recordings.inspection import (
         ColumnSummary,
         Content,
@@ -51,16 +50,17 @@ if TYPE_CHECKING:
     from needle_identification.steering.identify import identify_steering, SteeringSettings
     from needle_identification.steering.reading import read_steering_recording
     from needle_identification.steering.recording import SteeringRecording
-    from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
+    from needle_identification.stiffness.estimate import (
+        LevelEstimate,
+        LevelSummary,
+        StiffnessEstimate,
+        StiffnessSummary,
+        summarize_stiffness,
+    )
     from needle_identification.stiffness.identify import identify_stiffness
     from needle_identification.stiffness.presses import Presses
     from needle_identification.stiffness.settings import StiffnessSettings
     from needle_identification.stiffness.spring import asymmetry
-    from needle_identification.stiffness.summary import (
-        LevelSummary,
-        StiffnessSummary,
-        summarize_stiffness,
-    )
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from needle_ros.requests import no_answer
 
@@ -11,22 +11,10 @@ from needle_ros.requests import no_answer
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
-class ParameterFuture(Protocol):
-    """Future of the response of a node to a SetParameters request."""
-
-    def done(self) -> bool:
-        """Return whether the response was received or the call failed."""
-
-    def result(self) -> Any:
-        """Return the response; None if the call failed."""
-
-
 class Application:
-    """Parameters sent to other nodes, and their responses (None: no such node), by name."""
+    """Parameters sent to other nodes, and futures of the responses (None: no such node)."""
 
-    def __init__(
-        self, values: Mapping[str, float | str], answers: Mapping[str, ParameterFuture | None]
-    ) -> None:
+    def __init__(self, values: Mapping[str, float | str], answers: Mapping[str, Any]) -> None:
         self._values, self._answers = values, answers
         self._needed = [name for name in _COEFFICIENTS if name in values] or list(values)
 
@@ -36,16 +24,12 @@ class Application:
         return all(answer is None or answer.done() for answer in self._answers.values())
 
     def outcome(self) -> tuple[bool, str]:
-        """
-        Return whether each existing node set all parameters that it can change, and a message.
-
-        The message lists for each node the parameters that it set and those that it rejected.
-        """
+        """Return whether each existing node set all that it can, and a message by node."""
         outcomes = [self._of_node(name, answer) for name, answer in self._answers.items()]
         verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
         return bool(verdicts) and all(verdicts), '; '.join(words for _, words in outcomes)
 
-    def _of_node(self, node: str, answer: ParameterFuture | None) -> tuple[bool | None, str]:
+    def _of_node(self, node: str, answer: Any) -> tuple[bool | None, str]:
         if answer is None:
             return None, f'{node}: no such node'
         response = answer.result()

@@ -11,10 +11,10 @@ from typing import Any, ClassVar, Final
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_identification.application import Application
 from needle_identification.estimation.estimate import Statistic, statistic
+from needle_identification.friction.estimate import summarize
 from needle_identification.friction.identify import identify_friction
-from needle_identification.friction.live import LiveFriction
+from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
-from needle_identification.friction.summary import summarize
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
@@ -24,9 +24,9 @@ from needle_identification.recordings.reading import (
 from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status import live_statuses, sentence, Status, summary_statuses
+from needle_identification.stiffness.estimate import summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.summary import summarize_stiffness
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
@@ -155,20 +155,17 @@ class IdentificationNode(BaseNode):
             self._timer = self.create_timer(1.0, self._publish_live)
 
     def about(self) -> str:
-        """Return the identified quantity and its sources."""
         live = (contract.JOINT_STATES.name, contract.BASE_WRENCH.name) if self._is_live else ()
         heard = f', and live from {" and ".join(live)}' if live else ''
         return f'{self._what} from {len(self._bags)} recordings at ~/identify{heard}'
 
     def deactivate(self) -> None:
-        """Unsubscribe."""
         if self._is_live:
             self.destroy_timer(self._timer)
             for subscription in self._listening:
                 self.destroy_subscription(subscription)
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Set the recordings of the next identification."""
         self._bags = [name for name in changes['bags'] if name]
 
     def diagnose(self) -> Diagnosis[IdentificationStatus]:
@@ -211,9 +208,7 @@ class IdentificationNode(BaseNode):
                 self._estimates(
                     partial(read_friction_recording, **reading),
                     partial(
-                        identify_friction,
-                        settings=self._friction_settings,
-                        among=len(self._bags),
+                        identify_friction, settings=self._friction_settings, among=len(self._bags)
                     ),
                 )
             )
@@ -361,7 +356,6 @@ def _message_of(result: Status) -> DiagnosticStatus:
 
 
 def main() -> int:
-    """Run the node; return its exit status."""
     return run(IdentificationNode)
 
 

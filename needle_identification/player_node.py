@@ -162,7 +162,6 @@ class PlayerNode(BaseNode):
             return None
 
     def cleanup(self) -> None:
-        """Destroy the publishers."""
         for publisher in self._outputs.values():
             self.destroy_publisher(publisher)
         self._outputs.clear()
@@ -171,7 +170,6 @@ class PlayerNode(BaseNode):
             self._clock_publisher = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Change the rate."""
         self._playback.settings = self.settings('', PlaybackSettings, changes)
 
     def activate(self) -> None:
@@ -187,7 +185,6 @@ class PlayerNode(BaseNode):
         ]
 
     def about(self) -> str:
-        """Return the recording and its topics."""
         return f'plays {", ".join(sorted(self._outputs))} of {self._playback.bag.path}'
 
     def deactivate(self) -> None:
@@ -228,7 +225,6 @@ class PlayerNode(BaseNode):
         self._finish()
 
     def _finish(self) -> None:
-        """Restart or end playback after the last message."""
         playback = self._playback
         playback.finish(loop=bool(self.get_parameter('loop').value))
         if not playback.is_ended:
@@ -295,7 +291,6 @@ class PlayerNode(BaseNode):
     # Diagnostics.
 
     def _look(self) -> None:
-        """Check for duplicate publishers of the played topics."""
         contested = {
             name
             for name in self._outputs
@@ -373,7 +368,6 @@ def _player() -> PlayerNode:
 
 
 def main() -> int:
-    """Run the node; return its exit status."""
     return run(_player)
 
 

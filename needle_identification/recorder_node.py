@@ -94,7 +94,6 @@ class RecorderNode(BaseNode):
         self.create_timer(_TAKE_PERIOD, self._take, clock=steady)
 
     def configure(self) -> None:
-        """Read the topics and the path."""
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a folder to record to, got nothing')
@@ -105,11 +104,9 @@ class RecorderNode(BaseNode):
         self._names = {self.resolve_topic_name(name) for name in names if name != '*'}
 
     def activate(self) -> None:
-        """Start a recording."""
         self._begin()
 
     def deactivate(self) -> None:
-        """Complete the bag."""
         if self._bag is not None:
             self._end(self._bag)
 
@@ -330,7 +327,6 @@ def _offer(qos: QoSProfile) -> OfferedQos:
 
 
 def main() -> int:
-    """Run the node; return its exit status."""
     return run(RecorderNode)
 
 

@@ -1,18 +1,19 @@
-"""Write identified parameters to a ROS parameter file for plant and controller."""
+"""Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
-from math import isfinite
+from math import atan2, hypot, isfinite
 from pathlib import Path
 from typing import Final
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import UNKNOWN
-from needle_identification.friction.summary import FrictionSummary
-from needle_identification.stiffness.summary import StiffnessSummary
+from needle_identification.friction.estimate import FrictionSummary
+from needle_identification.steering.estimate import SteeringEstimate
+from needle_identification.stiffness.estimate import StiffnessSummary
 from needle_ros.files import write_whole
 import yaml
 
@@ -22,11 +23,9 @@ NODES: Final = ('plant', 'controller')
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     """
-    Return identified parameters as parameters of the nodes plant and controller.
+    Return identified constants of the model as parameters of plant and controller, in SI units.
 
-    Keys are names such as ``model.coulomb_friction``; values are in SI units. Only determined
-    parameters that are constants of the model are included. A mean outside the range of its
-    parameter, which can only be within its error of the limit, is set to the limit.
+    A mean outside the range of its parameter, by less than its error, is set to the limit.
     """
     # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters
@@ -37,8 +36,7 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
         item = constants.get(statistic.name)
         if item is not None and isfinite(statistic.mean):
             low, high = item.metadata['low'], item.metadata['high']
-            # More digits than the accuracy of any experiment.
-            values[f'model.{item.name}'] = float(f'{min(max(statistic.mean, low), high):.7g}')
+            values[f'model.{item.name}'] = _short(min(max(statistic.mean, low), high))
     if 'model.breakaway_friction' in values:
         values['model.friction_law'] = 'stribeck'
     return values
@@ -133,3 +131,54 @@ def write_result(
 
     """
     write_whole(path, result_yaml(friction, stiffness).encode())
+
+
+def steering_yaml(found: SteeringEstimate) -> str:
+    """
+    Return a ROS parameter file for plant, controller and steering node, errors as comments.
+
+    The data determine lengths, not forces: the bending stiffness is the default.
+    """
+    # Imported here for the same reason.
+    from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
+    from needle_dynamics.steering.parameters import tissue_of
+
+    if len(found.media) > 1:
+        raise IdentificationError(
+            'a parameter file describes a single medium, got '
+            f'{", ".join(medium.medium for medium in found.media)}'
+        )
+    (medium,) = found.media
+    length = medium['bending_length']
+    if not length.determined:
+        raise IdentificationError('the data do not determine the bending length')
+    stiffness = NeedleParameters.preset(DEFAULT_PRESET).bending_stiffness
+    tissue = tissue_of(stiffness, length.value)
+    lines = ['# Steered needle, identified by needle_identification.']
+    for one in (found.free_length, *medium.parameters):
+        unit = '' if one.unit == '1' else f' {one.unit}'
+        value = f'{one.value:.6g}{unit}, SE {one.error:.2g}' if one.determined else UNKNOWN
+        lines.append(f'# {one.symbol} ({one.name}) = {value}')
+    lines.append(f'# E I = {stiffness:g} N m^2 of the preset {DEFAULT_PRESET}')
+    lengths: dict[str, object] = {}
+    if found.free_length.determined and isfinite(found.free_length.value):
+        lengths['steering.free_length'] = _short(found.free_length.value)
+    if medium['skin'].determined:
+        lengths['steering.skin_stiffness'] = _short(max(0.0, medium['skin'].value) * tissue)
+    steering = {'steered': True, **lengths}
+    if 'bevel' in found.terms:
+        z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
+        steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
+        lines.append(f'# the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
+    model = {'model.preset': DEFAULT_PRESET, 'model.tissue_stiffness': _short(tissue)}
+    sections = {
+        '/**/plant': {'ros__parameters': {**model, **steering}},
+        '/**/controller': {'ros__parameters': model},
+        '/**/steering': {'ros__parameters': {**model, **lengths}},
+    }
+    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+
+
+def _short(value: float) -> float:
+    """Round to more digits than the accuracy of any experiment."""
+    return float(f'{value:.7g}')

@@ -7,32 +7,16 @@ from typing import NamedTuple
 
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import measured
-from needle_identification.friction.estimate import FrictionEstimate
-from needle_identification.friction.summary import FrictionSummary
-from needle_identification.stiffness.estimate import StiffnessEstimate
-from needle_identification.stiffness.summary import StiffnessSummary
+from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary
+from needle_identification.stiffness.estimate import StiffnessEstimate, StiffnessSummary
 
 
 class Status(NamedTuple):
-    """
-    A result as a message and values.
+    """A result as a message and values; ``source`` is ``recordings`` or ``live``."""
 
-    Attributes
-    ----------
-    name, message : str
-        Parameter or recording, and the result as text.
-    values : mapping
-        Values by name; None if not applicable.
-    is_determined : bool
-        Whether the data determine the parameter.
-    source : str
-        Source of a parameter: ``recordings`` or ``live``.
-
-    """
-
-    name: str
+    name: str  # parameter or recording
     message: str
-    values: Mapping[str, object]
+    values: Mapping[str, object]  # None if not applicable
     is_determined: bool = True
     source: str = ''
 

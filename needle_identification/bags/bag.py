@@ -10,8 +10,8 @@ import sqlite3
 from typing import Any, Final, NamedTuple
 
 from needle_identification.bags.batch import MessageBatch, Tally
+from needle_identification.bags.compression import Budget
 from needle_identification.bags.files import files_of, form_of
-from needle_identification.bags.limits import Budget
 from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
 from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic
@@ -118,23 +118,15 @@ class Bag:
         for file in self._files:
             indexed = indexed_topics(file) if file.suffix == '.mcap' else None
             if indexed is None:
-                found.update(self.count())
+                found.update(self._count())
                 break
             found.update(indexed)
         if not found:
             raise _empty(self)
         return tuple(sorted(found, key=lambda topic: (topic.name, topic.type_name)))
 
-    def count(self) -> Mapping[BagTopic, int]:
-        """
-        Read the whole bag and count its messages.
-
-        Returns
-        -------
-        mapping
-            Number of messages by topic; empty for an empty bag.
-
-        """
+    def _count(self) -> Mapping[BagTopic, int]:
+        """Read the whole bag and count its messages by topic."""
         for _ in self.batches(lambda _topic: False):
             pass
         return self.counts
@@ -238,7 +230,7 @@ def message_counts(path: Path | str) -> dict[str, int]:
     """
     bag = Bag(path)
     counts = Counter[str]()
-    for topic, number in sorted(bag.count().items(), key=lambda item: item[0].name):
+    for topic, number in sorted(bag._count().items(), key=lambda item: item[0].name):
         counts[topic.name] += number
     if not counts:
         raise _empty(bag)

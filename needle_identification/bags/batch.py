@@ -7,8 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.compression import DAMAGED, decompress
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import Budget, DAMAGED, decompress
 from needle_identification.bags.topics import BagTopic
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +23,12 @@ _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 
 class MessageBatch(NamedTuple):
-    """
-    Messages of one topic, in the order of the file.
-
-    Attributes
-    ----------
-    topic : BagTopic
-        Topic of the messages.
-    received : ndarray of int64, shape (m,)
-        Receive times [ns].
-    data, begin, end : ndarray
-        Bytes of the messages; offsets of the begin and end of each message, shape (m,).
-
-    """
+    """Messages (m,) of one topic, in the order of the file."""
 
     topic: BagTopic
-    received: NDArray[np.int64]
-    data: NDArray[np.uint8]
-    begin: NDArray[np.int64]
+    received: NDArray[np.int64]  # receive times [ns]
+    data: NDArray[np.uint8]  # bytes of the messages
+    begin: NDArray[np.int64]  # offset of each message
     end: NDArray[np.int64]
 
     @classmethod
@@ -58,12 +45,7 @@ class MessageBatch(NamedTuple):
     def of_times(
         cls, topic: BagTopic, times: Sequence[Any], messages: Sequence[Any]
     ) -> MessageBatch:
-        """
-        Build a batch from unchecked values of a file.
-
-        A receive time [ns] that is not an integer becomes 0; a message that is not bytes becomes
-        empty.
-        """
+        """Build a batch from values of a file; invalid times are 0, invalid messages empty."""
         stamps = np.array(
             [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times],
             dtype=np.int64,
@@ -71,16 +53,11 @@ class MessageBatch(NamedTuple):
         return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
 
     def messages(self) -> Iterator[tuple[int, bytes]]:
-        """Iterate over receive times [ns] and serialized messages."""
         for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
             yield int(received), self.data[begin:end].tobytes()
 
     def decompressed(self, budget: Budget) -> MessageBatch:
-        """
-        Decompress messages that were compressed one by one; a damaged message becomes empty.
-
-        Raises a RecordingError if the decompressed size exceeds the budget.
-        """
+        """Decompress messages that were compressed one by one; a damaged message becomes empty."""
         compression = _COMPRESSED.get(next(self.messages())[1][:4])
         if compression is None:
             return self
@@ -102,33 +79,15 @@ def grouped(rows: Iterable[tuple[Any, Any, Any]]) -> dict[Any, list[tuple[Any, A
 
 @dataclass(slots=True)
 class Tally:
-    """
-    Counts of the messages read from a file.
-
-    Attributes
-    ----------
-    counts : dict
-        Number of messages by topic.
-    wanted : callable
-        Selects topics: returns whether to read the messages of a topic.
-    faults : list of str
-        Faults of the file.
-    budget : Budget
-        Limits of the decompressed size.
-    count, written : int
-        Messages read of known topics, and messages by the statistics of the file, if available.
-    piece : int
-        Number of the current piece; the pieces of a file are in order of time.
-
-    """
+    """Counts of the messages read from a file."""
 
     counts: dict[BagTopic, int]
-    wanted: Callable[[BagTopic], bool]
+    wanted: Callable[[BagTopic], bool]  # whether to read the messages of a topic
     faults: list[str]
     budget: Budget
-    count: int = 0
-    written: int | None = None
-    piece: int = 0
+    count: int = 0  # messages read of known topics
+    written: int | None = None  # messages by the statistics of the file
+    piece: int = 0  # number of the piece of the file, in order of time
 
     def __str__(self) -> str:
         of = '' if self.written is None else f' of {self.written}'

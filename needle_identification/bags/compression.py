@@ -1,13 +1,16 @@
-"""Decompress files and messages (zstd, lz4), also truncated data."""
+"""Decompress files and messages (zstd, lz4), also truncated data, within limits of their size."""
 
 from __future__ import annotations
 
 from contextlib import suppress
+from math import isfinite
+import os
 from pathlib import Path
 import struct
 from typing import Any, Final
 
 import lz4.frame
+from needle_identification.errors import RecordingError
 import zstandard
 
 #: File name suffixes of compressed files.
@@ -28,6 +31,17 @@ DAMAGED: Final = (
     TypeError,
     ValueError,
 )
+
+#: Environment variable: factor of all limits of this module.
+FACTOR: Final = 'NEEDLE_BAG_FACTOR'
+
+#: Largest record or chunk, and largest message that was compressed individually [bytes].
+LARGEST_RECORD: Final = 2**27
+LARGEST_MESSAGE: Final = 2**26
+
+#: Decompressed size allowed for any file [bytes], and per byte of the file.
+_AT_LEAST: Final = 2**28
+_RATIO: Final = 50
 
 
 def open_file(file: Path) -> Any:
@@ -52,12 +66,7 @@ def read_up_to(stream: Any, length: int) -> bytes:
 
 
 def decompress(compression: str, data: bytes, size: int) -> bytes:
-    """
-    Decompress data (``zstd``, ``lz4``, or '' for none) up to `size` bytes.
-
-    Truncated data are decompressed up to their end. Raises a ValueError for an unknown
-    compression.
-    """
+    """Decompress data (``zstd``, ``lz4`` or '') up to `size` bytes, also if truncated."""
     if compression == 'zstd':
         with _zstd_stream(data) as stream:
             return read_up_to(stream, size)
@@ -70,3 +79,65 @@ def decompress(compression: str, data: bytes, size: int) -> bytes:
 
 def _zstd_stream(source: Any) -> Any:
     return zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
+
+
+def factor() -> float:
+    """Return the positive factor of all limits, `FACTOR` of the environment or 1."""
+    text = os.environ.get(FACTOR, '1')
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not (isfinite(value) and value > 0.0):
+        raise RecordingError(f'{FACTOR} must be a positive number, got {text!r}')
+    return value
+
+
+class Budget:
+    """Remaining decompressed size of a file, and its largest record and message [bytes]."""
+
+    def __init__(self, file: Path) -> None:
+        times = factor()
+        self.name, self._size = file.name, file.stat().st_size
+        self._most = self._left = round(times * max(_AT_LEAST, _RATIO * self._size))
+        self.largest = round(times * LARGEST_RECORD)
+        self.largest_message = round(times * LARGEST_MESSAGE)
+
+    def spend(self, number: int) -> None:
+        """Count decompressed bytes; raise a RecordingError above the limit."""
+        self._left -= number
+        if self._left < 0:
+            raise RecordingError(
+                f'{self.name} unfolds to more than {_bytes(self._most)} from '
+                f'{_bytes(self._size)}; {FACTOR}=10 raises this limit tenfold'
+            )
+
+    def too_large(self, what: str, size: int) -> str:
+        return (
+            f'a {what} of {size} bytes, at most {_bytes(self.largest)} are read; {FACTOR}=10 '
+            'raises this limit tenfold'
+        )
+
+    def metered(self, stream: Any) -> Any:
+        """Wrap a stream of decompressed bytes so that each byte read is counted."""
+        return _Metered(stream, self)
+
+
+class _Metered:
+    def __init__(self, stream: Any, budget: Budget) -> None:
+        self._stream, self._budget = stream, budget
+
+    def __enter__(self) -> _Metered:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int) -> bytes:
+        part: bytes = self._stream.read(size)
+        self._budget.spend(len(part))
+        return part
+
+
+def _bytes(number: int) -> str:
+    return f'{number / 2**20:.0f} MB' if number >= 2**20 else f'{number / 2**10:.1f} kB'

@@ -29,16 +29,11 @@ def form_of(file: Path) -> str:
 
 
 def _uncompressed(file: Path) -> Path:
-    """Return the file name without the suffix of its compression."""
     return file.with_suffix('') if file.suffix in COMPRESSED else file
 
 
 def files_of(path: Path) -> tuple[list[Path], list[str]]:
-    """
-    List the files of a bag in the order of recording, and its missing or foreign files.
-
-    `path` is a rosbag2 folder or a single file of it. Raises a RecordingError if it is not a bag.
-    """
+    """List the files of a bag in the order of recording, and its missing or foreign files."""
     if not path.exists():
         raise RecordingError(f'{path} does not exist; {_VALID}')
     if path.is_file():

@@ -109,11 +109,7 @@ def indexed_topics(file: Path) -> set[BagTopic] | None:
 
 
 def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
-    """
-    Read an MCAP file, compressed or not; yield the messages of the selected topics.
-
-    Raises a RecordingError if it is not an MCAP file.
-    """
+    """Read an MCAP file, compressed or not; yield the messages of the selected topics."""
     channels = _Channels()
     loose = bytearray()
     is_complete = False
@@ -151,7 +147,6 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
 
 
 def _skip(stream: Any, length: int) -> None:
-    """Skip bytes of a stream, in bounded memory."""
     while length > 0 and (part := read_up_to(stream, min(length, BLOCK))):
         length -= len(part)
 
@@ -196,7 +191,6 @@ def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int
 
 
 def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[MessageBatch]:
-    """Yield the messages among records."""
     data = np.frombuffer(content, dtype=np.uint8)
     for begin, end in _records(content):
         opcodes = data[begin - _HEAD.size]

@@ -83,7 +83,6 @@ def _message_in(kind: Any) -> str | None:
 
 
 def _message_file(type_name: str) -> Path:
-    """Return the .msg file of a type in the sourced workspaces."""
     package, _, name = type_name.partition('/msg/')
     for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
         path = Path(prefix) / 'share' / package / 'msg' / f'{name}.msg'
@@ -96,12 +95,7 @@ def _message_file(type_name: str) -> Path:
 
 
 def definition_of(type_name: str) -> tuple[str, str]:
-    """
-    Return the definition (``ros2msg``) and the type hash of a message type, as stored in a bag.
-
-    Raises a RecordingError if the type is neither in ROS 2 Jazzy nor installed, or its definition
-    is not readable.
-    """
+    """Return the definition (``ros2msg``) and the type hash of a message type."""
     try:
         store = _installed(type_name)
         definition, _ = store.generate_msgdef(type_name, ros_version=2)

@@ -21,11 +21,7 @@ _LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaybackSettings:
-    """
-    Interval and rate of playback; each field has its meaning and unit.
-
-    Raises a ParameterError if a setting is out of range, or `end` is not after `start`.
-    """
+    """Interval and rate of playback; each field has its meaning and unit."""
 
     rate: float = constant(
         1.0, '1', 'playback speed relative to the recording; 0: as fast as possible'
@@ -48,29 +44,9 @@ class BagPlayback:
     """
     Iterates over the messages of a bag in the order of reception, in recorded time.
 
-    Parameters
-    ----------
-    bag : Bag
-        Recording to play.
-    topics : set of str
-        Names of the topics to play.
-    latched : mapping
-        Number of messages that are kept for late readers, by name of each latched topic. Latched
-        messages from before the start are played first.
-    settings : PlaybackSettings
-        Interval and rate of playback.
-
-    Attributes
-    ----------
-    bag : Bag
-        Recording to play.
-    is_paused, is_ended : bool
-        Whether the recorded time is paused; whether all messages are played.
-    late, latest : float
-        Delay of the last message, and the largest delay [s].
-    loops : int
-        Number of restarts at the end.
-
+    ``latched`` has the number of messages that are kept for late readers, by name of each latched
+    topic. Latched messages from before the start are played first. ``late`` and ``latest`` are the
+    delay of the last message and the largest delay [s]; ``loops`` counts restarts at the end.
     """
 
     def __init__(
@@ -111,7 +87,6 @@ class BagPlayback:
 
     @property
     def position(self) -> int:
-        """Present recorded time [ns]."""
         if self.is_paused or self.is_ended or self._settings.rate == 0.0:
             return self._at
         elapsed = max(0.0, time.monotonic() - self._since)
@@ -122,7 +97,6 @@ class BagPlayback:
         return (position - self._origin) / NANOSECONDS
 
     def pause(self, paused: bool) -> None:
-        """Pause or resume the recorded time."""
         self._set_position(self.position)
         self.is_paused = paused
 
@@ -165,12 +139,7 @@ class BagPlayback:
         return self._next is not None
 
     def is_due(self) -> bool:
-        """
-        Return whether the next message is due (False without one), and record its delay.
-
-        Raises a RecordingError for an implausible receive time, more than a day after the previous
-        one.
-        """
+        """Whether the next message is due; records its delay, and rejects a pause of a day."""
         if self._next is None:
             return False
         pause = self._next.received - self._last
@@ -203,7 +172,6 @@ class BagPlayback:
         return taken
 
     def finish(self, *, loop: bool) -> None:
-        """Restart or end playback at the end of the recording."""
         if loop:
             self.loops += 1
             self._rewind()

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
-from needle_identification.bags.compression import DAMAGED, decompress
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import Budget, DAMAGED, decompress
 from needle_identification.bags.topics import make_topic
 from needle_identification.errors import RecordingError
 from rosbags.convert.converter import generate_message_converter
@@ -47,9 +46,7 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
     known = {name for name in old.fielddefs if name in new.fielddefs}
     topics = {
         connection.id: make_topic(
-            connection.topic,
-            connection.msgtype,
-            'cdr' if connection.msgtype in known else 'ros1',
+            connection.topic, connection.msgtype, 'cdr' if connection.msgtype in known else 'ros1'
         )
         for connection in reader.connections
     }

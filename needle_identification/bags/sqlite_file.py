@@ -12,8 +12,7 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
-from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
-from needle_identification.bags.limits import factor
+from needle_identification.bags.compression import BLOCK, COMPRESSED, factor, open_file, read_up_to
 from needle_identification.bags.topics import BagTopic, make_topic
 from needle_identification.errors import RecordingError
 
@@ -30,11 +29,7 @@ _STEPS_PER_CALL: Final = 10**5
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
-    """
-    Read a ``.db3`` file, compressed or not; yield the messages of the selected topics.
-
-    At a damaged part it raises a sqlite3.Error, after yielding the messages before this part.
-    """
+    """Read a ``.db3`` file; raise sqlite3.Error after the messages before a damaged part."""
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())
@@ -75,7 +70,6 @@ def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
 
 
 def _topics(database: sqlite3.Connection) -> dict[int, BagTopic]:
-    """Return the topics by their key in the database."""
     definitions: dict[Any, tuple[Any, Any]] = {}
     with suppress(sqlite3.Error):
         # Older recordings lack this table.

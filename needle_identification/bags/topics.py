@@ -153,10 +153,9 @@ def make_topic(
     profiles: str = '',
 ) -> BagTopic:
     """
-    Build a topic from the names and definitions in a file.
+    Build a topic; ``std_msgs/String`` (ROS 1, some writers) becomes ``std_msgs/msg/String``.
 
-    A type such as ``std_msgs/String`` (ROS 1, some writers) is completed to
-    ``std_msgs/msg/String``; a message encoding other than ``cdr`` (ROS 2) is appended to the type.
+    A message encoding other than ``cdr`` (ROS 2) is appended to the type.
     """
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'

@@ -136,10 +136,7 @@ class BagWriter:
             topic,
             'cdr',
             self._schemas[type_name],
-            {
-                'offered_qos_profiles': yaml.safe_dump(profiles),
-                'topic_type_hash': type_hash,
-            },
+            {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash},
         )
         self._counts.setdefault(topic, 0)
         self._topics[topic] = {
@@ -238,5 +235,4 @@ class BagWriter:
 
 
 def described(lost: Mapping[str, int]) -> str:
-    """Format the numbers of lost messages by topic in one line."""
     return ', '.join(f'{number} of {topic}' for topic, number in sorted(lost.items()))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan, sqrt
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.formatting import measured
@@ -40,25 +40,6 @@ class ParameterEstimate:
     error: float = inf
     interval: tuple[float, float] = (-inf, inf)
     determined: bool = False
-
-    def with_value(self, value: float, error: float, half_width: float) -> ParameterEstimate:
-        """
-        Return a determined copy, with an interval symmetric about the value.
-
-        Parameters
-        ----------
-        value, error, half_width : float
-            Estimate, standard error and half the width of the 95 % interval, in the unit of
-            the parameter.
-
-        Returns
-        -------
-        ParameterEstimate
-            Estimate with the new value.
-
-        """
-        interval = (value - half_width, value + half_width)
-        return replace(self, value=value, error=error, interval=interval, determined=True)
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.value, self.error, self.unit)}>'
@@ -99,22 +80,29 @@ class Statistic:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
 
 
+def with_value(
+    unknown: ParameterEstimate, value: float, error: float, low: float, high: float
+) -> ParameterEstimate:
+    """Return a determined copy with a value, its standard error and its 95 % interval."""
+    return replace(unknown, value=value, error=error, interval=(low, high), determined=True)
+
+
+def with_half_width(
+    unknown: ParameterEstimate, value: float, error: float, half_width: float
+) -> ParameterEstimate:
+    """Return a determined copy, with an interval symmetric about the value."""
+    return with_value(unknown, value, error, value - half_width, value + half_width)
+
+
 _Named = TypeVar('_Named', ParameterEstimate, Statistic)
 
 
-class Named(Generic[_Named]):
-    """Results by name: ``results[name]``; a KeyError lists the valid names."""
-
-    __slots__ = ()
-
-    def _named(self) -> Sequence[_Named]:
-        raise NotImplementedError
-
-    def __getitem__(self, name: str) -> _Named:
-        for item in self._named():
-            if item.name == name:
-                return item
-        raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in self._named())}')
+def named(items: Sequence[_Named], name: str) -> _Named:
+    """Return the item with a name; a KeyError lists the valid names."""
+    for item in items:
+        if item.name == name:
+            return item
+    raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in items)}')
 
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
@@ -148,8 +136,9 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     first = parameters[0]
     known = [parameter for parameter in parameters if parameter.determined]
     count = len(known)
+    unknown = Statistic(name=first.name, symbol=first.symbol, unit=first.unit)
     if not count:
-        return Statistic(name=first.name, symbol=first.symbol, unit=first.unit)
+        return unknown
     values = np.array([parameter.value for parameter in known])
     deviation = float(values.std(ddof=1)) if count > 1 else None
     within = float(np.mean([parameter.error**2 for parameter in known]))
@@ -157,10 +146,8 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     error = sqrt(max(within, between) / count)
     half_width = error * (float(stdtrit(count - 1, 0.975)) if between > within else 2.0)
     mean = float(values.mean())
-    return Statistic(
-        name=first.name,
-        symbol=first.symbol,
-        unit=first.unit,
+    return replace(
+        unknown,
         mean=mean,
         deviation=deviation,
         error=error,

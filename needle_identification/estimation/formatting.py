@@ -34,9 +34,9 @@ def rounded(value: float, error: float, unit: str = '') -> str:
     return f'{value:{_format(error)}}{_suffix(unit)}' if isfinite(value) else UNKNOWN
 
 
-def spread(deviation: float, unit: str = '') -> str:
+def spread(deviation: float) -> str:
     """Format a standard deviation with three digits; `UNKNOWN` if not finite."""
-    return rounded(deviation, 0.1 * deviation, unit)
+    return rounded(deviation, 0.1 * deviation)
 
 
 def between(interval: tuple[float, float]) -> str:

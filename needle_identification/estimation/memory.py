@@ -69,29 +69,17 @@ _RUN: Final = 50
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """
-    Parts of about equal length, without gaps.
-
-    Attributes
-    ----------
-    limits : ndarray of int, shape (m, 2)
-        First sample of each part, and one past its last.
-    length : float
-        Nominal length [samples].
-
-    """
+    """Parts of about equal ``length`` [samples], without gaps; limits (m, 2): begin and end."""
 
     limits: IntArray
     length: float
 
     @property
     def sizes(self) -> FloatArray:
-        """Number of samples of each part, shape (m,)."""
         return np.diff(self.limits, axis=1)[:, 0].astype(np.float64)
 
     @property
     def centers(self) -> FloatArray:
-        """Middle of each part [samples], shape (m,)."""
         return np.asarray(self.limits.mean(axis=1))
 
     def sums(self, values: FloatArray) -> FloatArray:
@@ -123,32 +111,15 @@ def divided(used: BoolArray, length: int) -> Parts:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Memory:
-    """
-    Autocorrelation of noise, and its effect on the errors.
+    """Autocorrelation of noise, and its effect on the errors of k parameters."""
 
-    Attributes
-    ----------
-    inflation, far : ndarray, shape (k,)
-        Error of each parameter relative to white noise, for intervals of 95 % and of 99.6 %, the
-        latter for tests with few false alarms.
-    length : float
-        Correlation time of the most probable model [samples]; 0 for white noise.
-    ratio : float
-        Variance of correlated noise, or of differences, relative to white noise in that model.
-
-    """
-
-    inflation: FloatArray
-    far: FloatArray
-    length: float
-    ratio: float
+    inflation: FloatArray  # (k,) errors over errors for white noise, for intervals of 95 %
+    far: FloatArray  # (k,) likewise for intervals of 99.6 %, for tests
+    length: float  # most probable correlation time [samples]; 0: white noise
+    ratio: float  # its variance relative to white noise
 
     def whitened(self, means: FloatArray, parts: Parts) -> FloatArray:
-        """
-        Return the innovations of the means of the noise over parts, (m,) (Kalman filter).
-
-        They are uncorrelated with equal variance if the noise agrees with the model.
-        """
+        """Return the innovations, (m,), of the means of noise over parts (Kalman filter)."""
         white = parts.length / parts.sizes
         if not self.length:
             return np.asarray(means / np.sqrt(white))
@@ -172,11 +143,10 @@ def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
     """
-    Estimate the autocorrelation of noise from the residuals (n,) of a fit.
+    Estimate the autocorrelation of noise from the residuals (n,); white with too few parts.
 
-    With too few parts, the noise is assumed white. `influence` (n, k) is the change of each
-    parameter with the response of each sample. Regressors and influence are zero for unused
-    samples.
+    `influence` (n, k) is the change of each parameter with the response of each sample. Regressors
+    and influence are zero for unused samples.
     """
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)

@@ -28,7 +28,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -60,7 +59,7 @@ _PRIOR: Final = 5.0
 _HUBER_LIMIT: Final = 1.345
 
 #: Standard deviation of normal noise over its median absolute deviation.
-_DEVIATION_OVER_MEDIAN: Final = 1.4826
+DEVIATION_OVER_MEDIAN: Final = 1.4826
 
 _MAX_ITERATIONS: Final = 100
 
@@ -117,14 +116,9 @@ class Regression:
         """Whether the residuals are rounding errors only."""
         return 1.0 - self.determination < _ROUNDING
 
-    def interval(self, level: float = 0.95) -> FloatArray:
+    def interval(self) -> FloatArray:
         """
-        Return the confidence intervals of the parameters (Student's t).
-
-        Parameters
-        ----------
-        level : float
-            Confidence level.
+        Return the 95 % confidence intervals of the parameters (Student's t).
 
         Returns
         -------
@@ -132,79 +126,47 @@ class Regression:
             Lower and upper limits; infinite where not determined.
 
         """
-        half_widths = stdtrit(self.degrees_of_freedom, 0.5 + level / 2.0) * self.errors
+        half_widths = stdtrit(self.degrees_of_freedom, 0.975) * self.errors
         centers = np.where(self.determined, self.values, 0.0)
         return np.column_stack([centers - half_widths, centers + half_widths])
 
-    def wald(self, which: Sequence[int]) -> tuple[float, float]:
-        """
-        Test whether parameters are all zero (Wald test).
 
-        Parameters
-        ----------
-        which : sequence of int
-            Indices of the parameters, all determined.
+def wald_test(fit: Regression, at: list[int]) -> float:
+    """Return the p-value that the parameters with these indices, all determined, are zero."""
+    values = fit.values[at]
+    covariance = fit.covariance[np.ix_(at, at)]
+    if fit.memory is not None:
+        more = fit.memory.far[at] / fit.memory.inflation[at]
+        covariance = covariance * np.outer(more, more)
+    if not covariance.any():
+        found = np.inf if values.any() else 0.0
+    else:
+        found = float(values @ np.linalg.solve(covariance, values))
+    freedom = float(fit.degrees_of_freedom[at].min())
+    return float(fdtrc(len(at), freedom, found / len(at)))
 
-        Returns
-        -------
-        statistic, p_value : float
-            Wald statistic and its p-value, from the F distribution.
 
-        """
-        at = list(which)
-        values = self.values[at]
-        covariance = self.covariance[np.ix_(at, at)]
-        if self.memory is not None:
-            more = self.memory.far[at] / self.memory.inflation[at]
-            covariance = covariance * np.outer(more, more)
-        if not covariance.any():
-            found = np.inf if values.any() else 0.0
-        else:
-            found = float(values @ np.linalg.solve(covariance, values))
-        freedom = float(self.degrees_of_freedom[at].min())
-        return found, float(fdtrc(len(at), freedom, found / len(at)))
+def hausman_test(part: Regression, whole: Regression, count: int) -> float:
+    """
+    Return the p-value that the first parameters agree in fits to some and to all samples.
 
-    def differs(self, whole: Regression, count: int) -> float:
-        """
-        Test whether this fit to a part of the samples contradicts the fit to all samples.
-
-        If the model holds for all samples, the parameters differ by at most their errors in this
-        fit (Hausman's test; including the errors of ``whole`` would increase the power, but not
-        the safety).
-
-        Parameters
-        ----------
-        whole : Regression
-            Fit of the same parameters to these samples and others.
-        count : int
-            Number of parameters to compare, from the first.
-
-        Returns
-        -------
-        float
-            The p-value, from the F distribution; 1 if no parameter is determined in both.
-
-        """
-        at = np.flatnonzero(self.determined[:count] & whole.determined[:count])
-        if not len(at) or not np.diag(self.covariance)[at].all():
-            return 1.0
-        off = self.values[at] - whole.values[at]
-        found = float(off @ np.linalg.solve(self.covariance[np.ix_(at, at)], off)) / len(at)
-        return float(fdtrc(len(at), float(self.degrees_of_freedom[at].min()), found))
+    Including the errors of ``whole`` would increase the power, but not the safety.
+    """
+    at = np.flatnonzero(part.determined[:count] & whole.determined[:count])
+    if not len(at) or not np.diag(part.covariance)[at].all():
+        return 1.0
+    off = part.values[at] - whole.values[at]
+    found = float(off @ np.linalg.solve(part.covariance[np.ix_(at, at)], off)) / len(at)
+    return float(fdtrc(len(at), float(part.degrees_of_freedom[at].min()), found))
 
 
 class _Solution(NamedTuple):
-    """
-    Parameters (k,), inverse normal matrix (k, k), influence and scores of each sample (n, k).
+    """Parameters, and the change and the contribution of each sample in their equations."""
 
-    The influence is the change of the normal equations with the response of the sample; the scores
-    are the contribution of the sample to these equations, and sum to zero.
-    """
-
-    values: FloatArray
-    inverse: FloatArray
-    influence: FloatArray
-    scores: FloatArray
+    values: FloatArray  # (k,)
+    inverse: FloatArray  # of the normal matrix (k, k)
+    influence: FloatArray  # (n, k)
+    scores: FloatArray  # (n, k), sums to zero
 
 
 def regress(
@@ -372,7 +334,6 @@ def _checked(
 
 
 def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:
-    """Solve weighted least squares."""
     root = np.sqrt(weights)[:, np.newaxis]
     values: FloatArray = np.asarray(np.linalg.lstsq(root * x, root[:, 0] * y, rcond=None)[0])
     influence = weights[:, np.newaxis] * x
@@ -384,11 +345,10 @@ def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
     """
-    Weight each sample by the inverse of the noise variance measured in its group.
+    Weight each sample by the inverse of the noise variance about the mean of its group.
 
-    The variance of a group is about its own mean, which excludes a misfit of the model. The noise
-    of all groups enters with the weight of a few correlation windows, because a group of few
-    samples may have a small variance by chance.
+    The noise of all groups enters with the weight of a few correlation windows, because a group of
+    few samples may have a small variance by chance.
     """
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
@@ -415,7 +375,7 @@ def _huber(x: FloatArray, y: FloatArray, used: BoolArray) -> _Solution:
     limit = np.inf
     for _ in range(_MAX_ITERATIONS):
         size = np.abs(y - x @ values)
-        limit = _HUBER_LIMIT * max(_DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
+        limit = _HUBER_LIMIT * max(DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
         weights = np.where(size > limit, limit / np.maximum(size, limit), 1.0) * used
         last, values = values, _weighted(x, y, weights).values
         if np.linalg.norm(values - last) <= _ROUNDING * np.linalg.norm(values):
@@ -441,11 +401,9 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
     """
-    Return a basis of the directions that regressors determine, and the undetermined parameters.
+    Return a basis (k, r) of the directions that regressors determine, and unknown parameters.
 
-    Inputs are the singular values of the regressors of unit norm, (k,), largest first, and their
-    directions, one per row (k, k). Returned are the directions that are not null, one per column
-    (k, r), and a mask of the undetermined parameters, (k,).
+    Inputs are the singular values (k,) of regressors of unit norm, and directions (k, k) by row.
     """
     null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
@@ -472,12 +430,10 @@ def independent_span(correlation: int) -> float:
 
 def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
     """
-    Return the covariance (k, k) of the sum of correlated scores (n, k).
+    Return the covariance (k, k) of the sum of correlated scores (n, k), zero where unused.
 
-    The scores are summed over all positions of a triangular window. This weights their
-    autocovariances with the autocorrelation of the window, the Parzen kernel, which is flat at lag
-    zero and gives no negative variance. Unused samples have score zero, which preserves the time
-    between the others.
+    The triangular window weights their autocovariances with its autocorrelation, the Parzen
+    kernel, which is flat at lag zero and gives no negative variance.
     """
     window = _window(correlation)
     padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))

@@ -75,10 +75,9 @@ def residual_tests(
     parameters: int,
 ) -> tuple[ResidualTest, ...]:
     """
-    Test the means of the residual over parts, whitened by the noise model.
+    Test the means of the residual over parts, whitened by the noise model; none for too few parts.
 
-    These means are nearly independent, although the samples are correlated. `residual` (response
-    minus model), `time` [s] and `speed` have shape (n,). Tests with too few parts are omitted.
+    These means are nearly independent, although the samples are correlated.
     """
     if len(parts.limits) < _FEWEST_PARTS:
         return ()

@@ -26,49 +26,21 @@ from scipy.special import fdtrc
 
 
 class Trial(NamedTuple):
-    """
-    Result of additional columns in a fit.
-
-    Attributes
-    ----------
-    values, errors : ndarray, shape (q,)
-        Coefficients of the columns, and standard errors.
-    determined : bool
-        Whether the data distinguish the columns from the other columns.
-    misfit : float
-        Residual sum of squares.
-    p_value : float
-        p-value of the test that all coefficients are zero.
-
-    """
+    """Coefficients (q,) and standard errors of additional columns, and the test that all are 0."""
 
     values: FloatArray
     errors: FloatArray
-    determined: bool
-    misfit: float
+    determined: bool  # distinguished from the other columns
+    misfit: float  # residual sum of squares
     p_value: float
 
 
 class Screening:
     """
-    Least squares fit to which additional columns are added on trial.
+    Least squares fit of the used samples, to which additional columns are added on trial.
 
-    Parameters
-    ----------
-    regressors : ndarray, shape (n, k)
-        Columns of the fit, of the used samples only.
-    response : ndarray, shape (n,)
-        Response of the used samples.
-    parts : Parts
-        Parts of the used samples.
-
-    Attributes
-    ----------
-    values, errors : ndarray, shape (k,)
-        Coefficients of the fit, and their standard errors for uncorrelated noise.
-    misfit : float
-        Residual sum of squares of the fit.
-
+    ``values`` and ``errors`` (k,) are the coefficients with errors for uncorrelated noise;
+    ``misfit`` is the residual sum of squares.
     """
 
     def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:

@@ -13,7 +13,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import regress
 from needle_identification.friction.design import Design
 from needle_identification.friction.filtering import CORRELATION_LENGTH
@@ -63,18 +63,13 @@ def breakaway_force(
             value -= bias * parameter.value
             error = hypot(error, bias * parameter.error)
             half_width = hypot(half_width, bias * (parameter.interval[1] - parameter.value))
-    return _UNKNOWN.with_value(value, error, half_width)
+    return with_half_width(_UNKNOWN, value, error, half_width)
 
 
 def _push(
     design: Design, span: tuple[int, int, int], least: float
 ) -> tuple[float, float, float] | None:
-    """
-    Return breakaway force, standard error and half width of the interval [N] for one rest.
-
-    ``span`` holds the sample indices at which the rest begins, the motion begins and the motion
-    ends; ``least`` is the smallest rise of the force [N].
-    """
+    """Return breakaway force, error and half interval [N]; span: rest, motion, its end."""
     signals = design.signals
     cutoff = signals.settings.cutoff
     correlation = ceil(_WINDOW_PART * CORRELATION_LENGTH / cutoff / signals.period)
@@ -129,7 +124,6 @@ def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
 
 
 def _misfit(time: FloatArray, values: FloatArray) -> float:
-    """Return the residual sum of squares of a straight line fit."""
     centered, rest = time - time.mean(), values - values.mean()
     total = float(centered @ centered)
     explained = float(centered @ rest) ** 2 / total if total else 0.0

@@ -10,8 +10,7 @@ from math import log, nan
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.memory import divided
-from needle_identification.estimation.regression import Regression, score_covariance
+from needle_identification.estimation.regression import Regression, score_covariance, wald_test
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
 from needle_identification.friction.settings import TERMS
@@ -66,21 +65,12 @@ class CandidateFit:
 
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
-    """
-    Fit each unused term in addition, and leave out each chosen term.
-
-    ``among`` is the number of recordings over which the probability of a false alarm is kept.
-    """
+    """Add each unused term, leave out each chosen term; among: number of recordings."""
     settings = design.signals.settings
     chosen = settings.terms
     samples = _independent_samples(design, fit)
     level = SIGNIFICANCE / among
-    used = design.used
-    screening = Screening(
-        design.regressors(chosen)[used],
-        design.signals.force[used],
-        divided(used, design.signals.correlation),
-    )
+    screening = design.screening()
     singles = [(term,) for term in _candidates(design)]
     found = _added(design, screening, singles, samples, level)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
@@ -90,18 +80,12 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
         both = _added(design, screening, pairs, samples, level)
         found += [one for one in both if one.supported]
     for term in chosen:
-        rest = tuple(other for other in chosen if other != term)
-        if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
-            names = [column.name for column in columns_of(chosen, settings)]
-            which = [names.index(column.name) for column in columns_of([term], settings)]
-            misfit = screening.misfit_without(which) / screening.misfit
-            difference = samples * log(misfit) - len(which) * log(samples)
-            found.append(_removed(rest, term, fit, which, difference))
+        if len(chosen) > 1 and not ('direction' in chosen and term in ('coulomb', 'viscous')):
+            found.append(_removed(design, fit, screening, term, samples))
     return tuple(found)
 
 
 def _candidates(design: Design) -> list[str]:
-    """Return the terms that could be added."""
     settings = design.signals.settings
     chosen = set(settings.terms)
     # The user must give the boundaries of layers.
@@ -146,7 +130,7 @@ def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial
         if other.determined[which].all():
             return trial._replace(
                 values=other.values[which], errors=other.errors[which],
-                p_value=other.wald(which)[1],
+                p_value=wald_test(other, which),
             )  # fmt: skip
     return trial._replace(determined=False, p_value=1.0)
 
@@ -196,8 +180,7 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     """
     Test whether additional terms lower the prediction error of held-out samples.
 
-    Folds consist of consecutive strokes and rests, so that fitting autocorrelated noise gives a
-    term no advantage.
+    Folds consist of consecutive strokes, so that fitting autocorrelated noise is no advantage.
     """
     used = design.used
     settings = design.signals.settings
@@ -236,12 +219,19 @@ def _independent_samples(design: Design, fit: Regression) -> float:
 
 
 def _removed(
-    terms: tuple[str, ...], term: str, fit: Regression, which: list[int], difference: float
+    design: Design, fit: Regression, screening: Screening, term: str, samples: float
 ) -> CandidateFit:
+    """Compare with the fit without a term."""
+    settings = design.signals.settings
+    terms = tuple(other for other in settings.terms if other != term)
+    names = [column.name for column in columns_of(settings.terms, settings)]
+    which = [names.index(column.name) for column in columns_of([term], settings)]
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
         return CandidateFit(terms=terms, words=words)
-    p_value = fit.wald(which)[1]
+    p_value = wald_test(fit, which)
+    misfit = screening.misfit_without(which) / screening.misfit
+    difference = samples * log(misfit) - len(which) * log(samples)
     supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
     return CandidateFit(

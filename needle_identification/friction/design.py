@@ -15,7 +15,9 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.memory import divided, Parts
 from needle_identification.estimation.regression import independent_span, regress, Regression
+from needle_identification.estimation.screening import Screening
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
@@ -40,49 +42,38 @@ _LONGEST_SETTLING: Final = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Design:
-    """
-    Motion delayed by the lag of the force, and the samples of the regression.
-
-    Attributes
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    speed, acceleration, depth : ndarray, shape (n,)
-        Velocity [m/s], acceleration [m/s^2] and insertion depth [m], delayed by the lag.
-    fresh : ndarray of bool, shape (n,)
-        Whether the needle is at its largest insertion depth so far.
-    regime : ndarray, shape (n,)
-        Sign of the velocity; 0 at rest.
-    change, used : ndarray of bool, shape (n,)
-        Where the regime changes or samples are lost, and samples to use.
-    stroke : ndarray of int, shape (n,)
-        Index of the stroke or rest of each sample.
-    lag_column : ndarray, shape (n, 1) or (n, 0)
-        Derivative of the force by the lag [N/s]; no column if the lag is not estimated.
-
-    """
+    """Motion delayed by the lag of the force, and the samples of the regression, (n,) each."""
 
     signals: FilteredSignals
-    speed: FloatArray
-    acceleration: FloatArray
-    depth: FloatArray
-    fresh: BoolArray
-    regime: FloatArray
-    change: BoolArray
-    used: BoolArray
-    stroke: IntArray
-    lag_column: FloatArray
+    lag: float  # of the force [s]
+    speed: FloatArray  # [m/s], delayed
+    acceleration: FloatArray  # [m/s^2], delayed
+    depth: FloatArray  # insertion depth [m], delayed
+    fresh: BoolArray  # at the largest insertion depth so far
+    regime: FloatArray  # sign of the velocity; 0 at rest
+    change: BoolArray  # where the regime changes or samples are lost
+    used: BoolArray  # samples to use
+    stroke: IntArray  # index of the stroke or rest
+    lag_column: FloatArray  # (n, 1) derivative of the force by the lag [N/s], or (n, 0)
 
     @property
     def estimates_lag(self) -> bool:
-        """Whether the regression includes the lag."""
         return self.lag_column.size > 0
 
     @property
     def is_enough(self) -> bool:
-        """Whether there are enough samples for standard errors."""
         needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
         return bool(np.count_nonzero(self.used) >= needed)
+
+    @property
+    def parts(self) -> Parts:
+        """Parts of the used samples with the correlation length of the noise."""
+        return divided(self.used, self.signals.correlation)
+
+    def screening(self) -> Screening:
+        """Return the least squares fit of the chosen terms, for additional terms on trial."""
+        x = self.regressors(self.signals.settings.terms)
+        return Screening(x[self.used], self.signals.force[self.used], self.parts)
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
         """Return the regressors of terms and of an estimated lag, shape (n, k)."""
@@ -104,9 +95,8 @@ class Design:
         """
         Test whether enough samples lie where a term has an effect.
 
-        ``stribeck`` acts near rest; at higher speeds it is nearly zero, and only velocity noise
-        would support it. ``cutting`` acts in new tissue; without motion into old tissue it is an
-        offset.
+        At higher speeds only velocity noise would support ``stribeck``; without motion into old
+        tissue ``cutting`` is an offset.
         """
         if term == 'cutting':
             inward = self.used & (self.speed > 0.0)
@@ -136,11 +126,7 @@ class Design:
         return replace(self, lag_column=column[:, np.newaxis])
 
     def solve(self, terms: Sequence[str], estimator: str) -> Regression:
-        """
-        Fit terms to the force; the last coefficient is the remaining lag [s] if it is estimated.
-
-        Raises `IdentificationError` for too few samples, or velocity noise above its variation.
-        """
+        """Fit terms to the force; the last coefficient is the remaining lag [s], if any."""
         signals = self.signals
         noise_of = {
             'viscous_friction': signals.speed_noise,
@@ -184,8 +170,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     """
     Select samples in steady regimes, outside the filter windows around changes.
 
-    ``lag`` is the lag of the force [s]; ``settling_lag`` [s] is the lag of the sensor filters, for
-    which additional samples are left out.
+    ``settling_lag`` [s] is the lag of the sensor filters, for which more samples are left out.
     """
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
@@ -211,6 +196,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
         used &= maximum_filter1d(large.astype(np.uint8), size) == 0
     return Design(
         signals=signals,
+        lag=lag,
         speed=speed,
         acceleration=acceleration,
         depth=depth,

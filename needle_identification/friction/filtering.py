@@ -52,43 +52,21 @@ _LARGEST_GRID: Final = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FilteredSignals:
-    """
-    Filtered force and motion.
-
-    Attributes
-    ----------
-    settings : FrictionSettings
-        Settings of the identification.
-    time, force, depth : ndarray, shape (n,)
-        Evenly spaced time [s], filtered force [N], and insertion depth [m].
-    period : float
-        Sampling period after resampling [s].
-    motion : BSpline
-        Filtered velocity [m/s] as a function of time [s].
-    lost : ndarray of bool, shape (n,)
-        Samples within a gap of the recording, or with a saturated force.
-    half_filter, margin : int
-        Half the length of the filter, and distance from a change of the filtered velocity within
-        which the change may affect the filtered force [samples].
-    speed_noise, acceleration_noise : float
-        Standard deviations of the noise of filtered velocity [m/s] and acceleration [m/s^2].
-    cut_off : float
-        Fraction of samples with a saturated force; these samples count as lost.
-
-    """
+    """Filtered force and motion; arrays have shape (n,)."""
 
     settings: FrictionSettings
-    time: FloatArray
-    force: FloatArray
-    depth: FloatArray
-    period: float
-    motion: BSpline
-    lost: BoolArray
-    half_filter: int
-    margin: int
-    speed_noise: float
-    acceleration_noise: float
-    cut_off: float
+    time: FloatArray  # evenly spaced [s]
+    force: FloatArray  # [N]
+    depth: FloatArray  # insertion depth [m]
+    period: float  # after resampling [s]
+    motion: BSpline  # velocity [m/s] as a function of time [s]
+    lost: BoolArray  # in a gap of the recording, or saturated
+    half_filter: int  # half the length of the filter [samples]
+    margin: int  # reach of a change of the velocity in the force [samples]
+    speed_noise: float  # standard deviation after the filter [m/s]
+    acceleration_noise: float  # likewise [m/s^2]
+    from_positions: bool  # velocity differentiated from the depth
+    cut_off: float  # fraction of samples with a saturated force
 
     @property
     def correlation(self) -> int:
@@ -97,17 +75,11 @@ class FilteredSignals:
 
     @property
     def moving_speed(self) -> float:
-        """Speed above which the needle counts as moving [m/s]."""
         return max(self.settings.moving_speed, _CLEARLY * self.speed_noise)
 
 
 def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
-    """
-    Filter force and motion of a recording.
-
-    Without recorded velocity, the insertion depth is differentiated by the same filter. Raises
-    `IdentificationError` if the recording is too short or its stamps are too uneven.
-    """
+    """Filter force and motion; without recorded velocity, the depth is differentiated."""
     time = recording.time
     if len(time) < 3:
         raise IdentificationError(f'too short: {len(time)} samples')
@@ -132,14 +104,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     taps = filter_taps(settings.cutoff, period)
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
-    derivative = 1 if recording.speed is None else 0
+    from_positions = recording.speed is None
     measured = recording.depth if recording.speed is None else recording.speed
     raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
-    motion = _filtered_speed(grid, raw, taps, step, derivative)
+    motion = _filtered_speed(grid, raw, taps, step, from_positions)
     impulse = np.zeros(8 * half + 8 * step + 17)
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
-    response = _filtered_speed(around, impulse, taps, 1, derivative)
+    response = _filtered_speed(around, impulse, taps, 1, from_positions)
     noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
     return FilteredSignals(
         settings=settings,
@@ -153,13 +125,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         margin=max(1, ceil(2 * (half - 1) / step)),
         speed_noise=noise * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
+        from_positions=from_positions,
         cut_off=float(cut.mean()),
     )
 
 
 def cut_off(force: FloatArray) -> BoolArray:
     """
-    Mark samples at which the force sensor is saturated, shape (n,).
+    Mark samples, (n,), at which the force sensor is saturated.
 
     The largest or smallest value is a limit if it is held for much longer than any other value.
     """
@@ -203,15 +176,15 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
 
 
 def _filtered_speed(
-    time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, derivative: int
+    time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, from_depth: bool
 ) -> BSpline:
-    """Return the filtered velocity as a spline of time, from velocity or (derivative 1) depth."""
+    """Return the filtered velocity as a spline of time, from velocity or from depth."""
     from scipy.interpolate import make_interp_spline
 
-    start = raw[0] if derivative else 0.0
+    start = raw[0] if from_depth else 0.0
     smooth = _smooth(raw - start, taps)
-    spline = make_interp_spline(time, smooth, k=5 if derivative else 3)
-    if derivative:
+    spline = make_interp_spline(time, smooth, k=5 if from_depth else 3)
+    if from_depth:
         spline = make_interp_spline(time[::step], spline(time[::step], 1), k=3)
     elif step > 1:
         spline = make_interp_spline(time[::step], smooth[::step], k=3)

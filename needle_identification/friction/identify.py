@@ -5,49 +5,25 @@ With the tip past the tissue, the axial row of equation (16) of the paper is fri
 with optional further terms:
 
 .. math:: f_y(t + \tau) = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + ...
-
-Modules:
-
-================  =================================================================================
-`filtering`       force and motion through one zero-phase filter, on an even time base
-`lag`             the lag tau of the force
-`design`          samples in steady motion, regressors (`terms`), and the regression
-`intervals`       parameters with standard errors and confidence intervals
-`breakaway`       breakaway force
-`punctures`       drops of the force on entering new tissue
-`comparison`      alternative sets of terms
-`checks`          errors and warnings
-================  =================================================================================
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from math import nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.memory import divided
-from needle_identification.estimation.regression import Regression
-from needle_identification.estimation.residual_tests import residual_tests
-from needle_identification.estimation.screening import Screening
+from needle_identification.estimation.regression import hausman_test, Regression
+from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
+from needle_identification.friction import checks
 from needle_identification.friction.breakaway import breakaway_force
-from needle_identification.friction.checks import (
-    check_friction,
-    fit_warnings,
-    missing_term,
-    noise_bias,
-    noise_words,
-)
-from needle_identification.friction.comparison import compare_terms
+from needle_identification.friction.comparison import CandidateFit, compare_terms
 from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
-from needle_identification.friction.filtering import (
-    filter_signals,
-    FilteredSignals,
-    HALF_LENGTH,
-)
+from needle_identification.friction.filtering import filter_signals, FilteredSignals, HALF_LENGTH
 from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.lag import find_lag, lag_estimate
 from needle_identification.friction.punctures import find_punctures
@@ -116,45 +92,153 @@ def identify_friction(
 
     """
     settings = settings or FrictionSettings()
+    alternatives: tuple[_Alternative, ...] = (_without_transitions,)
+    if settings.estimator == AUTO:
+        settings = replace(settings, estimator='ordinary')
+        alternatives = (_from_positions, _with_total, _without_transitions)
     try:
-        return _identify(recording, settings, among)
+        chosen = _fitted(filter_signals(recording, settings))
+        for alternative in alternatives:
+            chosen = alternative(recording, chosen) or chosen
+        return _finished(recording.name, chosen, among)
     except IdentificationError as error:
         raise IdentificationError(f'{recording.name}: {error}') from None
 
 
-def _identify(recording: Recording, settings: FrictionSettings, among: int) -> FrictionEstimate:
-    choice = _chosen(recording, settings)
-    signals, design, fit = choice.signals, choice.design, choice.fit
+class _Candidate(NamedTuple):
+    """Selected samples and their fit; ``coarse`` is the lag [s] from `find_lag`."""
+
+    design: Design
+    fit: Regression
+    coarse: float
+    remarks: tuple[str, ...] = ()
+
+
+#: Returns a better candidate than the chosen one, with a remark; None if there is none.
+_Alternative = Callable[[Recording, _Candidate], _Candidate | None]
+
+
+def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
+    """Fit at the lag that the motion determines, with its rest as an unknown, if any."""
     settings = signals.settings
-    has_inertia = 'inertia' in settings.terms
-    used = design.used
+    coarse, fine = find_lag(signals)
+    if fine is not None:
+        design = select_samples(signals, fine, abs(fine))
+        design.check()
+        design = design.with_lag_column()
+        fit = design.solve(settings.terms, settings.estimator)
+        # The force is not linear in a lag above the filter length.
+        if fit.errors[-1] < HALF_LENGTH / settings.cutoff:
+            return _Candidate(design, fit, coarse, remarks)
+    # The error of a coarse lag is up to half a step.
+    error = 0.5 * signals.half_filter * signals.period
+    design = select_samples(signals, coarse, abs(coarse) + error)
+    design.check()
+    return _Candidate(design, design.solve(settings.terms, settings.estimator), coarse, remarks)
+
+
+def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | None:
+    """Differentiate the positions if noise of the velocity matters, and they have less of it."""
+    remark = _noise_remark(chosen)
+    if not remark or recording.speed is None:
+        return None
+    speeds = chosen.design.signals
+    positions = filter_signals(replace(recording, speed=None), speeds.settings)
+    # Integrated velocities are no other source.
+    apart = float(np.std(positions.motion(speeds.time) - speeds.motion(speeds.time)))
+    noise = _CLEANER * speeds.speed_noise
+    if not (positions.speed_noise < noise and apart > noise):
+        return None
+    return _fitted(positions, f'{remark}: took the speed from the positions')
+
+
+def _noise_remark(chosen: _Candidate) -> str:
+    """Describe the effect of velocity noise if it is relevant."""
+    design = chosen.design
+    if bias := checks.noise_bias(design, chosen.fit):
+        return checks.noise_words(design, bias)
+    signals, usual = design.signals, float(np.median(np.abs(design.speed[design.used])))
+    if signals.moving_speed < _HIDDEN * usual:
+        return ''
+    return (
+        f'noise of {signals.speed_noise:.2g} m/s in the speed hides motion below '
+        f'{signals.moving_speed:.2g} m/s'
+    )
+
+
+def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
+    """Choose the estimator total if noise of the velocity biases the viscous friction."""
+    signals = chosen.design.signals
+    bias = checks.noise_bias(chosen.design, chosen.fit)
+    if bias and signals.settings.allows_total:
+        remark = f'{checks.noise_words(chosen.design, bias)}: took estimator total'
+        settings = replace(signals.settings, estimator='total')
+        with suppress(IdentificationError):
+            return _fitted(replace(signals, settings=settings), *chosen.remarks, remark)
+    return None
+
+
+def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
+    """Leave out more samples around each change if the force deviates from the terms there."""
+    settings, whole = chosen.design.signals.settings, chosen.fit
+    count = len(columns_of(settings.terms, settings))
+    design = chosen.design.far_from_changes(_TRANSITION)
+    if whole.is_exact or not design.is_enough or _agree(design, whole, count):
+        return None
+    try:
+        if design.estimates_lag:
+            design = design.with_lag_column()
+        fit = design.solve(settings.terms, settings.estimator)
+    except IdentificationError:
+        # Too few samples remain.
+        return None
+    if hausman_test(fit, whole, count) >= _TRANSITIONS_DIFFER:
+        return None
+    remark = (
+        f'within {_TRANSITION:g} s of starts, stops and reversals the force does not follow the '
+        'terms (presliding, play, stick-slip, or a force that settles): left out'
+    )
+    return _Candidate(design, fit, chosen.coarse, (*chosen.remarks, remark))
+
+
+def _agree(design: Design, whole: Regression, count: int) -> bool:
+    """Whether a subset of samples gives the same parameters within small standard errors."""
+    few = design.screening()
+    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
+    return bool((close | ~whole.determined)[:count].all())
+
+
+def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
+    """Test the chosen fit, compare it with other terms, and assemble the result."""
+    design, fit, signals = chosen.design, chosen.fit, chosen.design.signals
+    settings, used = signals.settings, design.used
     mean_speed = float(np.mean(np.abs(design.speed[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
-    check_friction(parameters)
-    lag = lag_estimate(choice.fine, design, fit)
-    tests = (
-        ()
-        if fit.is_exact or fit.memory is None
-        else residual_tests(
+    checks.check_friction(parameters)
+    lag = lag_estimate(design, fit)
+    tests: tuple[ResidualTest, ...] = ()
+    comparison: tuple[CandidateFit, ...] = ()
+    if fit.memory is not None and not fit.is_exact:
+        tests = residual_tests(
             fit.residual,
             time=signals.time,
             speed=design.speed,
-            parts=divided(used, signals.correlation),
+            parts=design.parts,
             memory=fit.memory,
             parameters=len(fit.values),
         )
-    )
-    comparison = () if fit.is_exact else compare_terms(design, fit, among)
-    missing = missing_term(settings.terms, comparison)
+        comparison = compare_terms(design, fit, among)
+    missing = checks.missing_term(settings.terms, comparison)
     doubts = [missing] if missing else [test.words for test in tests if test.failed]
+    warnings = checks.fit_warnings(design, fit, parameters, lag, chosen.coarse)
     return FrictionEstimate(
-        name=recording.name,
+        name=name,
         terms=settings.terms,
         estimator=settings.estimator,
         parameters=parameters,
         breakaway=breakaway_force(design, parameters),
         # The interval of the lag omits errors by the position resolution and by a mass.
-        lag=None if choice.from_positions or has_inertia else lag,
+        lag=None if signals.from_positions or 'inertia' in settings.terms else lag,
         punctures=find_punctures(design, fit),
         samples=fit.samples,
         residual=sqrt(float(fit.residual @ fit.residual) / fit.samples),
@@ -162,11 +246,7 @@ def _identify(recording: Recording, settings: FrictionSettings, among: int) -> F
         condition=fit.condition,
         tests=tests,
         comparison=comparison,
-        warnings=(
-            *choice.remarks,
-            *fit_warnings(design, fit, parameters, lag, choice.coarse),
-            *doubts,
-        ),
+        warnings=(*chosen.remarks, *warnings, *doubts),
         fit=Fit(
             time=signals.time,
             speed=design.speed,
@@ -175,123 +255,3 @@ def _identify(recording: Recording, settings: FrictionSettings, among: int) -> F
             used=used,
         ),
     )
-
-
-class _Choice(NamedTuple):
-    """Signals, samples and fit selected by the data; lag of the force [s] from `find_lag`."""
-
-    signals: FilteredSignals
-    design: Design
-    fit: Regression
-    coarse: float
-    fine: float | None
-    from_positions: bool
-    remarks: tuple[str, ...] = ()
-
-
-def _chosen(recording: Recording, settings: FrictionSettings) -> _Choice:
-    """Select velocity source, estimator and samples; remarks describe unusual choices."""
-    simple = replace(settings, estimator='ordinary') if settings.estimator == AUTO else settings
-    choice = _first_choice(filter_signals(recording, simple), recording.speed is None)
-    if settings.estimator != AUTO:
-        return _without_transitions(choice)
-    remark = _noise_remark(choice)
-    if remark and recording.speed is not None:
-        signals = filter_signals(replace(recording, speed=None), simple)
-        if _is_cleaner(signals, choice.signals):
-            choice = _first_choice(signals, from_positions=True)._replace(
-                remarks=(f'{remark}: took the speed from the positions',)
-            )
-    bias = noise_bias(choice.design, choice.fit)
-    if bias and settings.allows_total:
-        remark = noise_words(choice.design, bias)
-        total = replace(choice.signals, settings=replace(settings, estimator='total'))
-        with suppress(IdentificationError):
-            choice = _first_choice(total, choice.from_positions)._replace(
-                remarks=(*choice.remarks, f'{remark}: took estimator total')
-            )
-    return _without_transitions(choice)
-
-
-def _noise_remark(choice: _Choice) -> str:
-    """Describe the effect of velocity noise if it is relevant."""
-    if bias := noise_bias(choice.design, choice.fit):
-        return noise_words(choice.design, bias)
-    design = choice.design
-    usual = float(np.median(np.abs(design.speed[design.used])))
-    if choice.signals.moving_speed < _HIDDEN * usual:
-        return ''
-    return (
-        f'noise of {choice.signals.speed_noise:.2g} m/s in the speed hides motion below '
-        f'{choice.signals.moving_speed:.2g} m/s'
-    )
-
-
-def _is_cleaner(positions: FilteredSignals, speeds: FilteredSignals) -> bool:
-    """Whether positions give less velocity noise and are not integrated velocities."""
-    apart = float(np.std(positions.motion(speeds.time) - speeds.motion(speeds.time)))
-    noise = speeds.speed_noise
-    return positions.speed_noise < _CLEANER * noise and apart > _CLEANER * noise
-
-
-def _first_choice(signals: FilteredSignals, from_positions: bool) -> _Choice:
-    """Fit at the lag that the motion determines, if any."""
-    coarse, fine = 0.0, None
-    if 'inertia' not in signals.settings.terms:
-        coarse, fine = find_lag(signals)
-    design, fit = _fitted(signals, coarse, fine)
-    if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / signals.settings.cutoff:
-        # The force is not linear in a lag above the filter length.
-        fine = None
-        design, fit = _fitted(signals, coarse, fine)
-    return _Choice(signals, design, fit, coarse, fine, from_positions)
-
-
-def _without_transitions(choice: _Choice) -> _Choice:
-    """Leave out more samples around each change if the force deviates from the terms there."""
-    settings = choice.signals.settings
-    count = len(columns_of(settings.terms, settings))
-    design = choice.design.far_from_changes(_TRANSITION)
-    if choice.fit.is_exact or not design.is_enough or _agree(design, choice.fit, count):
-        return choice
-    try:
-        if design.estimates_lag:
-            design = design.with_lag_column()
-        fit = design.solve(settings.terms, settings.estimator)
-    except IdentificationError:
-        # Too few samples remain.
-        return choice
-    if fit.differs(choice.fit, count) >= _TRANSITIONS_DIFFER:
-        return choice
-    remark = (
-        f'within {_TRANSITION:g} s of starts, stops and reversals the force does not follow the '
-        'terms (presliding, play, stick-slip, or a force that settles): left out'
-    )
-    return choice._replace(design=design, fit=fit, remarks=(*choice.remarks, remark))
-
-
-def _agree(design: Design, whole: Regression, count: int) -> bool:
-    """Whether a subset of samples gives the same parameters within small standard errors."""
-    used = design.used
-    few = Screening(
-        design.regressors(design.signals.settings.terms)[used],
-        design.signals.force[used],
-        divided(used, design.signals.correlation),
-    )
-    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
-    return bool((close | ~whole.determined)[:count].all())
-
-
-def _fitted(
-    signals: FilteredSignals, coarse: float, fine: float | None
-) -> tuple[Design, Regression]:
-    """Fit with the remaining lag as an unknown, or at the coarse lag if ``fine`` is None."""
-    settings = signals.settings
-    lag = coarse if fine is None else fine
-    # The error of a coarse lag is up to half a step.
-    error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
-    design = select_samples(signals, lag, abs(lag) + error)
-    design.check()
-    if fine is not None:
-        design = design.with_lag_column()
-    return design, design.solve(settings.terms, settings.estimator)

@@ -7,11 +7,14 @@ Student's t. Ratios have intervals by the delta method.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot, sqrt
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import (
+    ParameterEstimate,
+    with_half_width,
+    with_value,
+)
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of
@@ -25,9 +28,8 @@ def parameter_estimates(
     """
     Return the coefficients of the terms, then derived ratios.
 
-    The first columns of ``fit`` are the columns of the terms. ``mean_speed`` [m/s] is the speed
-    for the ratio of withdrawal to insertion; ``period`` [s] is the sampling period, the largest
-    difference between the stamps of force and motion.
+    ``mean_speed`` [m/s] is the speed for the ratio of withdrawal to insertion; ``period`` [s] is
+    the largest difference between the stamps of force and motion.
     """
     columns = columns_of(settings.terms, settings)
     at = {column.name: k for k, column in enumerate(columns)}
@@ -36,26 +38,21 @@ def parameter_estimates(
     for k, column in enumerate(columns):
         parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
         if fit.determined[k]:
-            low, high = intervals[k]
-            parameter = replace(
-                parameter,
-                value=float(fit.values[k]),
-                error=float(fit.errors[k]),
-                interval=(float(low), float(high)),
-                determined=True,
-            )
+            low, high = intervals[k].tolist()
+            value, error = float(fit.values[k]), float(fit.errors[k])
+            parameter = with_value(parameter, value, error, low, high)
         found.append(parameter)
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:
             found[at['moving_mass']] = _widened(mass, viscous.value * period)
+    rows = np.zeros((2, len(fit.values)))
     if 'withdrawal_coulomb' in at:
-        rows = np.zeros((2, len(fit.values)))
         rows[0, [at['coulomb_friction'], at['viscous_friction']]] = 1.0, mean_speed
         rows[1, [at['withdrawal_coulomb'], at['withdrawal_viscous']]] = 1.0, mean_speed
         found.append(_ratio(fit, rows, 'withdrawal_friction', 'f_out / f_in'))
     if 'stribeck_friction' in at and 'coulomb_friction' in at:
-        rows = np.zeros((2, len(fit.values)))
+        rows[:] = 0.0
         rows[[0, 1], [at['coulomb_friction'], at['stribeck_friction']]] = 1.0
         found.append(_ratio(fit, rows, 'breakaway_friction', 'mu_b / mu_s'))
     return tuple(found)
@@ -64,7 +61,8 @@ def parameter_estimates(
 def _widened(mass: ParameterEstimate, largest: float) -> ParameterEstimate:
     """Add the error by a lag that resembles a mass, uniform within +- ``largest`` [kg]."""
     low, high = mass.interval
-    return mass.with_value(
+    return with_half_width(
+        mass,
         mass.value,
         hypot(mass.error, largest / sqrt(3.0)),
         hypot(0.5 * (high - low), 0.95 * largest),
@@ -81,4 +79,4 @@ def _ratio(fit: Regression, rows: FloatArray, name: str, symbol: str) -> Paramet
     gradient = (rows[1, taken] - more / base * rows[0, taken]) / base
     error = sqrt(float(gradient @ fit.covariance[np.ix_(taken, taken)] @ gradient))
     half_width = error * float(stdtrit(fit.degrees_of_freedom[taken].min(), 0.975))
-    return parameter.with_value(1.0 + float(more / base), error, half_width)
+    return with_half_width(parameter, 1.0 + float(more / base), error, half_width)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import hypot
 from typing import Final
 
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
@@ -47,16 +47,21 @@ _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     """
-    Search for the lag of the force, without the term inertia, which resembles a lag.
+    Search for the lag of the force, except with the term inertia, which resembles a lag.
 
-    Returns the coarse lag, within half the filter length [s], or 0 if no lag fits much better; and
-    the lag of least misfit [s], or None if the motion does not determine it.
+    Returns the coarse lag [s], or 0 if no lag fits much better; and the lag of least misfit [s],
+    or None if the motion does not determine it.
     """
     terms = signals.settings.terms
+    if 'inertia' in terms:
+        return 0.0, None
     lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):
         design = select_samples(signals, lag, abs(lag))
-        if not design.is_enough or _acceleration_is_noise(design):
+        if not design.is_enough:
+            return coarse, None
+        power = float(np.mean(design.acceleration[design.used] ** 2))
+        if power * _LARGEST_NOISE <= signals.acceleration_noise**2:
             return coarse, None
         design = design.with_lag_column()
         x, used = design.regressors(terms)[design.used], design.used
@@ -105,24 +110,15 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     return float(np.mean((force[moving] - x @ solution) ** 2))
 
 
-def _acceleration_is_noise(design: Design) -> bool:
-    power = float(np.mean(design.acceleration[design.used] ** 2))
-    return power * _LARGEST_NOISE <= design.signals.acceleration_noise**2
-
-
-def lag_estimate(lag: float | None, design: Design, fit: Regression) -> ParameterEstimate:
-    """
-    Return the lag [s] and its error, including the error of the spline.
-
-    The last coefficient of ``fit`` is the remaining lag. The lag is undetermined if it was not
-    estimated, or if the acceleration is within the filter error of velocity steps.
-    """
+def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:
+    """Return the lag [s] and its error; undetermined if the needle accelerates only by steps."""
     used = float(np.sqrt(np.mean(design.acceleration[design.used] ** 2)))
     accelerates = used > _SMALLEST_ACCELERATION * float(np.max(np.abs(design.acceleration)))
-    if lag is None or not design.estimates_lag or not accelerates:
+    if not design.estimates_lag or not accelerates:
         return _UNKNOWN
     period = design.signals.period
     spline = _SPLINE_ERROR * period * (design.signals.settings.cutoff * period) ** 4
-    value, low, high = lag + np.array([fit.values[-1], *fit.interval()[-1]])
+    value, low, high = design.lag + np.array([fit.values[-1], *fit.interval()[-1]])
     half_width = hypot(0.5 * (high - low), float(ndtri(0.975)) * spline)
-    return _UNKNOWN.with_value(float(value), hypot(float(fit.errors[-1]), spline), half_width)
+    error = hypot(float(fit.errors[-1]), spline)
+    return with_half_width(_UNKNOWN, float(value), error, half_width)

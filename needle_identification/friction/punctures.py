@@ -13,9 +13,9 @@ from math import hypot, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.memory import stretches
-from needle_identification.estimation.regression import Regression
+from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN, Regression
 from needle_identification.friction.design import Design
 import numpy as np
 from scipy.special import ndtri
@@ -25,9 +25,6 @@ _CLEAR: Final = 8.0
 
 #: Model error of a change of friction, as a fraction.
 _UNKNOWN_FRICTION: Final = 0.5
-
-#: Standard deviation of normal noise over its median absolute deviation.
-_DEVIATION_OVER_MEDIAN: Final = 1.4826
 
 _DEPTH: Final = ParameterEstimate(name='puncture_depth', symbol='s_p', unit='m')
 _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
@@ -53,7 +50,6 @@ class Puncture:
 
 
 def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
-    """Return punctures in order of time."""
     signals = design.signals
     inward = design.fresh & (design.regime > 0.0) & ~signals.lost
     width, reach = signals.correlation, signals.half_filter
@@ -80,7 +76,7 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     if np.count_nonzero(known) < 4 * width:
         return ()
     usual = float(np.median(drops[known]))
-    noise = _DEVIATION_OVER_MEDIAN * float(np.median(np.abs(drops[known] - usual)))
+    noise = DEVIATION_OVER_MEDIAN * float(np.median(np.abs(drops[known] - usual)))
     found = []
     # The threshold includes the model error of friction at velocity changes.
     clear = np.maximum(usual + _CLEAR * noise, _UNKNOWN_FRICTION * np.abs(others))
@@ -109,6 +105,6 @@ def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Pun
     place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
     return Puncture(
         time=float(signals.time[at]),
-        depth=_DEPTH.with_value(float(design.depth[at]), place, half_width * place),
-        drop=_DROP.with_value(drop, error, half_width * error),
+        depth=with_half_width(_DEPTH, float(design.depth[at]), place, half_width * place),
+        drop=with_half_width(_DROP, drop, error, half_width * error),
     )

@@ -28,27 +28,13 @@ import numpy as np
 
 
 class NeedleMotion(NamedTuple):
-    """
-    Motion of the needle, shape (n,) each.
+    """Motion of the needle, (n,) each, positive into the tissue."""
 
-    Attributes
-    ----------
-    speed, acceleration : ndarray
-        Insertion velocity [m/s] and acceleration [m/s^2], positive into the tissue.
-    time : ndarray
-        Time since the start of the recording [s].
-    depth : ndarray
-        Insertion depth [m].
-    fresh : ndarray of bool
-        Whether the needle is at its largest insertion depth so far.
-
-    """
-
-    speed: FloatArray
-    acceleration: FloatArray
-    time: FloatArray
-    depth: FloatArray
-    fresh: BoolArray
+    speed: FloatArray  # [m/s]
+    acceleration: FloatArray  # [m/s^2]
+    time: FloatArray  # since the start of the recording [s]
+    depth: FloatArray  # insertion depth [m]
+    fresh: BoolArray  # at the largest insertion depth so far
 
 
 @dataclass(frozen=True, slots=True)

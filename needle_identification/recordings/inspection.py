@@ -18,7 +18,7 @@ from needle_identification.recordings.reading import first_names, read_indentati
 from needle_identification.recordings.samples import (
     are_gaps,
     AXES,
-    each_joint,
+    EachJoint,
     Gathering,
     Samples,
     SignalSource,
@@ -193,7 +193,6 @@ class _Signal(NamedTuple):
     axis: str
     stamps: IntArray
     values: FloatArray
-    speed: bool
 
 
 def _bag(path: Path) -> Inspection:
@@ -240,19 +239,16 @@ def _presses(path: Path) -> bool:
 
 def _joints(bag: Bag, topics: Sequence[BagTopic]) -> Mapping[BagTopic, list[str]]:
     """Return the joint names of each JointState topic, from its first messages."""
-    states = [topic for topic in topics if topic.type_name == wire.JOINT_STATE]
     return {
         topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
-        for topic in states
+        for topic in topics
+        if topic.type_name == wire.JOINT_STATE
     }
 
 
 def _source(topic: BagTopic, axes: Sequence[str]) -> SignalSource:
-    return (
-        each_joint(axes)
-        if topic.type_name == wire.JOINT_STATE
-        else source_of(topic.type_name, axes)
-    )
+    is_joint = topic.type_name == wire.JOINT_STATE
+    return EachJoint(*axes) if is_joint else source_of(topic.type_name, axes)
 
 
 def _content(topic: BagTopic, count: int, axes: Sequence[str], samples: Samples) -> Content:
@@ -271,7 +267,7 @@ def _signals(topic: BagTopic, axes: Sequence[str], samples: Samples) -> Iterator
     for k, axis in enumerate(axes):
         values = samples.values[:, k]
         if np.isfinite(values).all() and np.ptp(values) > 0.0:
-            yield _Signal(topic, axis, samples.stamps, values, topic.type_name in _SPEEDS)
+            yield _Signal(topic, axis, samples.stamps, values)
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
@@ -286,11 +282,9 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
                 best = explained, size, force, motion
     if best is None or best[0] < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
-        why = (
-            f'no varying {" or ".join(lacking)}'
-            if lacking
-            else ('no force depends on the direction of a motion')
-        )
+        why = 'no force depends on the direction of a motion'
+        if lacking:
+            why = f'no varying {" or ".join(lacking)}'
         return [f'no friction found: {why}'], ''
     explained, size, force, motion = best
     what = (
@@ -326,7 +320,7 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     every = max(1, len(motion.stamps) // _TRIED)
     time = 1e-9 * (motion.stamps[::every] - start)
     values = motion.values[::every]
-    speed = values if motion.speed else np.gradient(values, time)
+    speed = values if motion.topic.type_name in _SPEEDS else np.gradient(values, time)
     read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
     moving = np.abs(speed) > _MOVING * np.quantile(np.abs(speed), 0.99)
     moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))

@@ -262,11 +262,7 @@ def first_names(bag: Bag, topic: BagTopic) -> list[tuple[str, ...]]:
 def chosen_topic(
     bag: Bag, topics: Sequence[BagTopic], wanted: Wanted, name: str | None
 ) -> BagTopic:
-    """
-    Return the topic with a name, or the only suitable topic by type and usual name.
-
-    Raises a RecordingError if there is no such topic, or more than one.
-    """
+    """Return the topic with a name, or the only suitable topic by type and usual name."""
     fitting = [topic for topic in topics if topic.type_name in wanted.types]
     short = ', '.join(type_name.rsplit('/', 1)[-1] for type_name in wanted.types)
     if name is not None:
@@ -293,11 +289,7 @@ def chosen_topic(
 def read_samples(
     bag: Bag, sources: Mapping[BagTopic, SignalSource], time: str
 ) -> tuple[Mapping[BagTopic, Gathering], str]:
-    """
-    Gather the samples of topics from a bag, with stamps from `time`, one of `TIMES`.
-
-    Also returns the configuration of the plant, '' if the bag has none.
-    """
+    """Gather topics from a bag by stamps of `time`; also return the configuration of the plant."""
     if time not in TIMES:
         raise RecordingError(f'time must be one of {", ".join(TIMES)}, got {time!r}')
     gathered = {

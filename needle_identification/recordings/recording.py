@@ -13,10 +13,33 @@ from needle_ros.errors import ShapeError, shown
 import numpy as np
 
 
+def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | None) -> None:
+    """
+    Replace arrays (n,) or (n, columns) by validated read-only copies.
+
+    The field ``first`` determines n; only the field ``missing`` may have values that are not
+    finite.
+    """
+    object.__setattr__(recording, 'name', shown(recording.name))
+    object.__setattr__(recording, 'losses', tuple(map(shown, recording.losses)))
+    length = np.shape(getattr(recording, first))
+    for field, count in {first: None, **columns}.items():
+        rest = () if count is None else (count,)
+        values = np.array(getattr(recording, field), dtype=np.float64)
+        if len(length) != 1 or values.shape != length + rest:
+            wanted = '(n,)' if count is None else f'(n, {count})'
+            raise ShapeError(
+                f'{recording.name}: {field} must have the shape {wanted} with the (n,) of '
+                f'{first}, got {values.shape} and {length}'
+            )
+        if field != missing and not np.isfinite(values).all():
+            raise ShapeError(f'{recording.name}: {field} must be finite')
+        values.setflags(write=False)
+        object.__setattr__(recording, field, values)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class _AnyRecording:
-    """Common fields and checks of recordings."""
-
     name: str = 'recording'
     time: FloatArray
     force: FloatArray
@@ -48,23 +71,7 @@ class _AnyRecording:
         return f'<{type(self).__name__} {self.name}: {len(self.time)} samples in {duration:.4g} s>'
 
     def _freeze(self, **columns: int | None) -> None:
-        """Replace arrays (n,) or (n, columns) by validated read-only copies."""
-        object.__setattr__(self, 'name', shown(self.name))
-        object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
-        length = np.shape(self.time)
-        for field, count in {'time': None, **columns}.items():
-            rest = () if count is None else (count,)
-            values = np.array(getattr(self, field), dtype=np.float64)
-            if len(length) != 1 or values.shape != length + rest:
-                wanted = '(n,)' if count is None else f'(n, {count})'
-                raise ShapeError(
-                    f'{self.name}: {field} must have the shape {wanted} with the (n,) of time, '
-                    f'got {values.shape} and {length}'
-                )
-            if not np.isfinite(values).all():
-                raise ShapeError(f'{self.name}: {field} must be finite')
-            values.setflags(write=False)
-            object.__setattr__(self, field, values)
+        freeze(self, 'time', **columns)
         if not (np.diff(self.time) > 0.0).all():
             raise ShapeError(f'{self.name}: time must increase strictly')
 

@@ -38,25 +38,14 @@ _LATENCIES: Final = (64, 2**16)
 
 
 class SignalSource(ABC):
-    """
-    Selection of numbers from the messages of a topic.
-
-    A call with the template of messages returns the positions of the numbers [bytes] for
-    `wire.decode`.
-
-    Attributes
-    ----------
-    columns, width : int
-        Numbers taken from each message, and values computed from them.
-
-    """
+    """Selects ``columns`` numbers of each message, and computes ``width`` values from them."""
 
     columns: int
     width: int
 
     @abstractmethod
     def __call__(self, template: wire.Template) -> Sequence[int] | None:
-        """Return the positions of the numbers; None for messages that are not needed."""
+        """Return the positions of the numbers [bytes] by a template; None: message not needed."""
 
     def _measured(self, numbers: FloatArray) -> FloatArray:
         """Compute the values from the numbers, (n, columns), nan where missing in a message."""
@@ -72,8 +61,6 @@ class SignalSource(ABC):
 
 
 class _Vector(SignalSource):
-    """Components of the first vector of a message."""
-
     def __init__(self, *axes: str) -> None:
         self.columns = self.width = len(axes)
         self._offsets = [8 * AXES.index(axis) for axis in axes]
@@ -141,13 +128,26 @@ class _Joint(SignalSource):
         return ''
 
 
-class _PlaneJoints(SignalSource):
-    """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
-
-    columns = width = 3
+class EachJoint(SignalSource):
+    """Positions of joints by name; nan where missing in a message."""
 
     def __init__(self, *joints: str) -> None:
+        self.columns = self.width = len(joints)
         self._joints = joints
+
+    def __call__(self, template: wire.Template) -> list[int] | None:
+        positions, names = template.arrays[0], template.names
+        return [
+            _element(positions, names.index(joint)) if joint in names else -1
+            for joint in self._joints
+        ]
+
+
+class _PlaneJoints(EachJoint):
+    """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
+
+    def __init__(self, *joints: str) -> None:
+        super().__init__(*joints)
         self._seen: set[str] = set()
         self._is_used = self._is_flat = False
 
@@ -158,11 +158,7 @@ class _PlaneJoints(SignalSource):
             return None
         self._is_used = True
         self._is_flat |= self._joints[2] not in template.names
-        positions = template.arrays[0]
-        return [
-            _element(positions, template.names.index(joint)) if joint in template.names else -1
-            for joint in self._joints
-        ]
+        return super().__call__(template)
 
     def _measured(self, numbers: FloatArray) -> FloatArray:
         if self._is_flat:
@@ -177,26 +173,6 @@ class _PlaneJoints(SignalSource):
 
     def _losses(self) -> list[str]:
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
-
-
-class _EachJoint(SignalSource):
-    """Positions of joints by name; nan where missing in a message."""
-
-    def __init__(self, *joints: str) -> None:
-        self.columns = self.width = len(joints)
-        self._joints = joints
-
-    def __call__(self, template: wire.Template) -> list[int]:
-        positions, names = template.arrays[0], template.names
-        return [
-            _element(positions, names.index(joint)) if joint in names else -1
-            for joint in self._joints
-        ]
-
-
-def each_joint(joints: Sequence[str]) -> SignalSource:
-    """Return a source of the positions of joints."""
-    return _EachJoint(*joints)
 
 
 def _listing(names: Set[str]) -> str:
@@ -218,10 +194,9 @@ def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> 
     """
     Return the source for messages of a type.
 
-    `axes` has one axis of motion, or two axes of a plane and the off-plane axis; for a JointState
-    with three axes, the joints with these names. `joint` is the moving joint of a JointState
-    (default: the joint of the plant, or the only joint). The values are the components; or, for
-    the motion of a JointState or Odometry, position, velocity, and whether the velocity is valid.
+    `axes` has one axis of motion, or two axes of a plane and the off-plane axis. `joint` is the
+    moving joint of a JointState. The motion along one axis has position, velocity, and whether it
+    is valid.
     """
     if type_name == wire.JOINT_STATE:
         return _PlaneJoints(*axes) if len(axes) == 3 else _Joint(joint)
@@ -231,26 +206,12 @@ def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> 
 
 
 class Samples(NamedTuple):
-    """
-    Samples of a topic.
-
-    Attributes
-    ----------
-    topic : str
-        Name of the topic.
-    stamps : ndarray of int64, shape (n,)
-        Strictly increasing stamps [ns].
-    values : ndarray, shape (n, k)
-        Values of the source.
-    latency : ndarray of int64, shape (l,)
-        A subset of the receive times minus stamps [ns].
-
-    """
+    """Samples of a topic."""
 
     topic: str
-    stamps: NDArray[np.int64]
-    values: FloatArray
-    latency: NDArray[np.int64]
+    stamps: NDArray[np.int64]  # (n,), strictly increasing [ns]
+    values: FloatArray  # (n, k)
+    latency: NDArray[np.int64]  # some receive times minus stamps [ns]
 
 
 class Gathering:
@@ -294,11 +255,7 @@ class Gathering:
             self._latencies = [np.concatenate(self._latencies)[::2]]
 
     def samples(self, bag: Bag) -> Samples:
-        """
-        Return the gathered samples; add the discarded data to the losses of the bag.
-
-        Raises a RecordingError for fewer than two samples or a fault of the source.
-        """
+        """Return the samples; add discarded data to the losses of the bag; raise on a fault."""
         name, series = self._topic.name, self._series
         if complaint := self._source._complaint():
             self._reject(bag, complaint)
@@ -342,12 +299,7 @@ def are_gaps(steps: NDArray[np.int64]) -> BoolArray:
 
 
 def position_and_speed(samples: Samples, bag: Bag) -> Samples:
-    """
-    Return the position and, if measured, the velocity; a velocity without position is integrated.
-
-    Input values are position, velocity and its validity, or the velocity only. Missing data are
-    added to the losses of the bag.
-    """
+    """Return the position and, if measured, the velocity; a velocity alone is integrated."""
     topic, _, values, _ = samples
     if values.shape[1] == 1:
         return _from_speed(samples, bag)

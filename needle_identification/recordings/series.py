@@ -20,24 +20,12 @@ _GATHERED: Final = 2**16
 
 class Series:
     """
-    Samples in order of stamp.
+    Samples in order of stamp; up to date after `compact`.
 
-    Up to two samples per bin are kept unchanged. Denser samples are averaged over bins, stamps and
-    values alike, which causes no delay. Above `LARGEST` samples, neighbors are averaged.
-
-    Attributes
-    ----------
-    stamps : ndarray of int64, shape (n,)
-        Strictly increasing stamps [ns]; up to date after `compact`, as all attributes below.
-    values : ndarray, shape (n, columns)
-        Measured values.
-    late : int
-        Number of samples received after a later stamp.
-    repeated : int
-        Number of samples discarded because of an equal stamp.
-    width : int
-        Width of the bins [ns]; 0 for none.
-
+    Up to two samples per bin are kept unchanged. Denser samples are averaged over bins of
+    ``width`` [ns], stamps and values alike, which causes no delay. Above `LARGEST` samples,
+    neighbors are averaged. ``late`` counts samples after a later stamp, ``repeated`` those with an
+    equal stamp.
     """
 
     def __init__(self, columns: int) -> None:

@@ -23,8 +23,7 @@ from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.bags.compression import BLOCK, DAMAGED
-from needle_identification.bags.limits import Budget
+from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps
@@ -87,26 +86,12 @@ _SPEC: Final = re.compile(r'^(-?)\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]
 
 
 class Table(NamedTuple):
-    """
-    Content of a table file.
-
-    Attributes
-    ----------
-    path : Path
-        Path of the file.
-    columns : dict
-        Columns by name, each of shape (n,); nan for non-numeric values.
-    scalars : dict
-        Single numbers by name, for factors.
-    losses : list of str
-        Parts that are not readable.
-
-    """
+    """Content of a table file, by name."""
 
     path: Path
-    columns: dict[str, FloatArray]
-    scalars: dict[str, float]
-    losses: list[str]
+    columns: dict[str, FloatArray]  # (n,) each; nan if not a number
+    scalars: dict[str, float]  # for factors
+    losses: list[str]  # parts that are not readable
 
 
 def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
@@ -124,7 +109,6 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
 
 
 def is_table(path: Path | str) -> bool:
-    """Return whether a file is read as a table, by its suffix."""
     return Path(path).suffix.lower() in TABLES
 
 
@@ -140,12 +124,7 @@ def read_table(path: Path) -> Table:
 
 
 def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
-    """
-    Read force and motion from a table.
-
-    `columns` are columns by role, of `ROLES`; other roles are found by their usual names. The
-    ``losses`` of the recording list the columns used, and discarded and repaired data.
-    """
+    """Read force and motion from a table; roles missing in `columns` are found by usual names."""
     table = read_table(path)
     specs = {**guessed(table), **columns}
     missing = [role for role in ('time', 'force') if role not in specs]
@@ -205,12 +184,7 @@ def _unit_of(name: str, role: str) -> str | None:
 
 
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
-    """
-    Return the values of a column in SI units, shape (n,).
-
-    `spec` is a name with sign, factor and unit. Suspicious values are added to `losses`. Raises a
-    RecordingError for a missing column or an invalid unit or factor.
-    """
+    """Return the values (n,) of a column in SI units, by its name with sign, factor and unit."""
     if role == 'time' and ':' in spec:
         seconds, _, nanoseconds = spec.partition(':')
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
@@ -413,7 +387,6 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    """Make column names unique."""
     seen: set[str] = set()
     for k, name in enumerate(names):
         unique = name if name and name not in seen else f'{name}{k + 1}'

@@ -37,8 +37,7 @@ def merge(
     Interpolate the motion at the stamps of the force, where both are available.
 
     Returns time from the first sample [s], (n,), force (n, k), motion (n, m) and the clock of the
-    force minus the clock of the motion [s]. Discarded samples and a shift are added to the losses
-    of the bag. Raises a RecordingError if force and motion do not overlap in time.
+    force minus the clock of the motion [s].
     """
     offset = _clock_offset(bag, force, motion)
     stamps = force.stamps - offset

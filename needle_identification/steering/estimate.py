@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import Named, ParameterEstimate
+from needle_identification.estimation.estimate import named, ParameterEstimate
 import numpy as np
 
 #: Symbol and unit of each constant.
@@ -25,7 +25,7 @@ CONSTANTS: Mapping[str, tuple[str, str]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class MediumEstimate(Named[ParameterEstimate]):
+class MediumEstimate:
     """
     Constants of the needle in a medium.
 
@@ -48,8 +48,8 @@ class MediumEstimate(Named[ParameterEstimate]):
     samples: int
     recordings: int
 
-    def _named(self) -> Sequence[ParameterEstimate]:
-        return self.parameters
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        return named(self.parameters, name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -27,12 +27,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import exp, inf, isfinite, sqrt
+from math import exp, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_value
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
@@ -144,8 +144,6 @@ def identify_steering(
 
 
 class _Fit(NamedTuple):
-    """Search, best variables, and cost."""
-
     search: Search
     x: FloatArray
     cost: float
@@ -166,29 +164,13 @@ def _check(search: Search) -> None:
 
 
 class _Errors(NamedTuple):
-    """
-    Errors of all constants: search variables, then the linear constants of each medium.
+    """Errors of the search variables, then of the linear constants of each medium."""
 
-    Attributes
-    ----------
-    errors : ndarray, shape (k,)
-        Standard errors.
-    units : ndarray, shape (k,)
-        Standard errors for unit variance of the samples.
-    freedom : list of int
-        Degrees of freedom of each medium.
-    values : list of ndarray
-        Linear constants of each medium.
-    left : list of ndarray
-        Residuals of each medium [m].
-
-    """
-
-    errors: FloatArray
-    units: FloatArray
-    freedom: list[int]
-    values: list[FloatArray]
-    left: list[FloatArray]
+    errors: FloatArray  # (k,) standard errors
+    units: FloatArray  # (k,) the same for unit variance of the samples
+    freedom: list[int]  # degrees of freedom by medium
+    values: list[FloatArray]  # linear constants by medium
+    left: list[FloatArray]  # residuals by medium [m]
 
 
 def _errors(search: Search, x: FloatArray) -> _Errors:
@@ -248,28 +230,25 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
         if name == 'skin':
             low, value, high = (SKIN_SCALE * one for one in (low, value, high))
             # The lower bound of the skin is zero.
-            return _constant(name, value, SKIN_SCALE * error, (max(0.0, low), high))
+            return _constant(name, value, SKIN_SCALE * error, max(0.0, low), high)
         if not (isfinite(low) and isfinite(high)):
             return _constant(name)
         value = exp(value)
-        return _constant(name, value, value * error, (exp(low), exp(high)))
+        return _constant(name, value, value * error, exp(low), exp(high))
 
     if search.known is None:
         free = length('free_length', 0, max(quantiles))
     else:
-        free = _constant('free_length', search.known, 0.0, (search.known, search.known))
+        free = _constant('free_length', search.known, 0.0, search.known, search.known)
     media, column = [], len(x)
     for k, (medium, members) in enumerate(search.members.items()):
         at = len(x) - _LENGTHS * (len(search.media) - k)
-        found = [
-            length('bending_length', at, quantiles[k]),
-            length('skin', at + 1, quantiles[k]),
-        ]
+        found = [length('bending_length', at, quantiles[k]), length('skin', at + 1, quantiles[k])]
         names = [name for term in search.terms for name in TERMS[term]]
         for j, name in enumerate(names):
             value, error = float(e.values[k][j]), float(e.errors[column + j])
             half = quantiles[k] * error
-            found.append(_constant(name, value, error, (value - half, value + half)))
+            found.append(_constant(name, value, error, value - half, value + half))
         column += len(e.values[k])
         media.append(
             MediumEstimate(
@@ -295,33 +274,20 @@ def _residuals(search: Search, left: Sequence[FloatArray]) -> list[FloatArray]:
     """Return the residuals of each recording, in input order."""
     found = {}
     for members, rest in zip(search.members.values(), left, strict=True):
-        begin = 0
-        for at in members:
-            n = search.recordings[at].samples
-            found[at] = rest[begin : begin + 2 * n].reshape(2, n).T
-            begin += 2 * n
+        ends = np.cumsum([2 * search.recordings[at].samples for at in members])
+        for at, own in zip(members, np.split(rest, ends[:-1]), strict=True):
+            found[at] = own.reshape(2, -1).T
     return [found[at] for at in sorted(found)]
 
 
 def _constant(
-    name: str,
-    value: float | None = None,
-    error: float = inf,
-    interval: tuple[float, float] = (-inf, inf),
+    name: str, value: float = nan, error: float = inf, low: float = -inf, high: float = inf
 ) -> ParameterEstimate:
     """Return a constant; it is undetermined if its interval is unbounded."""
     symbol, unit = CONSTANTS[name]
-    if value is None or not all(map(isfinite, interval)):
-        return ParameterEstimate(name=name, symbol=symbol, unit=unit)
-    return ParameterEstimate(
-        name=name,
-        symbol=symbol,
-        unit=unit,
-        value=value,
-        error=error,
-        interval=interval,
-        determined=True,
-    )
+    unknown = ParameterEstimate(name=name, symbol=symbol, unit=unit)
+    is_bounded = isfinite(low) and isfinite(high)
+    return with_value(unknown, value, error, low, high) if is_bounded else unknown
 
 
 def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> Iterator[str]:

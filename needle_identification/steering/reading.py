@@ -1,10 +1,16 @@
-"""Read steered insertions from bags, and from tables by `tables`."""
+"""
+Read steered insertions from bags, and from tables with named columns.
+
+Signs, units and factors of columns are written as in other tables; the suffix ``@1`` takes values
+from the previous row: ``guide_x=base.x[mm]@1``.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from math import ceil
 from pathlib import Path
+import re
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -18,31 +24,31 @@ from needle_identification.recordings.reading import (
     signed_axis,
     Wanted,
 )
-from needle_identification.recordings.samples import each_joint, source_of
-from needle_identification.recordings.tables import is_table
+from needle_identification.recordings.samples import EachJoint, source_of
+from needle_identification.recordings.tables import (
+    column_values,
+    guessed,
+    is_table,
+    read_table,
+    Table,
+)
 from needle_identification.recordings.timebase import merge
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
-from needle_identification.steering.tables import read_steering_table
-from needle_ros import wire
-from needle_ros.contract import (
-    GUIDE_X,
-    GUIDE_Z,
-    INSERTION,
-    JOINT_STATES,
-    ROLL,
-    TILT_X,
-    TILT_Z,
-    TIP_DEFLECTION,
-)
+from needle_ros import contract, wire
 import numpy as np
 
-_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
-_MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (JOINT_STATES.name,))
+_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
+_MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
 
 #: Joints by role, and components of the tip.
-_JOINTS: Final = {'depth': INSERTION, 'guide_x': GUIDE_X, 'guide_z': GUIDE_Z, 'roll': ROLL}
+_JOINTS: Final = {
+    'depth': contract.INSERTION,
+    'guide_x': contract.GUIDE_X,
+    'guide_z': contract.GUIDE_Z,
+    'roll': contract.ROLL,
+}
 _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
-_TILTS: Final = (TILT_X, TILT_Z)
+_TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
 #: Largest change of a constant tilt [rad].
 _MOVED: Final = 1e-4
@@ -50,6 +56,21 @@ _MOVED: Final = 1e-4
 #: Largest number of tip samples; denser samples are averaged. The spacing over a path of 100 mm
 #: is then 0.2 mm.
 _MOST: Final = 500
+
+#: Roles of the columns; without a roll column the roll is zero.
+STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
+
+#: Usual column names by role, in lower case without separators.
+_USUAL: Final = {
+    'depth': ('depth', 'insertion', 'insertiondepth', 'tipy', 'robot'),
+    'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
+    'guide_z': ('guidez', 'basez', 'zguide', 'zbase'),
+    'tip_x': ('tipx', 'xtip'),
+    'tip_z': ('tipz', 'ztip'),
+    'roll': ('roll', 'rotation', 'theta'),
+}
+
+_SHIFTED: Final = re.compile(r'^(.*?)\s*@\s*(\d{1,6})$')
 
 
 def read_steering_recording(
@@ -105,7 +126,7 @@ def read_steering_recording(
     motion = chosen_topic(bag, topics, _MOTION, motion_topic)
     seen = {name for names in first_names(bag, motion) for name in names}
     joints = {role: signed(columns.get(role, name)) for role, name in _JOINTS.items()}
-    if 'roll' not in columns and ROLL not in seen:
+    if 'roll' not in columns and contract.ROLL not in seen:
         del joints['roll']
     if missing := {name for _, name in joints.values()} - seen:
         raise RecordingError(
@@ -116,7 +137,7 @@ def read_steering_recording(
     tilts = [name for name in _TILTS if name in seen]
     sources = {
         tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
-        motion: each_joint([*(name for _, name in joints.values()), *tilts]),
+        motion: EachJoint(*(name for _, name in joints.values()), *tilts),
     }
     gathered, _ = read_samples(bag, sources, time)
     _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
@@ -141,3 +162,41 @@ def _thinned(values: Mapping[str, FloatArray], losses: list[str]) -> dict[str, F
     return {
         role: column[:whole].reshape(-1, group).mean(axis=1) for role, column in values.items()
     }
+
+
+def read_steering_table(
+    path: Path | str, columns: Mapping[str, str], medium: str = ''
+) -> SteeringRecording:
+    """Read an insertion from a table; roles missing in ``columns`` are found by usual names."""
+    path = Path(path)
+    table = read_table(path)
+    specs = {**guessed(table, _USUAL), **columns}
+    specs = {role: specs[role] for role in STEERING_ROLES if role in specs}
+    missing = [role for role in STEERING_ROLES if role not in specs and role != 'roll']
+    if missing:
+        raise RecordingError(
+            f'{path}: no column found for {" and ".join(missing)}, it has '
+            f'{", ".join(table.columns)}: use --columns {missing[0]}=NAME,...'
+        )
+    losses = list(table.losses)
+    if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
+        losses.append(f'columns by their names: {words}')
+    values = {role: _shifted(table, role, spec, losses) for role, spec in specs.items()}
+    moved = np.column_stack([values[role] for role in specs if not role.startswith('tip')])
+    usable = np.isfinite(moved).all(axis=1)
+    if lost := int(np.count_nonzero(~usable)):
+        losses.append(f'{lost} rows with a value that is not a number, left out')
+    if np.count_nonzero(usable) < 2:
+        raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
+    values = {role: column[usable] for role, column in values.items()}
+    return recorded_insertion(path, medium, values, losses)
+
+
+def _shifted(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
+    """Return the values of a column, shifted by rows; the first value is repeated."""
+    rows = 0
+    if spec not in table.columns and (match := _SHIFTED.match(spec)):
+        spec, rows = match[1], int(match[2])
+    found = column_values(table, role, spec, losses)
+    at = np.maximum(np.arange(len(found)) - rows, 0)
+    return np.asarray(found[at])

@@ -9,7 +9,8 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import RecordingError
-from needle_ros.errors import ShapeError, shown
+from needle_identification.recordings.recording import freeze
+from needle_ros.errors import ShapeError
 import numpy as np
 
 #: Number of equal consecutive tip measurements that indicate a frozen sensor.
@@ -66,20 +67,7 @@ class SteeringRecording:
     losses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'name', shown(self.name))
-        object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
-        count = np.shape(self.depth)
-        for field, rest in (('depth', ()), ('guide', (2,)), ('roll', ()), ('tip', (2,))):
-            values = np.array(getattr(self, field), dtype=np.float64)
-            if len(count) != 1 or values.shape != count + rest:
-                raise ShapeError(
-                    f'{self.name}: {field} must have shape {("n", *rest)}, with the n of depth, '
-                    f'got {values.shape} and {count}'
-                )
-            if field != 'tip' and not np.isfinite(values).all():
-                raise ShapeError(f'{self.name}: {field} must be finite')
-            values.setflags(write=False)
-            object.__setattr__(self, field, values)
+        freeze(self, 'depth', 'tip', guide=2, roll=None, tip=2)
         if (self.depth < 0.0).any():
             raise ShapeError(f'{self.name}: depth must be >= 0, got {self.depth.min():.4g} m')
 
@@ -100,10 +88,9 @@ class SteeringRecording:
 
 def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """
-    Return a mask of plausible tip samples, shape (n,), and messages about the others.
+    Return a mask (n,) of tip samples that are neither frozen nor implausible, and messages.
 
-    ``depth`` (n,) is from the robot; ``guide`` and ``tip`` (n, 2) are x and z [m] relative to
-    their start, NaN if missing. Frozen and implausible measurements are rejected.
+    ``guide`` and ``tip`` (n, 2) are x and z [m] relative to their start, NaN if missing.
     """
     there = np.isfinite(tip).all(axis=1)
     same = np.zeros(len(depth), dtype=np.bool_)
@@ -131,13 +118,7 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
 def recorded_insertion(
     path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
 ) -> SteeringRecording:
-    """
-    Create a recording from values of a file, without implausible samples.
-
-    ``values`` has shape (n,) each: ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z``
-    [m], optionally ``roll`` [rad]; finite except for the tip. Raises `RecordingError` if the depth
-    is positive out of the tissue, or no tip position is present.
-    """
+    """Create a recording from values of a file by role, (n,) each, without implausible samples."""
     losses, depth = list(losses), values['depth']
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')

@@ -27,33 +27,20 @@ _ELEMENT: Final = 1.5e-3
 
 
 class TipResponses(NamedTuple):
-    """
-    Tip motion at the samples by cause.
+    """Tip motion at the samples by cause."""
 
-    Attributes
-    ----------
-    guide : ndarray, shape (n, 2)
-        In x and z, by the motion of the guide [m].
-    tilt : ndarray, shape (n,)
-        Per tilt of the guide, in its plane [m].
-    bevel : ndarray, shape (n, 2)
-        In x and z, per curvature of a long needle by the bevel [m^2].
-
-    """
-
-    guide: FloatArray
-    tilt: FloatArray
-    bevel: FloatArray
+    guide: FloatArray  # (n, 2) x and z, by the motion of the guide [m]
+    tilt: FloatArray  # (n,) per tilt of the guide, in its plane [m]
+    bevel: FloatArray  # (n, 2) x and z, per curvature of a long needle by the bevel [m^2]
 
 
 def responses(
     recording: SteeringRecording, free: float, length: float, skin: float, order: str
 ) -> TipResponses:
     """
-    Simulate a recorded insertion for each cause.
+    Simulate a recorded insertion for each cause, with free and bending length [m].
 
-    ``free`` and ``length`` are the free and the bending length [m]; ``skin`` is the stiffness of
-    the skin over tissue stiffness per length [m]; ``order`` is from `ORDERS`.
+    ``skin`` is the stiffness of the skin over tissue stiffness per length [m].
     """
     depth, guide = recording.depth, recording.guide - recording.guide[0]
     poses = np.zeros((3, len(depth), 6))

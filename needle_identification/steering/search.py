@@ -43,8 +43,7 @@ class Search:
     Tip residuals of recorded insertions as a function of the lengths (variable projection).
 
     The variables are the logarithm of the free length, unless ``free`` [m] is given, and for each
-    medium the logarithm of the bending length, and the skin over its scale. ``media`` are in order
-    of appearance; ``members`` are the indices of recordings by medium.
+    medium the logarithm of the bending length, and the skin over its scale.
     """
 
     def __init__(
@@ -78,11 +77,7 @@ class Search:
         return free, [(exp(length), SKIN_SCALE * skin) for length, skin in pairs]
 
     def design(self, x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """
-        Return linear columns (2 n, c) and the tip without guide response (2 n,) by medium.
-
-        Rows are x, then z, of each recording; the last columns are offsets of the recordings.
-        """
+        """Return linear columns (2 n, c) and the tip without guide response, by medium."""
         free, lengths = self.lengths(x)
         return [self._part(k, free, *own) for k, own in enumerate(lengths)]
 
@@ -154,12 +149,7 @@ class Search:
     def interval(
         self, x: FloatArray, cost: float, k: int, width: float, rise: float
     ) -> tuple[float, float]:
-        """
-        Return the profile likelihood interval of variable k; infinite at a bound of the search.
-
-        ``cost`` is the minimum [m^2]; ``width`` is half the interval for a linear fit; ``rise`` is
-        the root of twice the rise of the cost at the ends of the interval [m].
-        """
+        """Return the profile likelihood interval of variable k; infinite at a search bound."""
         return (
             float(x[k]) - self._end(x, cost, k, -width, rise),
             float(x[k]) + self._end(x, cost, k, width, rise),

@@ -1,17 +1,26 @@
-"""Tissue stiffness at a place, by force level."""
+"""Tissue stiffness at a place, by force level, and summary over places, as in Table 2."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import Named, ParameterEstimate
-from needle_identification.stiffness.presses import Presses
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.estimate import (
+    named,
+    ParameterEstimate,
+    Statistic,
+    statistic,
+)
+from needle_identification.stiffness.matrix import ENTRIES
+from needle_identification.stiffness.presses import grouped, Presses
+from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class LevelEstimate(Named[ParameterEstimate]):
+class LevelEstimate:
     """
     Stiffness at a force level.
 
@@ -64,9 +73,9 @@ class LevelEstimate(Named[ParameterEstimate]):
     determination: float
     condition: float
 
-    def _named(self) -> tuple[ParameterEstimate, ...]:
+    def __getitem__(self, name: str) -> ParameterEstimate:
         others = (self.curl, self.spring, *self.principal, self.angle, self.tissue_stiffness)
-        return (*self.parameters, *others)
+        return named((*self.parameters, *others), name)
 
     def __repr__(self) -> str:
         (k_xx, k_xz), (k_zx, k_zz) = self.matrix.tolist()
@@ -108,3 +117,108 @@ class StiffnessEstimate:
     def __repr__(self) -> str:
         forces = ', '.join(f'{level.force:.3g}' for level in self.levels)
         return f'<StiffnessEstimate of {self.name}: force levels {forces} N>'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelSummary:
+    """
+    Force level over several places: a column of Table 2.
+
+    Attributes
+    ----------
+    force : float
+        Mean magnitude of the force [N].
+    statistics : tuple of Statistic
+        k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness; ``level[name]`` returns a statistic.
+
+    """
+
+    force: float
+    statistics: tuple[Statistic, ...]
+
+    def __getitem__(self, name: str) -> Statistic:
+        return named(self.statistics, name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StiffnessSummary:
+    """
+    Stiffness over several places, as in Table 2.
+
+    Attributes
+    ----------
+    levels : tuple of LevelSummary
+        By force, in ascending order.
+    tissue_stiffness : Statistic
+        k_a [N/m^2] at the chosen level.
+    estimates : tuple of StiffnessEstimate
+        One per place.
+    warnings : tuple of str
+        Warnings about all places.
+
+    """
+
+    levels: tuple[LevelSummary, ...]
+    tissue_stiffness: Statistic
+    estimates: tuple[StiffnessEstimate, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def summarize_stiffness(
+    estimates: Sequence[StiffnessEstimate],
+    *,
+    force: float | None = None,
+    level_tolerance: float = StiffnessSettings().level_tolerance,
+) -> StiffnessSummary:
+    """
+    Combine the estimates of several places, as in Table 2.
+
+    Parameters
+    ----------
+    estimates : sequence of StiffnessEstimate
+        One per place. A missing level of a place is replaced by the mean of the other places.
+    force : float, optional
+        Force level of the resulting tissue stiffness [N]; default the largest, as in the paper.
+    level_tolerance : float, optional
+        Tolerance within which levels of different places are grouped [N].
+
+    Returns
+    -------
+    StiffnessSummary
+        Means, standard deviations and standard errors by level.
+
+    Raises
+    ------
+    IdentificationError
+        If there are no estimates at all, or at the chosen force.
+
+    """
+    levels = [level for estimate in estimates for level in estimate.levels]
+    if not levels:
+        raise IdentificationError('no recordings to identify from')
+    group = grouped(np.array([level.force for level in levels]), level_tolerance)
+    summaries = []
+    for number in range(int(group.max()) + 1):
+        members = [level for level, of in zip(levels, group, strict=True) if of == number]
+        summaries.append(
+            LevelSummary(
+                force=float(np.mean([level.force for level in members])),
+                statistics=tuple(
+                    statistic([level[name] for level in members])
+                    for name in (*ENTRIES, 'curl', 'tissue_stiffness')
+                ),
+            )
+        )
+    chosen = summaries[-1]
+    if force is not None:
+        chosen = min(summaries, key=lambda summary: abs(summary.force - force))
+        if not abs(chosen.force - force) <= level_tolerance:
+            raise IdentificationError(
+                f'no level at {force:g} N; there are '
+                f'{", ".join(f"{summary.force:.3g}" for summary in summaries)} N'
+            )
+    return StiffnessSummary(
+        levels=tuple(summaries),
+        tissue_stiffness=chosen['tissue_stiffness'],
+        estimates=tuple(estimates),
+    )

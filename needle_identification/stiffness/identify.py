@@ -2,15 +2,7 @@ r"""
 Identify the tissue stiffness in the plane of deflection, section 3.2.2.3 of the paper.
 
 The end-effector presses the tissue with force F and displaces it by d; the reaction is -F. For
-each force level the stiffness matrix K of F = K d is fitted to the presses. Modules:
-
-============  =====================================================================================
-`plateaus`    holds and rests: intervals of steady force and position
-`presses`     displacement and force of each hold relative to the rests
-`matrix`      the stiffness matrix with its errors
-`spring`      whether the tissue is a spring
-`principal`   principal stiffnesses
-============  =====================================================================================
+each force level the stiffness matrix K of F = K d is fitted to the presses.
 """
 
 from __future__ import annotations
@@ -20,14 +12,18 @@ from itertools import pairwise
 from math import hypot, nan, sqrt
 from typing import Final
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import BoolArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
-from needle_identification.stiffness.matrix import ENTRIES, fit_matrix, MatrixFit
+from needle_identification.stiffness.matrix import (
+    ENTRIES,
+    fit_matrix,
+    MatrixFit,
+    principal_estimates,
+)
 from needle_identification.stiffness.plateaus import find_plateaus
 from needle_identification.stiffness.presses import find_presses, Presses
-from needle_identification.stiffness.principal import principal_estimates
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.spring import spring_estimates
 import numpy as np
@@ -128,7 +124,6 @@ def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> S
 def _level(
     presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
-    """Collect the results of a level."""
     k_zz = float(fit.matrix[1, 1])
     curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
     first, second, angle = principal_estimates(fit)
@@ -136,11 +131,13 @@ def _level(
     residual = float((fit.residual**2).sum())
     variation = float(((force - force.mean(axis=0)) ** 2).sum())
     is_known = fit.known.any()
+    # Gradients of the entries of the matrix.
+    units = np.eye(4).reshape(4, 2, 2)
     return LevelEstimate(
         force=float(np.hypot(*force.T).mean()),
         parameters=tuple(
-            fit.derived(name, name, 'N/m', float(fit.matrix[index]), _unit(*index))
-            for name, index in zip(ENTRIES, np.ndindex(2, 2), strict=True)
+            fit.derived(name, name, 'N/m', float(value), unit)
+            for name, value, unit in zip(ENTRIES, fit.matrix.ravel(), units, strict=True)
         ),
         curl=curl,
         spring=spring,
@@ -153,7 +150,7 @@ def _level(
             'k_a',
             'N/m^2',
             k_zz / settings.contact_length,
-            _unit(1, 1) / settings.contact_length,
+            units[3] / settings.contact_length,
         ),
         presses=len(force),
         directions=len(np.unique(presses.direction[chosen])),
@@ -161,13 +158,6 @@ def _level(
         determination=1.0 - residual / variation if is_known and variation > 0.0 else nan,
         condition=fit.condition,
     )
-
-
-def _unit(row: int, column: int) -> FloatArray:
-    """Return the gradient of an entry of the matrix."""
-    gradient = np.zeros((2, 2))
-    gradient[row, column] = 1.0
-    return gradient
 
 
 def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:

@@ -1,5 +1,5 @@
 r"""
-Fit the stiffness matrix of a force level by least squares over its presses.
+Fit the stiffness matrix of a force level by least squares over its presses; principal directions.
 
 .. math:: F = K d, \qquad K = \begin{bmatrix} k_{xx} & k_{xz} \\ k_{zx} & k_{zz} \end{bmatrix}
 
@@ -9,17 +9,19 @@ the paper.
 
 from __future__ import annotations
 
-from math import inf, isfinite, nan, sqrt
+from dataclasses import replace
+from math import atan2, hypot, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import regress
+from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise
 import numpy as np
 from numpy.linalg import norm
 from scipy.linalg import solve_triangular
-from scipy.special import stdtrit
+from scipy.special import fdtri, stdtrit
 
 #: Entries of the matrix, by row.
 ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')
@@ -36,54 +38,28 @@ _LARGEST_NOISE: Final = 3.0
 
 
 class MatrixFit(NamedTuple):
-    """
-    Stiffness matrix with errors.
+    """Stiffness matrix with errors."""
 
-    Attributes
-    ----------
-    matrix : ndarray, shape (2, 2)
-        Stiffness matrix K [N/m]; undetermined columns are nan.
-    known : ndarray of bool, shape (2,)
-        Columns that the presses determine.
-    factors : ndarray, shape (2, 2, 2)
-        Factors A of the covariance R_rs A_r A_s^T of rows r and s of K.
-    correlation : ndarray, shape (2, 2)
-        Correlation R of the residuals of the rows.
-    degrees_of_freedom : float
-        Degrees of freedom of each row.
-    residual : ndarray, shape (m, 2)
-        Force minus K d [N].
-    scatter : float
-        Scatter of the presses about the matrix over their noise [1].
-    condition : float
-        Condition number of the displacements.
-
-    """
-
-    matrix: FloatArray
-    known: BoolArray
-    factors: FloatArray
-    correlation: FloatArray
-    degrees_of_freedom: float
-    residual: FloatArray
-    scatter: float
-    condition: float
+    matrix: FloatArray  # (2, 2) K [N/m]; undetermined columns are nan
+    known: BoolArray  # (2,) columns that the presses determine
+    factors: FloatArray  # (2, 2, 2) A; R_rs A_r A_s^T is the covariance of rows r, s of K
+    correlation: FloatArray  # (2, 2) R, of the residuals of the rows
+    degrees_of_freedom: float  # of each row
+    residual: FloatArray  # (m, 2) force minus K d [N]
+    scatter: float  # of the presses about the matrix over their noise [1]
+    condition: float  # of the displacements
 
     def derived(
         self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
     ) -> ParameterEstimate:
-        """
-        Return a quantity derived from the matrix, with propagated errors.
-
-        ``gradient`` (2, 2) are its derivatives by the entries of the matrix. The quantity is
-        undetermined if a required entry is.
-        """
+        """Return a quantity with its gradient (2, 2) by K; undetermined if a required entry is."""
         parameter = ParameterEstimate(name=name, symbol=symbol, unit=unit)
         if not self.known[np.any(gradient != 0.0, axis=0)].all() or not isfinite(value):
             return parameter
         variance, freedom = self.variance_of(gradient)
         error = sqrt(variance)
-        return parameter.with_value(value, error, error * float(stdtrit(freedom, 0.975)))
+        half_width = error * float(stdtrit(freedom, 0.975))
+        return with_half_width(parameter, value, error, half_width)
 
     def variance_of(self, gradient: FloatArray) -> tuple[float, float]:
         """Return variance and degrees of freedom (Satterthwaite) of a quantity by its gradient."""
@@ -109,11 +85,9 @@ _UNKNOWN: Final = MatrixFit(
 
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """
-    Solve F = K d over the presses with indices ``chosen`` (m,).
+    Solve F = K d over the presses with indices ``chosen`` (m,), by row of K.
 
-    The rows of K are solved separately, with the noise of force and displacement and of their
-    zeros. Standard errors are computed from the scatter of the presses about K. The estimator
-    ``weighted`` uses the noise of each press.
+    Standard errors are computed from the scatter of the presses about K.
     """
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
@@ -173,9 +147,8 @@ def _deviation(
     """
     Return standard deviation, degrees of freedom, and used values of residuals.
 
-    The scatter of all presses is more accurate than the noise of each of a few presses. For
-    ``huber`` it is computed from the clipped residuals, P. J. Huber, "Robust Statistics", 1981,
-    section 7.6; each clipped residual reduces the degrees of freedom by 1.
+    For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
+    reduces the degrees of freedom by 1.
     """
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual
@@ -186,3 +159,52 @@ def _deviation(
     correction = (1.0 + (count - freedom) / count * (1.0 - share) / share) / share
     deviation = correction * sqrt(float(left @ left) / freedom)
     return deviation, max(freedom - count * (1.0 - share), 1.0), left
+
+
+def principal_estimates(
+    fit: MatrixFit,
+) -> tuple[ParameterEstimate, ParameterEstimate, ParameterEstimate]:
+    """
+    Return larger and smaller principal stiffness [N/m], and direction of the larger [rad].
+
+    If both agree within their errors, they are biased apart: their intervals then include the
+    interval of their mean, and the direction (from x toward z) is undetermined.
+    """
+    k = fit.matrix
+    half, shear = (k[0, 0] - k[1, 1]) / 2.0, (k[0, 1] + k[1, 0]) / 2.0
+    mean, radius = (k[0, 0] + k[1, 1]) / 2.0, hypot(half, shear)
+    stretch, slide = np.diag([0.5, -0.5]), np.array([[0.0, 0.5], [0.5, 0.0]])
+    cosine, sine = (half / radius, shear / radius) if radius > 0.0 else (1.0, 0.0)
+    outward, around = cosine * stretch + sine * slide, cosine * slide - sine * stretch
+    middle = fit.derived('', '', '', mean, np.eye(2) / 2.0)
+    differ = fit.known.all() and _differ(fit, np.array([half, shear]), stretch, slide)
+    found = []
+    for number, sign in ((1, 1.0), (2, -1.0)):
+        one = fit.derived(
+            f'principal_stiffness_{number}',
+            f'k_{number}',
+            'N/m',
+            mean + sign * radius,
+            np.eye(2) / 2.0 + sign * outward,
+        )
+        if one.determined and not differ:
+            ends = (*one.interval, *middle.interval)
+            one = replace(one, interval=(min(ends), max(ends)))
+        found.append(one)
+    angle = fit.derived(
+        'principal_angle',
+        'phi',
+        'rad',
+        atan2(shear, half) / 2.0 if differ else nan,
+        around / (2.0 * (radius or 1.0)),
+    )
+    return found[0], found[1], angle
+
+
+def _differ(fit: MatrixFit, found: FloatArray, stretch: FloatArray, slide: FloatArray) -> bool:
+    """Test at 1 % whether the two principal stiffnesses differ (F test)."""
+    (a, _), (b, _), (c, freedom) = (fit.variance_of(g) for g in (stretch, slide, stretch + slide))
+    covariance = np.array([[a, (c - a - b) / 2.0], [(c - a - b) / 2.0, b]])
+    if np.linalg.det(covariance) <= 0.0:
+        return bool(np.linalg.norm(found) > ROUNDING * np.linalg.norm(fit.matrix))
+    return bool(found @ np.linalg.solve(covariance, found) / 2.0 > fdtri(2, freedom, 0.99))

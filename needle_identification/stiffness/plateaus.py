@@ -45,29 +45,13 @@ ROUNDING: Final = 1e-8
 
 
 class Plateaus(NamedTuple):
-    """
-    Steady intervals of a recording.
+    """Steady intervals; channels are force x, z, displacement x, z, and off-plane displacement."""
 
-    Channels are force x, z, displacement x, z, and off-plane displacement.
-
-    Attributes
-    ----------
-    time : ndarray, shape (p,)
-        Center of each plateau [s].
-    mean, variance : ndarray, shape (p, 5)
-        Mean of each channel, and the variance of the mean.
-    rest : ndarray of bool, shape (p,)
-        Whether the plateau is a rest.
-    missed : int
-        Number of presses without a plateau.
-
-    """
-
-    time: FloatArray
-    mean: FloatArray
-    variance: FloatArray
-    rest: BoolArray
-    missed: int
+    time: FloatArray  # (p,) centers [s]
+    mean: FloatArray  # (p, 5)
+    variance: FloatArray  # (p, 5) of the means
+    rest: BoolArray  # (p,) whether it is a rest
+    missed: int  # presses without a plateau
 
 
 def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) -> Plateaus:
@@ -194,8 +178,7 @@ def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray
     """
     Return the variance of the mean of each part, with a common autocorrelation.
 
-    A steady trend within a part is drift or creep, not noise. The sum of autocorrelations ends at
-    a lag of five correlation times, which balances its bias and its noise (A. Sokal, "Monte Carlo
+    The sum of autocorrelations ends at a lag of five correlation times (A. Sokal, "Monte Carlo
     methods in statistical mechanics", 1997).
     """
     rows, shapes = [], []

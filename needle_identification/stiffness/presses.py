@@ -57,30 +57,15 @@ class Presses:
 
 
 class PressNoise(NamedTuple):
-    """
-    Noise of the presses.
+    """Noise of the presses."""
 
-    Attributes
-    ----------
-    force, displacement : ndarray, shape (m, 2)
-        Variance of the means of the holds [N^2], [m^2].
-    force_zero, displacement_zero : ndarray, shape (m, m)
-        Covariance of the zeros of each axis [N^2], [m^2].
-
-    """
-
-    force: FloatArray
-    displacement: FloatArray
-    force_zero: FloatArray
-    displacement_zero: FloatArray
+    force: FloatArray  # (m, 2) variance of the means of the holds [N^2]
+    displacement: FloatArray  # likewise [m^2]
+    force_zero: FloatArray  # (m, m) covariance of the zeros of an axis [N^2]
+    displacement_zero: FloatArray  # likewise [m^2]
 
     def covariance(self, matrix: FloatArray, chosen: IntArray, *, pooled: bool) -> FloatArray:
-        """
-        Return the covariance of F - K d for each row of K [N^2], shape (2, m, m).
-
-        ``matrix`` is K [N/m]; ``chosen`` (m,) are indices of presses; ``pooled`` uses the mean
-        noise of the holds.
-        """
+        """Return the covariance (2, m, m) of F - K d by row of K [N^2], or of pooled noise."""
         force, displacement = self.force[chosen], self.displacement[chosen]
         squares: FloatArray = matrix**2
         if pooled:
@@ -108,11 +93,7 @@ def _bounded(variance: FloatArray) -> FloatArray:
 def find_presses(
     recording: IndentationRecording, plateaus: Plateaus, settings: StiffnessSettings
 ) -> tuple[Presses, PressNoise, list[str]]:
-    """
-    Compute the holds relative to the rests; return presses, their noise, and warnings.
-
-    Raises `IdentificationError` if there is no hold.
-    """
+    """Return the holds relative to the rests, their noise, and warnings."""
     rest, hold = plateaus.rest, ~plateaus.rest
     if not hold.any():
         highest = float(np.hypot(*(recording.force - plateaus.mean[rest, :2][0]).T).max())
@@ -196,12 +177,9 @@ def _follow_zero(
     times: FloatArray, rests: FloatArray, variance: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """
-    Estimate the zero between rests as a random walk with measurement noise.
+    Estimate the zero between rests (r, c) as a random walk with measurement noise.
 
-    Rests of shape (r, c) at ``times`` have this ``variance`` (r,). Returns the zeros ``at`` other
-    times, (m, c), and their covariance in each channel, (m, m). The variance of the walk is the
-    maximum likelihood estimate: without drift the zero is the mean of all rests; if the drift
-    exceeds the noise, it is interpolated between neighbors.
+    Returns the zeros ``at`` other times, (m, c), and their covariance in each channel, (m, m).
     """
     mean: FloatArray = rests.mean(axis=0)
     knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)

@@ -54,8 +54,7 @@ def spring_estimates(
     """
     Return curl, asymmetry, whether the tissue is a spring, and the result as a sentence.
 
-    The curl is k_zx - k_xz [N/m], the asymmetry ``|curl| / (sqrt(2) |K_s|)`` [1]. The tissue is a
-    spring if the whole interval of the asymmetry is within ``limit`` [1].
+    The tissue is a spring if the whole interval of the asymmetry is within ``limit`` [1].
     """
     k = fit.matrix
     curl = fit.derived('curl', 'curl F', 'N/m', float(k[1, 0] - k[0, 1]), _CURL)
@@ -83,8 +82,7 @@ def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[floa
     """
     Return the 95 % interval of the magnitude of a signed quantity.
 
-    It contains each magnitude for which the measured value is among the nearest 95 % of possible
-    values, hence zero if the Student's t interval of the signed quantity contains zero.
+    It contains each magnitude for which the measured value is among the nearest 95 % of values.
     """
     if error <= ROUNDING * value:
         return value, value

@@ -17,10 +17,9 @@ from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.estimate import SteeringEstimate
-from needle_identification.steering.reading import read_steering_recording
+from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_identification.steering.tables import STEERING_ROLES
 from needle_insertion.commands.common import check_file
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -147,7 +146,7 @@ def _read(
 def _run(options: argparse.Namespace) -> int:
     # A large import, which the other subcommands do not need.
     from needle_identification import identify_steering, SteeringSettings
-    from needle_identification.steering.result import steering_yaml
+    from needle_identification.result import steering_yaml
 
     if options.output is not None:
         check_file(options.output)

@@ -4,7 +4,7 @@ from math import inf, nan
 
 from needle_dynamics import ParameterError
 from needle_identification import FrictionSettings, ParameterEstimate
-from needle_identification.friction.live import LiveFriction
+from needle_identification.friction.recursive import LiveFriction
 import numpy as np
 import pytest
 from support.samples import IDEAL, simulated, TRUTH

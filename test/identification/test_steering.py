@@ -22,9 +22,9 @@ from needle_identification import (
 )
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
+from needle_identification.result import steering_yaml
+from needle_identification.steering.reading import STEERING_ROLES
 from needle_identification.steering.recording import credible
-from needle_identification.steering.result import steering_yaml
-from needle_identification.steering.tables import STEERING_ROLES
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -235,7 +235,7 @@ def test_invalid_input_is_reported() -> None:
     blind = replace(short, name='run 7', tip=np.full((3, 2), np.nan))
     with pytest.raises(IdentificationError, match='run 7: no valid sample of the tip'):
         identify_steering([blind])
-    with pytest.raises(ShapeError, match=r"guide must have shape \('n', 2\)"):
+    with pytest.raises(ShapeError, match=r'guide must have the shape \(n, 2\)'):
         replace(short, guide=np.zeros((2, 2)))
     with pytest.raises(ShapeError, match='depth must be >= 0'):
         replace(short, depth=np.array([0.0, -0.01, 0.0]))
