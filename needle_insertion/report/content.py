@@ -22,25 +22,13 @@ def png(figure: Figure) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """
-    Figure with caption.
+    """Figure with caption."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the PNG next to the page, without extension.
-    caption : str
-        Text below the figure.
-    figure : Figure
-        The figure.
-    description : str
-        Alternative text for screen readers; default: the caption.
-
-    """
-
+    #: File name of the PNG next to the page, without extension.
     name: str
     caption: str
     figure: Figure
+    #: Alternative text for screen readers; default: the caption.
     description: str = ''
 
     @cached_property

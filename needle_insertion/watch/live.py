@@ -22,19 +22,7 @@ def _json(content: object) -> str:
 
 
 class Live:
-    """
-    Generator of frames at a fixed rate, the same for all readers.
-
-    Parameters
-    ----------
-    view : View
-        State of the page.
-    poll : callable
-        Updates the view at a time [s].
-    control : bool
-        Whether the page has buttons.
-
-    """
+    """Frames at a fixed rate, the same for all readers; `poll` updates the view at a time [s]."""
 
     def __init__(self, view: View, poll: Callable[[float], None], *, control: bool) -> None:
         self._view, self._poll = view, poll
@@ -102,17 +90,7 @@ class LiveReader:
 
 
 class RecordedReader:
-    """
-    Frames of a recording for one reader.
-
-    Parameters
-    ----------
-    recording : ShownRecording
-        Recording.
-    losses : sequence of str
-        Descriptions of unreadable parts.
-
-    """
+    """Frames of a recording for one reader; `losses` describes its unreadable parts."""
 
     def __init__(self, recording: ShownRecording, losses: Sequence[str] = ()) -> None:
         self._recording = recording

@@ -73,25 +73,8 @@ class ShownRecording:
     """
     Content of a bag for the page, by time from its start.
 
-    Parameters
-    ----------
-    path : Path
-        Bag in a format of `needle_identification.Bag`.
-
-    Attributes
-    ----------
-    name : str
-        Name of the bag.
-    duration : float
-        Time from the first to the last shown message [s].
-    losses : tuple of str
-        Descriptions of unreadable parts.
-
-    Raises
-    ------
-    RecordingError
-        If it is not readable, is empty, or has nothing to show.
-
+    `duration` is the time from the first to the last shown message [s], and `losses` describes
+    unreadable parts. Raises `RecordingError` if the bag is unreadable or has nothing to show.
     """
 
     def __init__(self, path: Path) -> None:
@@ -189,24 +172,7 @@ class ShownRecording:
 
 
 class PagePlayback:
-    """
-    Playback of a recording for one reader.
-
-    Parameters
-    ----------
-    duration : float
-        Length of the recording [s].
-    steady : callable
-        Returns the time of a monotonic clock [s].
-
-    Attributes
-    ----------
-    playing : bool
-        Whether the playback runs.
-    speed : float
-        Playback speed relative to real time.
-
-    """
+    """Playback of a recording of a duration [s] for one reader; `speed` is 1 in real time."""
 
     def __init__(self, duration: float, steady: Callable[[], float] = monotonic) -> None:
         self._duration = duration

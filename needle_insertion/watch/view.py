@@ -53,25 +53,12 @@ def line(points: FloatArray) -> list[list[float]]:
 
 
 class View:
-    """
-    Newest message of each topic; all times are of a single clock [s].
-
-    Parameters
-    ----------
-    silent : float
-        Timeout of a topic [s].
-
-    Attributes
-    ----------
-    invalid : int
-        Number of unreadable messages.
-    scene : dict
-        Needle, tissue and limits, from `scene.scene`.
-
-    """
+    """Newest message of each topic; all times, also the timeout `silent`, are of one clock [s]."""
 
     def __init__(self, silent: float = 1.0) -> None:
+        #: Number of unreadable messages.
         self.invalid = 0
+        #: Needle, tissue and limits.
         self.scene = scene({})
         self._silence = silent
         #: Newest reading of each topic and its time of arrival.

@@ -50,14 +50,6 @@ class WatchNode(Node):
     The node is not spun: messages wait in the middleware, which keeps the newest only, and `poll`
     takes them. Subscriptions are best effort, so that no publisher waits or resends, and the node
     publishes nothing.
-
-    Parameters
-    ----------
-    view : View
-        Receiver of the messages.
-    context : Context
-        Context of the node.
-
     """
 
     def __init__(self, view: View, context: Context) -> None:
