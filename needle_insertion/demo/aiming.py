@@ -8,15 +8,16 @@ from math import inf
 from pathlib import Path
 from typing import Final
 
-from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.demo.bending import read_needles
 from needle_insertion.demo.insertion import RATE, SETTLING
+from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
@@ -24,7 +25,7 @@ from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
-from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus
+from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
 
@@ -99,35 +100,29 @@ def record_aimed(
     `logs` is the folder of the node output. If not `steered`, the guide rests. Raises `GraphError`
     if a node fails or stops, or the target depth is not reached in time.
     """
+    nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
+    nodes['controller'] = {**CONTROLLER, 'steered': steered}
+    nodes['plant'] = PLANT
+    end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
     with Graph(logs) as graph:
         run = SimulatedRun(graph, show, lockstep=lockstep)
-        aim = run.publisher(PointStamped, 'target')
         expected = graph.latest(run.node, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
-        waiting = True
-        end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
 
-        def act(sample: RunSample) -> bool:
-            nonlocal waiting, end
-            if waiting and sample.time >= WARM_UP:
-                waiting = False
-                aim(target_message(sample.stamp, TARGET))
-            if steered and end == inf and _is_done(run.statuses.get('steering'), sample.time):
+        def proceeds(sample: RunSample) -> bool:
+            nonlocal end
+            if end == inf and _is_done(run.states.get('steering'), sample.time):
                 # Stamp of the last tip measurement; time since the first sample.
                 last = nanoseconds(expected.message.header.stamp)
                 end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
-            done = (sample.depth - START) / (TARGET[1] - START)
-            show('inserting', min(max(done, 0.0), 1.0))
             return sample.time < end
 
-        nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
-        nodes['controller'] = {**CONTROLLER, 'steered': steered}
-        nodes['plant'] = PLANT
-        run.record(bag, nodes, act)
+        run.insert(bag, nodes, START, TARGET, proceeds)
 
 
-def _is_done(status: NodeStatus | None, time: float) -> bool:
+def _is_done(state: State | None, time: float) -> bool:
     """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
     phase, rejection = SteeringPhase.INACTIVE, ''
+    status = None if state is None else state.status
     if isinstance(status, SteeringStatus):
         phase, rejection = status.phase, status.last_rejection
         if phase is SteeringPhase.STOPPED:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from math import inf, isfinite
 import re
 import shlex
@@ -10,8 +10,9 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from needle_controller import LAWS
+from needle_insertion.graph.messages import State
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.live.operator import Operator, RequestOutcome, State
+from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.requests import CONTROLLER, STEERING
 from needle_insertion.live.screen import Screen
@@ -93,7 +94,7 @@ class Terminal:
         #: Whether the latest motion is a steered insertion.
         self._steers = False
 
-    def begin(self, nodes: Sequence[str]) -> None:
+    def begin(self, nodes: Collection[str]) -> None:
         """
         Wait until all nodes report their state, and controller and steering have measurements.
 

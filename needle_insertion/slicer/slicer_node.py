@@ -10,6 +10,7 @@ from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
+from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
@@ -254,13 +255,10 @@ class SlicerNode(BaseNode):
         if newest is None:
             return
         frame, (x, y, z) = newest
-        message = PointStamped()
-        message.header.frame_id = contract.ENTRY
         # The clock of the peer is not synchronized.
-        message.header.stamp = request_stamp(self)
-        message.point.x, message.point.y, message.point.z = x, y, z
+        stamp = nanoseconds(request_stamp(self))
+        message = target_message(stamp, (x, y, z))
         self._target.publish(message)
-        stamp = nanoseconds(message.header.stamp)
         self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
         self._targets += 1
         heard = self._target.get_subscription_count()
