@@ -12,16 +12,15 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.demo.bending import read_needles
+from needle_insertion.demo.bending import read_needles, replay_check
 from needle_insertion.demo.insertion import RATE, SETTLING
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
-from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
-from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
@@ -94,12 +93,7 @@ _NORMAL: Final = 1.96
 def record_aimed(
     bag: Path, logs: Path, show: Show, *, steered: bool, lockstep: bool = True
 ) -> None:
-    """
-    Insert a needle to the target with real nodes and record everything.
-
-    `logs` is the folder of the node output. If not `steered`, the guide rests. Raises `GraphError`
-    if a node fails or stops, or the target depth is not reached in time.
-    """
+    """Insert a needle to the target with real nodes and record everything; steer it or not."""
     nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
     nodes['controller'] = {**CONTROLLER, 'steered': steered}
     nodes['plant'] = PLANT
@@ -178,16 +172,11 @@ def read_aimed(bag: Path) -> Aimed:
 
 
 def aiming_checks(bag: Path, other: Path) -> list[Check]:
-    """
-    Check the miss, the calibration of the expected tip, and the replay of the steered run.
-
-    `other` is the bag of the insertion with a guide at rest.
-    """
+    """Check both misses, the expected tip, and the replay; `other` is with a guide at rest."""
     found = read_aimed(bag)
     off = found.tip - found.expected
     held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
     alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
-    (run,) = verify(bag)
     x, z = 1e3 * found.tip
     return [
         Check(
@@ -203,22 +192,15 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
             alone > LARGEST_MISS,
         ),
         Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
-        Check(
-            'computed again from its bag, steered',
-            'identical or within tolerance',
-            run.verdict,
-            run.verdict != 'differs',
-        ),
+        replay_check(bag, 'steered'),
     ]
 
 
 def draw_aiming(bag: Path, other: Path) -> Figure:
     """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
     needles, path = read_needles(bag)
-    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
-    return draw_needle(
-        [needles[k] for k in at], path, np.array(TARGET), read_needles(other)[0][-1]
-    )
+    (*_, last), _ = read_needles(other)
+    return draw_needle(evenly(needles, _DRAWN), path, np.array(TARGET), last)
 
 
 def animate_aiming(bag: Path) -> Animation:

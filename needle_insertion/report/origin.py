@@ -111,13 +111,7 @@ def identify_all(
     *,
     digest: bool,
 ) -> tuple[list[Any], Origin]:
-    """
-    Identify recordings, and skip copies and unusable recordings.
-
-    ``read`` and ``identify`` handle a single recording; ``digest`` enables the checksums of the
-    files, for which they are read again. Returns the estimates, and the origin with sources and
-    failures.
-    """
+    """Identify recordings except copies and unusable ones; return estimates and origin."""
     estimates, sources, failures, copies = [], [], [], []
     seen: dict[bytes, str] = {}
     for bag in tqdm(bags, desc='bags', disable=None, leave=False):
