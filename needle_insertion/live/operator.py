@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.messages import listen_states, State, target_message
-from needle_insertion.live.requests import CONTROLLER, Request, REQUESTS, STEERING
+from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.calls_node import Calls
@@ -105,18 +105,15 @@ class Operator:
         return pending
 
     def ask(self, word: str) -> Future:
-        """
-        Call the services of a key of `REQUESTS`; the result of the future is an `RequestOutcome`.
-
-        The future is done at once if no node offers the service.
-        """
+        """Call the services of a key of `REQUESTS`; the future has a `RequestOutcome`."""
         ready = [
             (request, client)
             for request in REQUESTS[word]
             if (client := self._clients[request.node, request.service]).service_is_ready()
         ]
         if not ready:
-            return _done(RequestOutcome(False, f'no node offers {_names(REQUESTS[word])}'))
+            services = ' or '.join(f'{one.node}/{one.service}' for one in REQUESTS[word])
+            return _done(RequestOutcome(False, f'no node offers {services}'))
         return _gathered(
             {
                 f'{request.node}/{request.service}': self._calls.call(
@@ -131,11 +128,7 @@ class Operator:
         )
 
     def set(self, node: str, name: str, value: Any) -> Future:
-        """
-        Set a parameter of a node; the result of the future is an `RequestOutcome`.
-
-        The future is done at once if there is no such node.
-        """
+        """Set a parameter of a node; the future has a `RequestOutcome`."""
         client = self._client(SetParameters, node, 'set_parameters')
         # A new client has not discovered the service yet.
         if not client.wait_for_service(timeout_sec=_DISCOVERY):
@@ -149,10 +142,6 @@ class Operator:
         request = SetParameters.Request(parameters=[parameter])
         service = f'{node}/set_parameters'
         return _gathered({service: self._calls.call(client, request)}, read)
-
-
-def _names(requests: tuple[Request, ...]) -> str:
-    return ' or '.join(f'{request.node}/{request.service}' for request in requests)
 
 
 def _done(outcome: RequestOutcome) -> Future:

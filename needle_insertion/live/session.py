@@ -73,11 +73,7 @@ class Session:
 
 
 def run(session: Session) -> int:
-    """
-    Start the nodes, execute the commands of a person or a script, and end the nodes; return 0.
-
-    Raises `NeedleError` if a node fails, or a command of a script fails.
-    """
+    """Start the nodes, execute the commands of a person or a script, and end the nodes."""
     screen = Screen()
     with Graph(session.logs, shared=True) as graph:
         node = graph.node('operator')

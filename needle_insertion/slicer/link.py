@@ -42,11 +42,7 @@ _MOST_STRANGERS: Final = 8
 
 
 class Connection:
-    """
-    Connection to a peer, which is restored whenever it is lost.
-
-    `wanted` returns whether a message of a type and a device name is wanted.
-    """
+    """Connection to a peer, which is restored whenever it is lost; `wanted` as in `Frames`."""
 
     def __init__(
         self,

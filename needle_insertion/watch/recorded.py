@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -38,10 +37,6 @@ _HISTORY_RATE: Final = 10.0
 SLOWEST, FASTEST = 0.02, 50.0
 
 _Item = TypeVar('_Item')
-
-
-def _same(item: _Item) -> _Item:
-    return item
 
 
 class _Kept(Generic[_Item]):
@@ -132,7 +127,8 @@ class ShownRecording:
             self._expected.add(time, lambda: deserialize(message.topic, data))
         elif name == contract.DIAGNOSTICS.name:
             for status in deserialize(message.topic, data).status:
-                self._nodes.setdefault(status.name, _Kept()).add(time, partial(_same, status))
+                # Called at once.
+                self._nodes.setdefault(status.name, _Kept()).add(time, lambda: status)  # noqa: B023
         else:
             parameters = parameters_of(read_string(data))
             self._configurations[name].add(time, lambda: parameters)
@@ -193,11 +189,7 @@ class PagePlayback:
         return self._at
 
     def take(self, message: dict[str, Any]) -> bool:
-        """
-        Process a playback message: ``at`` (a time [s]), ``play`` (bool) or ``speed``.
-
-        Returns whether the time has jumped; `ParameterError` if the message is invalid.
-        """
+        """Process a message ``at`` (a time [s]), ``play`` or ``speed``; return if time jumped."""
         now = self.at
         match message:
             case {'at': int() | float() as at, **rest} if not rest and at is not True:

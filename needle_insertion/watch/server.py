@@ -86,11 +86,7 @@ class Control(Protocol):
         """Send a target [m]; return acceptance and answer, `JobError` without an answer."""
 
     async def ask(self, what: str) -> tuple[bool, str]:
-        """
-        Call the services of a request, a key of `needle_insertion.live.requests.REQUESTS`.
-
-        Returns success and the answers of the nodes; `JobError` without an answer.
-        """
+        """Call the services of a key of `REQUESTS`; return success and the answers."""
 
 
 class Server:

@@ -17,8 +17,7 @@ import numpy as np
 #: Frames per second.
 RATE: Final = 30.0
 
-#: Columns of the history, and its duration [s].
-HISTORY: Final = ('time', 'depth', 'reference', 'force', 'tip_x', 'tip_z')
+#: Duration of the history [s].
 SPAN: Final = 20.0
 
 #: Timeout of the status of a node, which is published every second [s].
@@ -41,11 +40,7 @@ def number(value: float | None) -> float | None:
 
 
 def line(points: FloatArray) -> list[list[float]]:
-    """
-    Return points (n, 3) [m] as columns x, y and z, decimated to 120 points.
-
-    Points that are not finite are left out.
-    """
+    """Return finite points (n, 3) [m] as columns x, y and z, decimated to 120 points."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) > _POINTS:
         points = points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
@@ -235,7 +230,7 @@ def _progress(status: NodeStatus | None) -> dict[str, int]:
 
 
 def row(frame: Mapping[str, Any]) -> list[float | None]:
-    """Return the values of a frame for the strip charts, in the columns `HISTORY`."""
+    """Return time, depth, reference, force, tip x and z of a frame for the strip charts."""
     tip = frame['tip'] or [None] * 3
     charted = [frame['time'], frame['depth'], frame['reference'], frame['force']]
     return [*charted, tip[0], tip[2]]

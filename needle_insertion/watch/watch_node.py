@@ -155,11 +155,7 @@ class Buttons:
 
 @contextmanager
 def watching(*, control: bool) -> Iterator[tuple[View, Callable[[float], None], Buttons | None]]:
-    """
-    Join the ROS graph of the user; yield the view, a function to update it, and the buttons.
-
-    The buttons are None unless ``control`` is true.
-    """
+    """Join the ROS graph of the user; yield the view, a function to update it, and buttons."""
     stay_local(os.environ)
     context = Context()
     context.init(domain_id=domain_of(os.environ))
