@@ -146,11 +146,9 @@ class SlicerNode(BaseNode):
     # Messages of the nodes.
 
     @contextmanager
-    def _rejecting(self, topic: Topic, frame: str = '') -> Iterator[None]:
-        """Check the frame of a message, and report an invalid message."""
+    def _rejecting(self, topic: Topic) -> Iterator[None]:
+        """Report an invalid message of a topic."""
         try:
-            if frame not in ('', contract.ENTRY):
-                raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
             yield
         except MessageError as error:
             self._events.reject(f'{topic.name} refused: {error}')
@@ -159,7 +157,8 @@ class SlicerNode(BaseNode):
         points = [(p.position.x, p.position.y, p.position.z) for p in message.poses]
         turn = _quaternion(message.poses[-1].orientation) if message.poses else []
         stamp = nanoseconds(message.header.stamp)
-        with self._rejecting(contract.NEEDLE_POSES, message.header.frame_id):
+        with self._rejecting(contract.NEEDLE_POSES):
+            _check_frame(message.header.frame_id)
             self._view.take_poses(stamp, points, turn, monotonic())
 
     def _on_joints(self, reading: Reading) -> None:
@@ -172,14 +171,16 @@ class SlicerNode(BaseNode):
             self._view.take_guide(x, z, monotonic())
 
     def _on_tip(self, reading: Reading) -> None:
-        with self._rejecting(contract.TIP_DEFLECTION, reading.frame):
+        with self._rejecting(contract.TIP_DEFLECTION):
+            _check_frame(reading.frame)
             self._view.take_tip(reading.stamp, reading.values[0], monotonic())
 
     def _on_expected(self, message: PoseWithCovarianceStamped) -> None:
         pose = message.pose.pose
         at = [pose.position.x, pose.position.y, pose.position.z]
         stamp = nanoseconds(message.header.stamp)
-        with self._rejecting(contract.TIP_EXPECTED, message.header.frame_id):
+        with self._rejecting(contract.TIP_EXPECTED):
+            _check_frame(message.header.frame_id)
             self._view.take_expected(stamp, at, _quaternion(pose.orientation))
             self._state_changed = monotonic()
 
@@ -337,6 +338,11 @@ class SlicerNode(BaseNode):
 
 def _quaternion(orientation: Any) -> list[float]:
     return [orientation.x, orientation.y, orientation.z, orientation.w]
+
+
+def _check_frame(frame: str) -> None:
+    if frame not in ('', contract.ENTRY):
+        raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
 
 
 def main() -> int:
