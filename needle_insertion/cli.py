@@ -39,7 +39,12 @@ COMMANDS: Final[Mapping[str, str]] = {
 }
 
 #: Modules of the subcommands of the packages above this one, which are loaded by their names only.
-ABOVE: Final[Mapping[str, str]] = {'reproduce': 'reproduction.command', 'bench': 'benchmarks.run'}
+ABOVE: Final[Mapping[str, str]] = {
+    'demo': 'reproduction.demo_command',
+    'experiment': 'reproduction.experiment_command',
+    'reproduce': 'reproduction.command',
+    'bench': 'benchmarks.run',
+}
 
 _ROOT: Final = Path(__file__).parents[1]
 

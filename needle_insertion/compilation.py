@@ -36,11 +36,7 @@ MODULES: Final = (
 
 
 def compile_kernels(names: Sequence[str] = MODULES) -> int:
-    """
-    Compile the kernels that are not in the cache, with progress on stderr; return their number.
-
-    `names` are as for `needle_dynamics.compiled.cache.kernels`.
-    """
+    """Compile the kernels that are not in the cache, with progress; return their number."""
     missing = [name for name in kernels(names) if not is_kept(name)]
     if not missing:
         return 0

@@ -383,7 +383,7 @@ class InsertionProtocol:
         """Return the first row of depth, velocity, error and deflection that the guard rejects."""
         guard = Guard(self._limits, (self._needle.minimum_depth, self._needle.length))
         for k, (depth, speed, error, tip) in enumerate(samples.tolist()):
-            encoders = guard.encoders(Measurement(time=0.0, depth=depth, speed=speed))
+            encoders = guard.encoders(Measurement(time=0.0, depth=depth, velocity=speed))
             if encoders or guard.tracking(error) or guard.tip(tip):
                 return k
         return None

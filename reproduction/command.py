@@ -53,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
     if options.record is not None:
         wanted = campaigns(options.what)
         # Needs ROS; the shipped recordings are read without it.
-        from needle_insertion.experiment.record import record
+        from reproduction.record import record
 
         recorded = {name: record(one, options.record) for name, one in wanted.items()}
     if folder is not None:

@@ -19,14 +19,14 @@ from needle_identification import (
 )
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.experiment.truth import (
+from needle_insertion.report.content import Grid, ReportSection
+from needle_ros.errors import NeedleError
+from reproduction.truth import (
     compare_friction,
     compare_stiffness,
     Coverage,
     LEVEL,
 )
-from needle_insertion.report.content import Grid, ReportSection
-from needle_ros.errors import NeedleError
 from scipy.special import chdtri
 from tqdm import tqdm
 

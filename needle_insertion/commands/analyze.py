@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-import json
 from pathlib import Path
-import sys
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters
 from needle_dynamics.linearization import SLIDING
@@ -15,6 +13,7 @@ from needle_insertion.commands.common import (
     check_folder,
     constants,
     make_folder,
+    print_result,
     Subcommand,
 )
 from needle_insertion.report import controllability as report
@@ -79,19 +78,15 @@ def _run(options: argparse.Namespace) -> int:
         options.sliding,
     )
     files = _write_map(parameters, options) if options.map else []
-    if options.json:
-        found = {
-            'preset': options.preset,
-            'parameters': asdict(parameters),
-            'unit': 'SI',
-            'points': [point.document for point in points],
-            'files': [str(path) for path in files],
-        }
-        sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
-    else:
-        sys.stdout.write(f'{table([point.row for point in points], report.POINT_HEADS)}\n')
-        for path in files:
-            sys.stdout.write(f'wrote {path}\n')
+    document = {
+        'preset': options.preset,
+        'parameters': asdict(parameters),
+        'unit': 'SI',
+        'points': [point.document for point in points],
+        'files': [str(path) for path in files],
+    }
+    text = table([point.row for point in points], report.POINT_HEADS)
+    print_result(document, text, files, as_json=options.json)
     return 0
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import json
 import os
 from pathlib import Path
+import sys
 from typing import Any, NamedTuple
 
-from needle_ros.errors import ParameterError
+from needle_ros.errors import ParameterError, shown
 
 
 class Subcommand(NamedTuple):
@@ -57,6 +58,22 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             values[name] = text
     return values
+
+
+def print_result(
+    document: object, text: str, files: Iterable[Path] = (), *, as_json: bool
+) -> None:
+    """Print a result as JSON, or as text with the written files."""
+    if as_json:
+        sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
+    else:
+        sys.stdout.write(''.join([f'{text}\n', *(f'wrote {path}\n' for path in files)]))
+
+
+def print_each(kind: str, lines: Iterable[object]) -> None:
+    """Print warnings or errors on stderr, one per line."""
+    for line in lines:
+        sys.stderr.write(shown(f'{kind}: {line}') + '\n')
 
 
 def check_file(path: Path) -> None:

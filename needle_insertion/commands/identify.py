@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -24,10 +23,16 @@ from needle_identification import (
     TERMS,
     write_result,
 )
-from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles, ROLES
-from needle_insertion.commands.common import check_file, check_folder, make_folder, Subcommand
-from needle_insertion.commands.identify_steering import add_steering
+from needle_insertion.commands.common import (
+    check_file,
+    check_folder,
+    make_folder,
+    print_each,
+    print_result,
+    Subcommand,
+)
+from needle_insertion.commands.identify_steering import add_steering, add_time
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -161,12 +166,7 @@ def _add_common(
         help='topic of the motion (default: the only topic of a suitable type, or joint_states or '
         'end_effector_pose)',
     )
-    reading.add_argument(
-        '--time',
-        choices=TIMES,
-        default='header',
-        help='time of a sample: stamp of its message or time of receipt (default header)',
-    )
+    add_time(reading)
     fitting = parser.add_argument_group('identification')
     # The default of the settings is the first choice.
     estimators = tuple(dict.fromkeys([defaults.estimator, *ESTIMATORS]))
@@ -268,14 +268,13 @@ def _identify(
     if not estimates:
         return 2
     summary = summarize(estimates)
-    written = []
-    complaint = ''
+    written, complaints = list[Path](), list[str]()
     if options.output is not None:
         try:
             write(options.output, summary)
             written.append(options.output)
         except IdentificationError as error:
-            complaint = f'{options.output} is not written: {error}'
+            complaints.append(f'{options.output} is not written: {error}')
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
@@ -283,26 +282,18 @@ def _identify(
         make_folder(options.report)
         written.append(write_identified_page(options.report, summary, origin))
     short, full = warned(summary, origin)
-    for words in full if options.all_warnings else short:
-        sys.stderr.write(shown(f'warning: {words}') + '\n')
+    print_each('warning', full if options.all_warnings else short)
     if len(full) > len(short) and not options.all_warnings:
         sys.stderr.write(f'{len(full)} warnings in {len(short)} groups: --all-warnings\n')
-    if options.json:
-        result = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
-        sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
-    else:
-        sys.stdout.write(f'{identified_text(summary)}\n')
-        for path in written:
-            sys.stdout.write(f'wrote {path}\n')
-    if complaint:
-        sys.stderr.write(shown(f'error: {complaint}') + '\n')
-    return 2 if origin.failures or complaint else 0
+    document = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
+    print_result(document, identified_text(summary), written, as_json=options.json)
+    print_each('error', complaints)
+    return 2 if origin.failures or complaints else 0
 
 
 def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
     """Print the recordings that cannot be used, and the other subcommand if it accepts them."""
-    for line in origin.failed:
-        sys.stderr.write(shown(f'error: {line}') + '\n')
+    print_each('error', origin.failed)
     for name, _reason in origin.failures:
         if _can(identify, Path(name)):
             sys.stderr.write(shown(f'{name}: try needle identify {other}') + '\n')

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-import json
 from math import isfinite
 from pathlib import Path
 import re
-import sys
 from typing import Any
 
 from needle_identification.errors import IdentificationError
@@ -20,9 +18,9 @@ from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_insertion.commands.common import check_file
+from needle_insertion.commands.common import check_file, print_each, print_result
 from needle_insertion.report.text import table
-from needle_ros.errors import NeedleError, ParameterError, shown
+from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
 from tqdm import tqdm
 
@@ -76,12 +74,7 @@ def add_steering(what: Any) -> None:
         metavar='TOPIC',
         help='topic of the joints, a JointState (default: the only such topic, or joint_states)',
     )
-    reading.add_argument(
-        '--time',
-        choices=TIMES,
-        default='header',
-        help='time of a sample: stamp of its message or time of receipt (default header)',
-    )
+    add_time(reading)
     reading.add_argument(
         '--medium',
         type=_pattern,
@@ -105,6 +98,16 @@ def add_steering(what: Any) -> None:
         '--free-length', type=float, metavar='M', help='known free length [m] (default: fitted)'
     )
     parser.set_defaults(identify=_run)
+
+
+def add_time(reading: argparse._ArgumentGroup) -> None:
+    """Add the option of the source of time stamps."""
+    reading.add_argument(
+        '--time',
+        choices=TIMES,
+        default='header',
+        help='time of a sample: stamp of its message or time of receipt (default header)',
+    )
 
 
 def _pattern(text: str) -> re.Pattern[str]:
@@ -139,7 +142,7 @@ def _read(
             columns=columns,
         )
     except (NeedleError, OSError) as error:
-        sys.stderr.write(shown(f'error: {error}') + '\n')
+        print_each('error', [error])
         return None
 
 
@@ -159,36 +162,31 @@ def _run(options: argparse.Namespace) -> int:
     recordings = [one for one in read if one is not None]
     if not recordings:
         return 2
-    for words, names in _alike(recordings):
-        sys.stderr.write(shown(f'warning: {names}: {words}') + '\n')
+    print_each('warning', _alike(recordings))
     with tqdm(desc='fits', unit='', disable=None, leave=False, delay=2.0) as bar:
         found = identify_steering(recordings, settings, bar.update)
-    for words in found.warnings:
-        sys.stderr.write(shown(f'warning: {words}') + '\n')
-    if options.json:
-        document = steering_document(found, recordings)
-        sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
-    else:
-        sys.stdout.write(f'{steering_text(found)}\n')
+    print_each('warning', found.warnings)
+    written, complaints = list[Path](), list[str]()
     if options.output is not None:
         try:
             write_whole(options.output, steering_yaml(found).encode())
+            written.append(options.output)
         except IdentificationError as error:
-            sys.stderr.write(shown(f'error: {options.output} is not written: {error}') + '\n')
-            return 2
-        if not options.json:
-            sys.stdout.write(f'wrote {options.output}\n')
-    return 0 if len(recordings) == len(read) else 2
+            complaints.append(f'{options.output} is not written: {error}')
+    document = steering_document(found, recordings)
+    print_result(document, steering_text(found), written, as_json=options.json)
+    print_each('error', complaints)
+    return 2 if complaints or len(recordings) < len(read) else 0
 
 
-def _alike(recordings: Sequence[SteeringRecording]) -> list[tuple[str, str]]:
-    """Group the losses of all recordings: message, and the recordings with it."""
+def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:
+    """Group the losses of all recordings: the recordings with a message, and the message."""
     groups: dict[str, list[str]] = {}
     for one in recordings:
         for words in one.losses:
             groups.setdefault(words, []).append(one.name)
     return [
-        (words, names[0] if len(names) == 1 else f'{names[0]} and {len(names) - 1} more')
+        f'{names[0]}{f" and {len(names) - 1} more" if names[1:] else ""}: {words}'
         for words, names in groups.items()
     ]
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from math import isfinite
 from pathlib import Path
-import sys
 
 from needle_identification import inspect_recording, Inspection
-from needle_insertion.commands.common import Subcommand
+from needle_insertion.commands.common import print_each, print_result, Subcommand
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, shown
@@ -28,27 +26,17 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Print the contents of each recording; return 2 if a recording cannot be read."""
-    found: list[Inspection] = []
-    bad = 0
+    found, bad = list[Inspection](), 0
     for path in options.recordings:
-        one = _inspected(path)
-        found += one
-        bad += not one
-    if options.json:
-        document = [plain(one) for one in found]
-        sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
-    else:
-        sys.stdout.write('\n\n'.join(map(_text, found)) + ('\n' if found else ''))
+        try:
+            found.append(inspect_recording(path))
+        except (NeedleError, OSError) as error:  # noqa: PERF203
+            print_each('error', [error])
+            bad += 1
+    if found or options.json:
+        text = '\n\n'.join(map(_text, found))
+        print_result([plain(one) for one in found], text, as_json=options.json)
     return 2 if bad else 0
-
-
-def _inspected(path: Path) -> list[Inspection]:
-    """Inspect a recording, or print the error and return an empty list."""
-    try:
-        return [inspect_recording(path)]
-    except (NeedleError, OSError) as error:
-        sys.stderr.write(shown(f'error: {error}') + '\n')
-        return []
 
 
 def _text(found: Inspection) -> str:

@@ -69,13 +69,21 @@ def _run(options: argparse.Namespace) -> int:
     )
     if not file.is_file():
         raise ParameterError(f'--params-file {file} does not exist')
-    nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {}}
-    nodes['controller'] = {}
+    nodes = _nodes(options)
+    if not options.no_recording:
+        nodes = {'recorder': {'path': str(options.output / 'bag')}, **nodes}
+    compile_nodes()
+    lockstep = not (options.hardware or options.realtime)
+    return run(Session(nodes, file, options.output / 'logs', lockstep=lockstep))
+
+
+def _nodes(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each node that the options change."""
+    steered = {'steered': True} if options.steering else {}
+    nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {**steered}}
+    nodes['controller'] = {**steered}
     if options.steering:
         nodes['steering'] = {}
-        nodes['controller']['steered'] = True
-        if not options.hardware:
-            nodes['plant']['steered'] = True
     if options.preset:
         for values in nodes.values():
             values['model.preset'] = options.preset
@@ -88,16 +96,7 @@ def _run(options: argparse.Namespace) -> int:
         if name in ('lockstep', 'use_sim_time'):
             raise ParameterError(f'-p {word}: this parameter is set by --realtime')
         nodes[node][name] = value
-    compile_nodes()
-    return run(
-        Session(
-            nodes=nodes,
-            file=file,
-            folder=options.output,
-            records=not options.no_recording,
-            lockstep=not (options.hardware or options.realtime),
-        )
-    )
+    return nodes
 
 
 def _parameter(word: str) -> tuple[str, str, Any]:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import json
 from math import sqrt
 from pathlib import Path
-import sys
 from time import perf_counter
 from typing import Final
 
 from needle_dynamics import DEFAULT_PRESET, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
-from needle_insertion.commands.common import add_needle, check_file, constants, Subcommand
+from needle_insertion.commands.common import (
+    add_needle,
+    check_file,
+    constants,
+    print_each,
+    print_result,
+    Subcommand,
+)
 from needle_insertion.commands.simulate_steering import add_steering, run_steering
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
@@ -145,21 +150,15 @@ def _run_modes(options: argparse.Namespace) -> int:
     for path in options.output:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
-    for words in report.warnings(trajectory):
-        sys.stderr.write(f'warning: {words}\n')
-    if options.json:
-        sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
-    else:
-        # Decayed values have no significant digits left.
-        rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
-        sys.stdout.write(
-            f'{preset}: inserted {depth:g} m at the start, force '
-            f'{force:g} N, for {duration:g} s\n\n'
-            f'{table(rows, ("quantity", "value"))}\n'
-            f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time\n'
-        )
-        for path in options.output:
-            sys.stdout.write(f'wrote {path}\n')
+    print_each('warning', report.warnings(trajectory))
+    # Decayed values have no significant digits left.
+    rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
+    text = (
+        f'{preset}: inserted {depth:g} m at the start, force {force:g} N, for {duration:g} s\n\n'
+        f'{table(rows, ("quantity", "value"))}\n'
+        f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time'
+    )
+    print_result(summary, text, options.output, as_json=options.json)
     return 0
 
 

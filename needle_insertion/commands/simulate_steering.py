@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict, fields
-import json
 from math import inf
 from pathlib import Path
-import sys
 
 from needle_dynamics import (
     FloatArray,
@@ -17,7 +15,7 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
-from needle_insertion.commands.common import constants
+from needle_insertion.commands.common import constants, print_result
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values, unknown_name
@@ -145,14 +143,10 @@ def run_steering(options: argparse.Namespace) -> int:
     for path in options.output:
         report.write(path, recorder)
     summary = report.summary(recorder)
-    if options.json:
-        sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
-        return 0
     rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
-    sys.stdout.write(
+    text = (
         f'{name}: inserted from {start:g} m to {to:g} m at {speed:g} m/s\n\n'
-        f'{table(rows, ("quantity", "value"))}\n'
+        f'{table(rows, ("quantity", "value"))}'
     )
-    for path in options.output:
-        sys.stdout.write(f'wrote {path}\n')
+    print_result(summary, text, options.output, as_json=options.json)
     return 0

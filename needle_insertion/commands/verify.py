@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
-import json
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import Subcommand
+from needle_insertion.commands.common import print_result, Subcommand
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -40,11 +39,9 @@ def _run(options: argparse.Namespace) -> int:
         found = _verified(path, options.tolerance)
         results += found
         bad += not found
-    if options.json:
-        document = [result.document for result in results]
-        sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
-    elif results:
-        sys.stdout.write('\n'.join([_table(results), *map(shown, _remarks(results)), '']))
+    if results or options.json:
+        text = '\n'.join([_table(results), *map(shown, _remarks(results))])
+        print_result([one.document for one in results], text, as_json=options.json)
     return 2 if bad else int(any(result.verdict == 'differs' for result in results))
 
 

@@ -10,8 +10,8 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from needle_insertion.commands.common import Subcommand
-from needle_ros.errors import ParameterError, shown
+from needle_insertion.commands.common import print_each, Subcommand
+from needle_ros.errors import ParameterError
 
 if TYPE_CHECKING:
     # Takes long to import.
@@ -65,8 +65,7 @@ async def _recorded(options: argparse.Namespace) -> None:
     from needle_insertion.watch.server import Server
 
     recording = ShownRecording(options.bag)
-    for loss in recording.losses:
-        sys.stderr.write(shown(f'warning: {loss}') + '\n')
+    print_each('warning', recording.losses)
     await _serve(Server(lambda: RecordedReader(recording), options.host, options.port))
 
 

@@ -8,23 +8,23 @@ from math import inf
 from pathlib import Path
 from typing import Final
 
-from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.demo.bending import read_needles
+from needle_insertion.demo.bending import read_needles, replay_check
 from needle_insertion.demo.insertion import RATE, SETTLING
+from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
-from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
-from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
-from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus
+from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
 
@@ -93,41 +93,30 @@ _NORMAL: Final = 1.96
 def record_aimed(
     bag: Path, logs: Path, show: Show, *, steered: bool, lockstep: bool = True
 ) -> None:
-    """
-    Insert a needle to the target with real nodes and record everything.
-
-    `logs` is the folder of the node output. If not `steered`, the guide rests. Raises `GraphError`
-    if a node fails or stops, or the target depth is not reached in time.
-    """
+    """Insert a needle to the target with real nodes and record everything; steer it or not."""
+    nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
+    nodes['controller'] = {**CONTROLLER, 'steered': steered}
+    nodes['plant'] = PLANT
+    end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
     with Graph(logs) as graph:
         run = SimulatedRun(graph, show, lockstep=lockstep)
-        aim = run.publisher(PointStamped, 'target')
         expected = graph.latest(run.node, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
-        waiting = True
-        end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
 
-        def act(sample: RunSample) -> bool:
-            nonlocal waiting, end
-            if waiting and sample.time >= WARM_UP:
-                waiting = False
-                aim(target_message(sample.stamp, TARGET))
-            if steered and end == inf and _is_done(run.statuses.get('steering'), sample.time):
+        def proceeds(sample: RunSample) -> bool:
+            nonlocal end
+            if end == inf and _is_done(run.states.get('steering'), sample.time):
                 # Stamp of the last tip measurement; time since the first sample.
                 last = nanoseconds(expected.message.header.stamp)
                 end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
-            done = (sample.depth - START) / (TARGET[1] - START)
-            show('inserting', min(max(done, 0.0), 1.0))
             return sample.time < end
 
-        nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
-        nodes['controller'] = {**CONTROLLER, 'steered': steered}
-        nodes['plant'] = PLANT
-        run.record(bag, nodes, act)
+        run.insert(bag, nodes, START, TARGET, proceeds)
 
 
-def _is_done(status: NodeStatus | None, time: float) -> bool:
+def _is_done(state: State | None, time: float) -> bool:
     """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
     phase, rejection = SteeringPhase.INACTIVE, ''
+    status = None if state is None else state.status
     if isinstance(status, SteeringStatus):
         phase, rejection = status.phase, status.last_rejection
         if phase is SteeringPhase.STOPPED:
@@ -183,16 +172,11 @@ def read_aimed(bag: Path) -> Aimed:
 
 
 def aiming_checks(bag: Path, other: Path) -> list[Check]:
-    """
-    Check the miss, the calibration of the expected tip, and the replay of the steered run.
-
-    `other` is the bag of the insertion with a guide at rest.
-    """
+    """Check both misses, the expected tip, and the replay; `other` is with a guide at rest."""
     found = read_aimed(bag)
     off = found.tip - found.expected
     held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
     alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
-    (run,) = verify(bag)
     x, z = 1e3 * found.tip
     return [
         Check(
@@ -208,22 +192,15 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
             alone > LARGEST_MISS,
         ),
         Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
-        Check(
-            'computed again from its bag, steered',
-            'identical or within tolerance',
-            run.verdict,
-            run.verdict != 'differs',
-        ),
+        replay_check(bag, 'steered'),
     ]
 
 
 def draw_aiming(bag: Path, other: Path) -> Figure:
     """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
     needles, path = read_needles(bag)
-    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
-    return draw_needle(
-        [needles[k] for k in at], path, np.array(TARGET), read_needles(other)[0][-1]
-    )
+    (*_, last), _ = read_needles(other)
+    return draw_needle(evenly(needles, _DRAWN), path, np.array(TARGET), last)
 
 
 def animate_aiming(bag: Path) -> Animation:

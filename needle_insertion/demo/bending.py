@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import pi
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from builtin_interfaces.msg import Duration
 from matplotlib.figure import Figure
@@ -19,7 +19,7 @@ from needle_identification import (
 from needle_insertion.demo.insertion import record_insertion
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
-from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.text import Check
 from needle_ros.errors import NeedleError
 import numpy as np
@@ -53,11 +53,7 @@ _DRAWN: Final = 5
 
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
-    """
-    Insert a bending needle with a moving guide and record everything.
-
-    `logs` is the folder of the node output. Raises `GraphError` if a node fails.
-    """
+    """Insert a bending needle with a moving guide and record everything."""
     course = JointTrajectory(
         joint_names=list(JOINTS),
         points=[
@@ -74,7 +70,6 @@ def bending_checks(bag: Path) -> list[Check]:
     truth = bending_length(needle.bending_stiffness, needle.tissue_stiffness)
     (tip, _) = read_needles(bag)
     aside = float(np.hypot(tip[-1][-1, 0], tip[-1][-1, 2]))
-    (run,) = verify(bag)
     found = identify_steering(
         [read_steering_recording(bag)], SteeringSettings(terms=('bevel',), order='together')
     )
@@ -88,12 +83,7 @@ def bending_checks(bag: Path) -> list[Check]:
             f'{1e3 * aside:.2f} mm',
             aside > LEAST_DEFLECTION,
         ),
-        Check(
-            'computed again from its bag, bent needle',
-            'identical or within tolerance',
-            run.verdict,
-            run.verdict != 'differs',
-        ),
+        replay_check(bag, 'bent needle'),
         Check(
             'lambda, bent needle',
             f'{1e3 * truth:.4g} mm within {LARGEST_DISTANCE:g} x 95 %',
@@ -103,23 +93,29 @@ def bending_checks(bag: Path) -> list[Check]:
     ]
 
 
+def replay_check(bag: Path, what: str) -> Check:
+    """Check that the recorded run is computed again with the same values."""
+    (run,) = verify(bag)
+    wanted = 'identical or within tolerance'
+    passed = run.verdict != 'differs'
+    return Check(f'computed again from its bag, {what}', wanted, run.verdict, passed)
+
+
 def draw_bending(bag: Path) -> Figure:
     """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
-    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
-    return draw_needle([needles[k] for k in at], path)
+    return draw_needle(evenly(needles, _DRAWN), path)
 
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
     """
-    Read the published shapes of the needle and the path that it cut.
+    Read the shapes of the needle, each (k, 3) [m], and the path that it cut, (m, 3) [m].
 
-    Returns the needle at successive times, without its straight part outside, each of shape (k, 3)
-    [m], and the path, shape (m, 3) [m]. Raises `NeedleError` if the bag has no needle with a path.
+    The shapes are at successive times, without the straight part of the needle outside.
     """
     needles, path = [], None
     for _, message in read_topic(bag, '/needle_shape'):
-        points = _points(message)
+        points = np.array([(point.x, point.y, point.z) for point in message.points])
         if message.ns == 'path':
             path = points
         else:
@@ -127,7 +123,3 @@ def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
     if path is None or not needles:
         raise NeedleError(f'{bag} holds no needle with a path')
     return needles, path
-
-
-def _points(message: Any) -> FloatArray:
-    return np.array([(point.x, point.y, point.z) for point in message.points])

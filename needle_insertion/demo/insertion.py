@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from geometry_msgs.msg import PointStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message, WARM_UP
+from needle_insertion.graph.simulated_run import SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
 from needle_insertion.report.text import Check
 from needle_ros.timing import seconds
@@ -66,30 +65,22 @@ def record_insertion(
     is the needle of the paper, bent at the start. `course` moves the guide of a steered needle
     from the time of the target on. Raises `GraphError` if a node fails.
     """
+    given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
+    model = {name: value for name, value in given.items() if name.startswith('model.')}
+    nodes = {
+        'controller': {'law': law, 'rate': RATE, 'reference.speed': SPEED, **model},
+        'plant': {'depth': START_DEPTH, 'rate': RATE, **given},
+    }
+    end = WARM_UP + (TARGET_DEPTH - START_DEPTH) / SPEED + SETTLING
     with Graph(logs) as graph:
-        run = SimulatedRun(graph, show, lockstep=lockstep)
-        aim = run.publisher(PointStamped, 'target')
-        move = run.publisher(JointTrajectory, 'joint_trajectory')
-        waiting = True
-
-        def act(sample: RunSample) -> bool:
-            nonlocal waiting
-            if waiting and sample.time >= WARM_UP:
-                waiting = False
-                aim(target_message(sample.stamp, (0.0, TARGET_DEPTH, 0.0)))
-                if course is not None:
-                    move(course)
-            done = (sample.depth - START_DEPTH) / (TARGET_DEPTH - START_DEPTH)
-            show('inserting', min(max(done, 0.0), 1.0))
-            return sample.time < WARM_UP + (TARGET_DEPTH - START_DEPTH) / SPEED + SETTLING
-
-        given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
-        model = {name: value for name, value in given.items() if name.startswith('model.')}
-        nodes = {
-            'controller': {'law': law, 'rate': RATE, 'reference.speed': SPEED, **model},
-            'plant': {'depth': START_DEPTH, 'rate': RATE, **given},
-        }
-        run.record(bag, nodes, act)
+        SimulatedRun(graph, show, lockstep=lockstep).insert(
+            bag,
+            nodes,
+            START_DEPTH,
+            (0.0, TARGET_DEPTH, 0.0),
+            lambda sample: sample.time < end,
+            course,
+        )
 
 
 def read_insertion(law: str, bag: Path) -> RecordedInsertion:

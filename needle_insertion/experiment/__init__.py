@@ -1,1 +1,1 @@
-"""Run the experiments of the paper in a graph of nodes, and compare with the true values."""
+"""Define the experiments of the paper: published values, motions and sampled parameters."""

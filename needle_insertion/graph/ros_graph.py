@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 import gc
@@ -152,23 +152,11 @@ class Graph:
 
     def wait_for(self, node: Node, name: str) -> None:
         """Wait until a node of the suite answers a node of this process with all its clients."""
-        if name in self._life_cycles:
-            return
-        self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
-        probe = node.create_client(GetState, f'{name}/get_state')
-        self.spin_until(probe.service_is_ready, f'the node {name}', _START)
-        # A response to a client that the server has not discovered is lost. Clients are discovered
-        # in the order of their creation: once the last has a response, all will.
-        answers: list[Future] = []
-        start = time.monotonic()
-
-        def answered() -> bool:
-            if time.monotonic() - start >= len(answers):
-                answers.append(probe.call_async(GetState.Request()))
-            return any(answer.done() for answer in answers)
-
-        self.spin_until(answered, f'the answer of {name}', _START)
-        node.destroy_client(probe)
+        if name not in self._life_cycles:
+            # Clients are discovered in the order of their creation: once the last has a response,
+            # all will.
+            self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
+            self._ask_state(node, name, f'the answer of {name}', 1.0)
 
     def wait_active(
         self, node: Node, name: str, show: Callable[[str], object] = lambda _name: None
@@ -176,21 +164,32 @@ class Graph:
         """Wait until a node with automatic start is active; call `show` with its name."""
         show(name)
         self.wait_for(node, name)
+        what, active = f'the activation of {name}', (State.PRIMARY_STATE_ACTIVE,)
+        self._ask_state(node, name, what, _ASK, active, lambda: show(name))
+
+    def _ask_state(
+        self,
+        node: Node,
+        name: str,
+        what: str,
+        period: float,
+        states: Container[int] = range(256),
+        show: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Ask a node for its state in a period [s], until an answer is one of `states`."""
         client = node.create_client(GetState, f'{name}/get_state')
         self.spin_until(client.service_is_ready, f'the node {name}', _START)
-        answer = client.call_async(GetState.Request())
-        sent = time.monotonic()
+        # A response to a client that the server has not discovered is lost.
+        answers: list[Future] = []
+        start = time.monotonic()
 
-        def active() -> bool:
-            nonlocal answer, sent
-            show(name)
-            if answer.done() and answer.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
-                return True
-            if time.monotonic() - sent > _ASK:
-                answer, sent = client.call_async(GetState.Request()), time.monotonic()
-            return False
+        def answered() -> bool:
+            show()
+            if time.monotonic() - start >= period * len(answers):
+                answers.append(client.call_async(GetState.Request()))
+            return any(one.done() and one.result().current_state.id in states for one in answers)
 
-        self.spin_until(active, f'the activation of {name}', _START)
+        self.spin_until(answered, what, _START)
         node.destroy_client(client)
 
     def change(self, node: Node, name: str, *transitions: int) -> None:

@@ -6,16 +6,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_identification.recorder_node import is_hidden
-from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.messages import listen_states, State, target_message
+from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
 from needle_insertion.progress import Show
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, profile, SENSOR
-from needle_ros.contract import ENTRY
-from needle_ros.status import NodeStatus, PlantStatus, read_status
+from needle_ros.status import PlantStatus
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader
 from rclpy.duration import Duration
@@ -23,6 +22,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory
 
 #: Time before the target is sent, until all sensors have reported [s].
 WARM_UP: Final = 0.1
@@ -46,15 +46,6 @@ class RunSample(NamedTuple):
     time: float
     #: Insertion depth [m].
     depth: float
-
-
-def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
-    """Return a target x, y, z [m] with a stamp [ns]."""
-    message = PointStamped()
-    message.header.frame_id = ENTRY
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
-    message.point.x, message.point.y, message.point.z = point
-    return message
 
 
 class Witness:
@@ -107,23 +98,102 @@ class Witness:
             self._processed.publish(message)
 
 
+def start_nodes(
+    graph: Graph,
+    node: Node,
+    nodes: Mapping[str, Mapping[str, object]],
+    show: Callable[[str], object],
+    file: Path | None = None,
+    *,
+    lockstep: bool,
+) -> list[NodeProcess]:
+    """
+    Start nodes with their parameters, and wait until all except the plant are active.
+
+    `file` is the parameter file of all nodes except the recorder. See `activate_plant`.
+    """
+    processes = []
+    for name, parameters in nodes.items():
+        own: dict[str, object] = {}
+        if name == 'plant':
+            own = {'autostart': False, 'lockstep': lockstep}
+        elif name != 'recorder' and lockstep:
+            own = {'use_sim_time': True}
+        used = None if name == 'recorder' else file
+        processes.append(graph.start(name, {**parameters, **own}, used))
+    for name in nodes:
+        if name != 'plant':
+            graph.wait_active(node, name, show)
+    return processes
+
+
+def activate_plant(
+    graph: Graph,
+    node: Node,
+    states: Mapping[str, State],
+    number: int,
+    what: str = 'the nodes in lock-step',
+    ready: Callable[[], bool] = lambda: True,
+) -> None:
+    """Activate the plant when `ready`, and the plant has discovered the nodes in lock-step."""
+    graph.change(node, 'plant', CONFIGURE)
+
+    def found() -> bool:
+        status = states['plant'].status if 'plant' in states else None
+        in_lockstep = isinstance(status, PlantStatus) and status.lockstep_nodes == number
+        return in_lockstep and ready()
+
+    graph.spin_until(found, what)
+    graph.change(node, 'plant', ACTIVATE)
+
+
 class SimulatedRun:
     """
-    Start nodes and a plant, act at samples of the plant, and record everything.
+    Start nodes and a plant, send a target, and record everything.
 
     In lock-step the plant waits at each sample until the action is complete and all its messages
-    have arrived: a message arrives at the same sample on any machine.
+    have arrived: a message arrives at the same sample on any machine. `states` has the latest
+    state of each node by its name.
     """
 
     def __init__(self, graph: Graph, show: Show, *, lockstep: bool = True) -> None:
         self._graph, self._show, self._lockstep = graph, show, lockstep
-        self.node = node = graph.node('demo')
-        #: Latest status and message of each node by its name.
-        self.statuses: dict[str, NodeStatus] = {}
-        self._messages: dict[str, str] = {}
-        node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, self._hear, 10)
+        self.node = graph.node('demo')
+        self.states = listen_states(self.node)
 
-    def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
+    def insert(
+        self,
+        bag: Path,
+        nodes: Mapping[str, Mapping[str, object]],
+        start: float,
+        target: tuple[float, float, float],
+        proceeds: Callable[[RunSample], bool],
+        motion: JointTrajectory | None = None,
+    ) -> None:
+        """
+        Insert from a depth to a target [m], and record until `proceeds` returns False.
+
+        `nodes` are the parameters of the nodes, the plant last; `motion` is published with the
+        target.
+        """
+        aim = self._publisher(PointStamped, contract.TARGET.name)
+        move = self._publisher(JointTrajectory, contract.JOINT_TRAJECTORY.name) if motion else None
+        waiting = True
+
+        def act(sample: RunSample) -> bool:
+            nonlocal waiting
+            if waiting and sample.time >= WARM_UP:
+                waiting = False
+                aim(target_message(sample.stamp, target))
+                if move is not None:
+                    move(motion)
+            done = (sample.depth - start) / (target[1] - start)
+            self._show('inserting', min(max(done, 0.0), 1.0))
+            return proceeds(sample)
+
+        self._record(bag, nodes, act)
+
+    def _publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
         """Create a publisher; return a function that publishes and waits for all subscribers."""
         publisher = self.node.create_publisher(kind, topic, COMMAND)
 
@@ -134,36 +204,27 @@ class SimulatedRun:
 
         return publish
 
-    def record(
+    def _record(
         self,
         bag: Path,
         nodes: Mapping[str, Mapping[str, object]],
         act: Callable[[RunSample], bool],
     ) -> None:
-        """Record the nodes, the plant last, until `act`, called at each sample, returns False."""
+        """Record the nodes until `act`, called at each sample of the plant, returns False."""
         graph, node = self._graph, self.node
         witness = Witness(node, act, lockstep=self._lockstep)
-        started = [graph.start('recorder', {'path': str(bag)})]
-        time = {'use_sim_time': True} if self._lockstep else {}
-        for name, parameters in nodes.items():
-            own = {'autostart': False, 'lockstep': self._lockstep} if name == 'plant' else time
-            started.append(graph.start(name, {**parameters, **own}))
-        for one in started[:-1]:
-            graph.wait_active(node, one.name, self._show_start)
+        recorded = {'recorder': {'path': str(bag)}, **nodes}
+        started = start_nodes(graph, node, recorded, self._show_start, lockstep=self._lockstep)
         self._show('starting plant')
-        graph.change(node, 'plant', CONFIGURE)
         # The bag must contain every sample, and lock-step must include all nodes.
-        participants = self._lockstep * (2 + ('steering' in nodes))
-
-        def in_lockstep() -> bool:
-            plant = self.statuses.get('plant')
-            return isinstance(plant, PlantStatus) and plant.lockstep_nodes == participants
-
-        graph.spin_until(
-            lambda: witness.is_matched and self._is_recorded() and in_lockstep(),
+        activate_plant(
+            graph,
+            node,
+            self.states,
+            self._lockstep * (2 + ('steering' in nodes)),
             'the recorder and the nodes in lock-step',
+            lambda: witness.is_matched and self._is_recorded(),
         )
-        graph.change(node, 'plant', ACTIVATE)
         graph.spin_until(
             lambda: witness.ended,
             'the next sample',
@@ -176,7 +237,7 @@ class SimulatedRun:
 
     def _show_start(self, name: str) -> None:
         """Show the starting node and its status."""
-        said = self._messages.get(name, '')
+        said = self.states[name].message if name in self.states else ''
         self._show(f'starting {name}' + (f': {said}' if said else ''))
 
     def _is_recorded(self) -> bool:
@@ -187,11 +248,3 @@ class SimulatedRun:
             for topic, _ in node.get_topic_names_and_types()
             if node.count_publishers(topic) and not is_hidden(topic)
         )
-
-    def _hear(self, array: DiagnosticArray) -> None:
-        for status in array.status:
-            name = status.name.rpartition('/')[2]
-            self._messages[name] = status.message
-            found = read_status({one.key: one.value for one in status.values})
-            if found is not None:
-                self.statuses[name] = found

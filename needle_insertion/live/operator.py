@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from time import monotonic
 from typing import Any, Final, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from needle_insertion.live.requests import CONTROLLER, Request, REQUESTS, STEERING
+from needle_insertion.graph.messages import listen_states, State, target_message
+from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
-from needle_ros.requests import no_answer, PendingRequest, RequestStatus
-from needle_ros.status import NodeStatus, read_status
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.requests import no_answer, PendingRequest
+from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -31,25 +29,6 @@ _DISCOVERY: Final = 1.0
 
 #: Period of the checks for answers to a target [s].
 _CHECK: Final = 0.1
-
-
-class State(NamedTuple):
-    """Latest status of a node on /diagnostics."""
-
-    #: 0 OK, 1 warning, 2 error.
-    level: int
-    message: str
-    #: Typed status of a node of the suite.
-    status: NodeStatus | None
-    #: Requests that the node accepts, and its answers.
-    requests: RequestStatus
-    #: Time of receipt by `time.monotonic` [s].
-    heard: float
-
-    @property
-    def age(self) -> float:
-        """Time since receipt [s]; the node publishes every second."""
-        return monotonic() - self.heard
 
 
 class RequestOutcome(NamedTuple):
@@ -74,7 +53,6 @@ class Operator:
         self._sending: list[tuple[PendingRequest, PointStamped]] = []
         #: Stamp of the latest target [ns].
         self._stamp = 0
-        self.states: dict[str, State] = {}
         self._target = node.create_publisher(
             PointStamped, contract.TARGET.name, profile(contract.TARGET.qos)
         )
@@ -83,12 +61,7 @@ class Operator:
             for request in requests:
                 kind = Trigger if request.data is None else SetBool
                 self._client(kind, request.node, request.service)
-        node.create_subscription(
-            DiagnosticArray,
-            contract.DIAGNOSTICS.name,
-            self._hear,
-            profile(contract.DIAGNOSTICS.qos),
-        )
+        self.states = listen_states(node, self._hear)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_CHECK, self._repeat, clock=steady)
 
@@ -98,20 +71,9 @@ class Operator:
             self._clients[node, service] = client
         return self._clients[node, service]
 
-    def _hear(self, array: DiagnosticArray) -> None:
-        for status in array.status:
-            name = printable(status.name.rpartition('/')[2])
-            values = {printable(one.key): printable(one.value) for one in status.values}
-            self.states[name] = state = State(
-                # rclpy represents a byte as bytes.
-                int.from_bytes(status.level, 'little'),
-                printable(status.message),
-                read_status(values),
-                RequestStatus.from_values(values),
-                monotonic(),
-            )
-            for pending, _ in self._sending:
-                pending.hear(name, state.requests)
+    def _hear(self, name: str, state: State) -> None:
+        for pending, _ in self._sending:
+            pending.hear(name, state.requests)
 
     def _repeat(self) -> None:
         """Repeat targets without an answer; use simulated time if it is published."""
@@ -133,31 +95,25 @@ class Operator:
 
         Without the node `steering` only the depth y is used.
         """
-        message = PointStamped()
-        message.header.frame_id = contract.ENTRY
         stamp = nanoseconds(request_stamp(self._node))
         # A stamp identifies the request: simulated time may stand still.
         self._stamp = max(stamp, self._stamp + 1) if stamp else 0
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._stamp, NANOSECONDS)
-        message.point.x, message.point.y, message.point.z = x, y, z
+        message = target_message(self._stamp, (x, y, z))
         pending = PendingRequest(contract.TARGET, self._stamp, self.aims)
         self._sending.append((pending, message))
         self._target.publish(message)
         return pending
 
     def ask(self, word: str) -> Future:
-        """
-        Call the services of a key of `REQUESTS`; the result of the future is an `RequestOutcome`.
-
-        The future is done at once if no node offers the service.
-        """
+        """Call the services of a key of `REQUESTS`; the future has a `RequestOutcome`."""
         ready = [
             (request, client)
             for request in REQUESTS[word]
             if (client := self._clients[request.node, request.service]).service_is_ready()
         ]
         if not ready:
-            return _done(RequestOutcome(False, f'no node offers {_names(REQUESTS[word])}'))
+            services = ' or '.join(f'{one.node}/{one.service}' for one in REQUESTS[word])
+            return _done(RequestOutcome(False, f'no node offers {services}'))
         return _gathered(
             {
                 f'{request.node}/{request.service}': self._calls.call(
@@ -172,11 +128,7 @@ class Operator:
         )
 
     def set(self, node: str, name: str, value: Any) -> Future:
-        """
-        Set a parameter of a node; the result of the future is an `RequestOutcome`.
-
-        The future is done at once if there is no such node.
-        """
+        """Set a parameter of a node; the future has a `RequestOutcome`."""
         client = self._client(SetParameters, node, 'set_parameters')
         # A new client has not discovered the service yet.
         if not client.wait_for_service(timeout_sec=_DISCOVERY):
@@ -190,10 +142,6 @@ class Operator:
         request = SetParameters.Request(parameters=[parameter])
         service = f'{node}/set_parameters'
         return _gathered({service: self._calls.call(client, request)}, read)
-
-
-def _names(requests: tuple[Request, ...]) -> str:
-    return ' or '.join(f'{request.node}/{request.service}' for request in requests)
 
 
 def _done(outcome: RequestOutcome) -> Future:

@@ -11,8 +11,14 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_insertion.graph.node_process import GraphError, NodeProcess
-from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.graph.simulated_run import RunSample, WARM_UP, Witness
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.simulated_run import (
+    activate_plant,
+    RunSample,
+    start_nodes,
+    WARM_UP,
+    Witness,
+)
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
@@ -21,7 +27,6 @@ from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
-from needle_ros.status import PlantStatus
 from rclpy.node import Node
 
 #: Folder of the parameter files, below the prefix of pip or colcon.
@@ -56,45 +61,31 @@ def config_file(name: str) -> Path:
 class Session:
     """Nodes, parameters and folders of `needle run`."""
 
-    #: Parameters by node: `controller`, and optionally `plant` and `steering`.
+    #: Parameters by node, in the order of their start: `controller`, and optionally `recorder`,
+    #: `plant` and `steering`.
     nodes: Mapping[str, Mapping[str, Any]]
     #: ROS parameter file of all nodes; `nodes` overrides it.
     file: Path
-    #: Folder of the recording, ``bag``, and of the node output, ``logs``.
-    folder: Path
-    records: bool
+    #: Folder of the node output.
+    logs: Path
     #: Whether the plant runs in lock-step, and the nodes in its time.
     lockstep: bool = False
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the nodes, in the order of their start."""
-        return ['recorder'] * self.records + list(self.nodes)
-
-    @property
-    def bag(self) -> Path:
-        """Folder of the recording."""
-        return self.folder / 'bag'
-
 
 def run(session: Session) -> int:
-    """
-    Start the nodes, execute the commands of a person or a script, and end the nodes; return 0.
-
-    Raises `NeedleError` if a node fails, or a command of a script fails.
-    """
+    """Start the nodes, execute the commands of a person or a script, and end the nodes."""
     screen = Screen()
-    with Graph(session.folder / 'logs', shared=True) as graph:
+    with Graph(session.logs, shared=True) as graph:
         node = graph.node('operator')
         operator = Operator(node)
         readings = Readings(Node('readings', context=graph.context))
-        screen.say(f'starting {", ".join(session.names)}')
+        screen.say(f'starting {", ".join(session.nodes)}')
         # The first commands of a script are always executed at the same sample.
         holds = session.lockstep and not screen.typed
         witness = Witness(node, _warms_up, lockstep=True) if holds else None
         processes = _bring_up(session, graph, node, operator, screen, holds=holds)
         terminal = Terminal(graph, operator, readings, screen)
-        terminal.begin(session.names)
+        terminal.begin(session.nodes)
         screen.say(f'on domain {graph.domain}; `help` lists the words')
         with screen.reading():
             _converse(terminal, screen, processes, witness)
@@ -103,8 +94,8 @@ def run(session: Session) -> int:
             for process in processes:
                 if process.name == name:
                     process.interrupt()
-    if session.records:
-        screen.say(f'recorded to {session.bag}')
+    if 'recorder' in session.nodes:
+        screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
     return 0
 
 
@@ -123,26 +114,16 @@ def _bring_up(
     holds: bool,
 ) -> list[NodeProcess]:
     """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
-    processes, begin = [], monotonic()
-    for name in session.names:
-        parameters = dict(session.nodes.get(name, {}))
-        if name == 'recorder':
-            processes.append(graph.start(name, {'path': str(session.bag)}))
-            continue
-        if name == 'plant':
-            parameters |= {'autostart': False, 'lockstep': session.lockstep}
-        elif session.lockstep:
-            parameters['use_sim_time'] = True
-        processes.append(graph.start(name, parameters, session.file))
+    begin = monotonic()
 
     def show(name: str) -> None:
         said = operator.states[name].message if name in operator.states else ''
         screen.show(f'starting {name}, {monotonic() - begin:.0f} s' + (said and f': {said}'))
 
-    for process in processes:
-        if process.name != 'plant':
-            graph.wait_active(node, process.name, show)
-    own = 'plant' in session.names
+    processes = start_nodes(
+        graph, node, session.nodes, show, session.file, lockstep=session.lockstep
+    )
+    own = 'plant' in session.nodes
 
     def count(topic: Topic) -> int:
         return node.count_subscribers(topic.name)
@@ -157,8 +138,9 @@ def _bring_up(
     _check_alone(graph, node)
     if own:
         show('plant')
-        number = session.lockstep * (holds + session.records + ('steering' in session.names))
-        _begin_plant(graph, node, operator, number)
+        followers = [name for name in session.nodes if name in ('recorder', 'steering')]
+        number = session.lockstep * (holds + len(followers))
+        activate_plant(graph, node, operator.states, number)
     return processes
 
 
@@ -173,19 +155,6 @@ def _check_alone(graph: Graph, node: Node) -> None:
                 f'{number} nodes publish {topic.name} on domain {graph.domain}: another {there} '
                 f'is running. End it, or choose another {DOMAIN}'
             )
-
-
-def _begin_plant(graph: Graph, node: Node, operator: Operator, number: int) -> None:
-    """Activate the plant once it has discovered the nodes in lock-step."""
-    graph.change(node, 'plant', CONFIGURE)
-
-    def found() -> bool:
-        state = operator.states.get('plant')
-        status = None if state is None else state.status
-        return isinstance(status, PlantStatus) and status.lockstep_nodes == number
-
-    graph.spin_until(found, 'the nodes in lock-step')
-    graph.change(node, 'plant', ACTIVATE)
 
 
 def _converse(

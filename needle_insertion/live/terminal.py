@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from math import inf, isfinite
 import re
 import shlex
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final
 
 from needle_controller import LAWS
+from needle_insertion.graph.messages import State
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.live.operator import Operator, RequestOutcome, State
+from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.requests import CONTROLLER, STEERING
 from needle_insertion.live.screen import Screen
@@ -50,29 +51,23 @@ _ERROR: Final = _LEVELS.index('ERROR')
 #: Phases in which no insertion is under way.
 _AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE)
 
-
-class _Word(NamedTuple):
-    """Arguments and description of a command."""
-
-    takes: str
-    meaning: str
-
-
+#: Arguments and description of each command.
 WORDS: Final = {
-    'target': _Word(
-        'DEPTH | X Y Z', 'insert to a depth, or steer the tip to a point: 0.05 or 50mm [m]'
+    'target': (
+        'DEPTH | X Y Z',
+        'insert to a depth, or steer the tip to a point: 0.05 or 50mm [m]',
     ),
-    'wait': _Word('[SECONDS]', 'wait until the needle is at its target'),
-    'pause': _Word('', 'brake to rest and hold'),
-    'resume': _Word('', 'continue after a pause'),
-    'retract': _Word('', 'withdraw to retract_depth'),
-    'stop': _Word('', 'stop and command zero force, until `clear`'),
-    'clear': _Word('', 'clear a stop'),
-    'law': _Word('NAME', f'change the control law: {", ".join(LAWS)}'),
-    'set': _Word('NODE NAME VALUE', 'set a parameter, such as controller retract_depth 0.02'),
-    'status': _Word('', 'position of the needle, and state of the nodes'),
-    'help': _Word('', 'this list'),
-    'quit': _Word('', 'end the nodes and complete the recording'),
+    'wait': ('[SECONDS]', 'wait until the needle is at its target'),
+    'pause': ('', 'brake to rest and hold'),
+    'resume': ('', 'continue after a pause'),
+    'retract': ('', 'withdraw to retract_depth'),
+    'stop': ('', 'stop and command zero force, until `clear`'),
+    'clear': ('', 'clear a stop'),
+    'law': ('NAME', f'change the control law: {", ".join(LAWS)}'),
+    'set': ('NODE NAME VALUE', 'set a parameter, such as controller retract_depth 0.02'),
+    'status': ('', 'position of the needle, and state of the nodes'),
+    'help': ('', 'this list'),
+    'quit': ('', 'end the nodes and complete the recording'),
 }
 
 
@@ -93,7 +88,7 @@ class Terminal:
         #: Whether the latest motion is a steered insertion.
         self._steers = False
 
-    def begin(self, nodes: Sequence[str]) -> None:
+    def begin(self, nodes: Collection[str]) -> None:
         """
         Wait until all nodes report their state, and controller and steering have measurements.
 
@@ -119,12 +114,7 @@ class Terminal:
         return self._screen.take()
 
     def do(self, line: str) -> bool:
-        """
-        Execute a command, where ``#`` begins a comment; return whether another may follow.
-
-        Raises `ParameterError` if the line is invalid, and `JobError` if a node rejects the
-        command or does not answer.
-        """
+        """Execute a command, where ``#`` begins a comment; return whether another may follow."""
         try:
             words = shlex.split(line, comments=True)
         except ValueError as error:
@@ -139,14 +129,15 @@ class Terminal:
             near = get_close_matches(word, WORDS, 1)
             meant = f'; did you mean {near[0]}?' if near else ''
             raise ParameterError(f'unknown word {word!r}{meant} Valid are {", ".join(WORDS)}')
-        if WORDS[word].takes:
+        takes, _ = WORDS[word]
+        if takes:
             getattr(self, f'_{word}')(*rest)
         elif rest:
             raise _unfit(word, rest)
         elif word == 'quit':
             return False
         elif word == 'help':
-            rows = [(f'{name} {one.takes}', one.meaning) for name, one in WORDS.items()]
+            rows = [(f'{name} {given}', meaning) for name, (given, meaning) in WORDS.items()]
             self._say(table(rows, ('word', 'effect')))
         elif word == 'status':
             self._status()
@@ -276,8 +267,8 @@ class Terminal:
 
 
 def _unfit(word: str, given: Sequence[str]) -> ParameterError:
-    takes = WORDS[word].takes or 'nothing'
-    return ParameterError(f'{word} takes {takes}, got {" ".join(given) or "nothing"}')
+    takes, _ = WORDS[word]
+    return ParameterError(f'{word} takes {takes or "nothing"}, got {" ".join(given) or "nothing"}')
 
 
 def _length(word: str) -> float:

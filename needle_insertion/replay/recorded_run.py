@@ -116,20 +116,11 @@ def _trajectory(message: Any) -> Event:
 
 
 class Rows(NamedTuple):
-    """
-    Messages of a topic, sorted by sample number.
-
-    Attributes
-    ----------
-    numbers, stamps : ndarray, shape (n,)
-        Sample numbers, from 1, and stamps [ns].
-    values : ndarray, shape (n, k)
-        Values of the messages, nan for values that an older version did not publish.
-
-    """
+    """Messages of a topic, sorted by sample number, from 1, with stamps [ns], shape (n,)."""
 
     numbers: NDArray[np.int64]
     stamps: NDArray[np.int64]
+    #: Shape (n, k), nan for values that an older version did not publish.
     values: FloatArray
 
 
@@ -138,29 +129,6 @@ class RecordedRun:
     Run of a plant as recorded in a bag.
 
     Raises `RecordingError` if a parameter is missing or not valid, or measurements are missing.
-
-    Attributes
-    ----------
-    values : dict
-        Parameters at the start, by name.
-    constants : PlantConstants
-        Constants at the start.
-    topics : dict
-        Topics of the plant by full name.
-    rows : dict
-        Recorded messages by topic.
-    numbers : list of int
-        Numbers of the samples with recorded messages.
-    events : dict
-        Events by the number of the first affected sample.
-    commands : dict
-        Stamp [ns], frame, force [N] and torque [N m] of commands, by the number of the last
-        sample before their arrival.
-    notes : list of str
-        Faults of the bag, and missing topics.
-    faults : str
-        Enabled faults, '' for none.
-
     """
 
     def __init__(
@@ -171,6 +139,7 @@ class RecordedRun:
         configurations = _configurations(messages[f'{name}/configuration'])
         said = _events(messages.get(f'{name}/events', []))
         made = (event.content for _, _, event in said if event.kind == CONFIGURED)
+        #: Parameters and constants at the start, and topics by full name.
         self.values = {**_UNLIMITED, **next(made, configurations[0][1])}
         lacking = next((name for name in _NEEDED if name not in self.values), None)
         if lacking:
@@ -190,9 +159,12 @@ class RecordedRun:
         self.numbers = sorted({number for _, number in self._arrivals})
         trajectories = messages.get(f'{space}/joint_trajectory', [])
         done = [(number, event) for _, number, event in said]
+        #: Events by the number of the first affected sample.
         self.events: dict[int, list[Event]] = defaultdict(list)
         for number, event in done or self._guessed(configurations, trajectories):
             self.events[number].append(event)
+        #: Stamp [ns], frame, force [N] and torque [N m] of commands, by the number of the last
+        #: sample before their arrival.
         self.commands: dict[int, list[tuple[int, str, float, float]]] = defaultdict(list)
         for received, (stamp, frame, _, (values,)) in messages.get(f'{space}/wrench_command', []):
             number = self._number(stamp) if stamp else self._newest(received)

@@ -48,30 +48,18 @@ _WORDS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TopicComparison:
-    """
-    Comparison of a recorded topic with the recomputed topic.
+    """Comparison of a recorded topic with the recomputed topic."""
 
-    Attributes
-    ----------
-    compared, differing : int
-        Number of compared messages, and of messages beyond the tolerance.
-    largest : float
-        Largest difference, relative to the accepted difference.
-    difference : float
-        Largest difference in its unit.
-    quantity, unit : str
-        Quantity of the largest difference, '' if there is no difference.
-    first : dict or None
-        First difference beyond the tolerance.
-
-    """
-
+    #: Number of compared messages, and of messages beyond the tolerance.
     compared: int
     differing: int
+    #: Largest difference, relative to the accepted difference, and in its unit.
     largest: float
     difference: float
+    #: Of the largest difference, '' if there is no difference.
     quantity: str
     unit: str
+    #: First difference beyond the tolerance.
     first: dict[str, Any] | None
 
     @property
@@ -83,26 +71,11 @@ class TopicComparison:
 
 
 class Rerun:
-    """
-    Recomputation of a recorded run.
-
-    Attributes
-    ----------
-    recorded : RecordedRun
-        Recorded run.
-    topics : dict
-        `TopicComparison` of each topic.
-    first : dict or None
-        First difference beyond the tolerance.
-    reason : str
-        Probable reason of a difference, '' without difference.
-    notes : list of str
-        Events, faults of the bag, and missing information.
-
-    """
+    """Recomputation of a recorded run, its first difference, and the probable reason of it."""
 
     def __init__(self, recorded: RecordedRun, tolerance: float) -> None:
         self.recorded = recorded
+        #: Events, faults of the bag, and missing information.
         self.notes = [*recorded.notes]
         #: Reason for which the recomputed plant stopped.
         self._halted = ''

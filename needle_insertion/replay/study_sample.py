@@ -13,11 +13,7 @@ import numpy as np
 
 
 def replay_sample(results: Results, number: int, bag: Path) -> bool:
-    """
-    Record a sample to a bag; return whether there was a table to compare with.
-
-    Raises `ParameterError` if there is no such sample, and `JobError` if the table differs.
-    """
+    """Record a sample to a bag; return whether it was compared with a table of the study."""
     study = results.study
     if not 0 <= number < study.samples:
         raise ParameterError(

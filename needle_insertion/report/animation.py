@@ -25,22 +25,12 @@ _DRAWN: Final = ('time', 'needle', 'shape', 'target', 'expected', 'tip', 'depth'
 
 @dataclass(frozen=True, eq=False)
 class Animation:
-    """
-    Animation of a needle from frames.
-
-    Attributes
-    ----------
-    caption : str
-        Text below the animation.
-    scene : mapping
-        Tissue and limits, from `needle_insertion.watch.scene.scene`.
-    frames : sequence of mapping
-        Frames of `needle_insertion.watch.view.View.frame`, each with a needle.
-
-    """
+    """Animation of a needle from frames."""
 
     caption: str
+    #: From `needle_insertion.watch.scene.scene`.
     scene: Mapping[str, Any]
+    #: Frames of `needle_insertion.watch.view.View.frame`, each with a needle.
     frames: Sequence[Mapping[str, Any]]
 
     @property

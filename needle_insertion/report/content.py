@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
+import csv
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
+from io import BytesIO, StringIO
 from typing import TYPE_CHECKING
+
+from needle_dynamics.arrays import FloatArray
 
 if TYPE_CHECKING:
     # Takes half a second to import; only pictures need it.
@@ -20,27 +24,24 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
+def csv_table(heads: Sequence[str], rows: FloatArray) -> bytes:
+    """Return rows of numbers, shape (n, columns), as a CSV file."""
+    text = StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(heads)
+    writer.writerows(rows.tolist())
+    return text.getvalue().encode()
+
+
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """
-    Figure with caption.
+    """Figure with caption."""
 
-    Attributes
-    ----------
-    name : str
-        File name of the PNG next to the page, without extension.
-    caption : str
-        Text below the figure.
-    figure : Figure
-        The figure.
-    description : str
-        Alternative text for screen readers; default: the caption.
-
-    """
-
+    #: File name of the PNG next to the page, without extension.
     name: str
     caption: str
     figure: Figure
+    #: Alternative text for screen readers; default: the caption.
     description: str = ''
 
     @cached_property

@@ -56,19 +56,7 @@ _PANELS: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatingPoint:
-    """
-    Analysis at an operating point.
-
-    Attributes
-    ----------
-    depth, deflection, speed, force : float
-        Insertion depth [m], tip deflection [m], insertion velocity [m/s] and force [N].
-    system : LinearSystem
-        Linearized model.
-    result : Analysis
-        Controllability and observability.
-
-    """
+    """Analysis at an insertion depth [m], tip deflection [m], velocity [m/s] and force [N]."""
 
     depth: float
     deflection: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 import re
 from typing import Any, Final
@@ -10,8 +10,9 @@ from typing import Any, Final
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification import (
+    Fit,
     FrictionEstimate,
     LevelEstimate,
     ParameterEstimate,
@@ -26,9 +27,6 @@ import numpy as np
 #: Colors: insertion and results, withdrawal, data, pale data, fits.
 _IN, _OUT, _DATA, _LIGHT, _FIT = '#1f5fa8', '#c25a00', '#8b95a1', '#c3cad2', '#111111'
 
-#: Directions of motion: sign, label, color and marker.
-_SIDES: Final = ((1.0, 'insertion', _IN, 'o'), (-1.0, 'withdrawal', _OUT, '^'))
-
 #: Largest number of drawn points of a line, in large and small plots.
 _MOST_POINTS: Final = 8000
 _MOST_SMALL: Final = 300
@@ -37,10 +35,16 @@ _SYMBOL: Final = re.compile(r'\b(mu|k|f)_(\w{1,3})\b')
 _GREEK: Final = {'mu': r'\mu'}
 
 
+def _sides(fit: Fit) -> Iterator[tuple[BoolArray, str, str, str]]:
+    """Yield used samples, label, color and marker of each direction of motion."""
+    yield fit.used & (fit.speed > 0.0), 'insertion', _IN, 'o'
+    yield fit.used & (fit.speed < 0.0), 'withdrawal', _OUT, '^'
+
+
 def friction_data(estimate: FrictionEstimate) -> Figure:
     """Draw the filtered force over time and against velocity, with the fit."""
     fit = estimate.fit
-    figure = _new_figure(9.0, 7.5)
+    figure = Figure(figsize=(9.0, 7.5), layout='constrained')
     above, below = figure.subplots(2, 1)
     time, force = _thinned(fit.time - fit.time[0], fit.force)
     above.plot(time, force, color=_LIGHT, linewidth=3.0, label='measured, filtered')
@@ -48,13 +52,13 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
     above.plot(*_thinned(fit.time - fit.time[0], model), color=_FIT, linewidth=1.2, label='fit')
     _label(above, 'time [s]', 'force on the needle [N]')
     _legend_above(above)
-    for sign, words, color, mark in _SIDES:
-        side = fit.used & (np.sign(fit.speed) == sign)
+    for side, words, color, mark in _sides(fit):
         speed, force = _thinned(1e3 * fit.speed[side], fit.force[side])
         below.plot(speed, force, mark, color=color, markersize=2.5, alpha=0.4, label=words)
         order = np.argsort(fit.speed[side])
         line = _thinned(1e3 * fit.speed[side][order], fit.model[side][order])
-        below.plot(*line, color=_FIT, linewidth=1.2, label='fit' if sign < 0.0 else None)
+        label = 'fit' if words == 'withdrawal' else None
+        below.plot(*line, color=_FIT, linewidth=1.2, label=label)
     below.axhline(0.0, color=_FIT, linewidth=0.6)
     below.axvline(0.0, color=_FIT, linewidth=0.6)
     _label(below, 'insertion velocity [mm/s]', 'force on the needle [N]')
@@ -65,13 +69,12 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
 def friction_residuals(estimate: FrictionEstimate) -> Figure:
     """Draw the residual over time, against velocity, and as a histogram."""
     fit = estimate.fit
-    figure = _new_figure(9.0, 6.5)
+    figure = Figure(figsize=(9.0, 6.5), layout='constrained')
     over, against, often = figure.subplot_mosaic([['time', 'time'], ['speed', 'size']]).values()
     residual = 1e3 * (fit.force - fit.model)
     reach = float(np.abs(residual[fit.used]).max())
     edges = np.linspace(-reach, reach, 41).tolist()
-    for sign, words, color, mark in _SIDES:
-        side = fit.used & (np.sign(fit.speed) == sign)
+    for side, words, color, mark in _sides(fit):
         time, speed, left = _thinned(
             fit.time[side] - fit.time[0], 1e3 * fit.speed[side], residual[side]
         )
@@ -98,8 +101,7 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
     )
     for axes, estimate in zip(panels, estimates, strict=True):
         fit = estimate.fit
-        for sign, words, color, mark in _SIDES:
-            side = fit.used & (np.sign(fit.speed) == sign)
+        for side, words, color, mark in _sides(fit):
             order = np.argsort(fit.speed[side])
             speed, force, model = (
                 _thinned(values[side][order], most=_MOST_SMALL)[0]
@@ -121,18 +123,25 @@ def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str])
 
 def _small_multiples(names: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list[Axes]]:
     """Return a figure with a small plot for each name, in rows, with shared axes."""
-    count = len(names)
-    columns = min(count, 5)
-    lines = -(-count // columns)
-    figure = _new_figure(9.0, 0.6 + 1.7 * lines)
-    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
-    for axes in panels.flat[count:]:
-        axes.set_visible(False)
-    for axes, name in zip(panels.flat, names, strict=False):
+    figure, panels = _panels(len(names), 5, 0.6, 1.7, sharex=True)
+    for axes, name in zip(panels, names, strict=True):
         axes.set_title(name, fontsize='small')
         _label(axes, '', '')
     figure.supxlabel(xlabel)
     figure.supylabel(ylabel)
+    return figure, panels
+
+
+def _panels(
+    count: int, most: int, margin: float, height: float, *, sharex: bool
+) -> tuple[Figure, list[Any]]:
+    """Return a figure with plots in rows of at most `most`, with heights and a margin [in]."""
+    columns = min(count, most)
+    lines = -(-count // columns)
+    figure = Figure(figsize=(9.0, margin + height * lines), layout='constrained')
+    panels = figure.subplots(lines, columns, sharex=sharex, sharey=True, squeeze=False)
+    for axes in panels.flat[count:]:
+        axes.set_visible(False)
     return figure, list(panels.flat[:count])
 
 
@@ -148,7 +157,7 @@ def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
 
 def stiffness_levels(summary: StiffnessSummary) -> Figure:
     """Draw each entry of the matrix against the force, with Table 2."""
-    figure = _new_figure(9.0, 6.5)
+    figure = Figure(figsize=(9.0, 6.5), layout='constrained')
     for axes, (name, (means, deviations)) in zip(
         figure.subplots(2, 2, sharex=True).flat, TABLE_2.items(), strict=True
     ):
@@ -182,7 +191,7 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
 def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
     """Draw force against displacement, and the displacements in the plane, with the fit."""
     presses = estimate.presses
-    figure = _new_figure(9.0, 4.8)
+    figure = Figure(figsize=(9.0, 4.8), layout='constrained')
     left, right = figure.subplots(1, 2)
     force = np.hypot(*presses.force.T)
     along = np.einsum('ij,ij->i', presses.displacement, presses.force) / force
@@ -227,11 +236,8 @@ def spread_figure(
     means: Sequence[Statistic], rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]]
 ) -> Figure:
     """Draw each parameter of each recording with its interval, and the mean with its interval."""
-    columns = min(len(means), 4)
-    lines = -(-len(means) // columns)
-    figure = _new_figure(9.0, lines * (1.2 + 0.24 * len(rows)))
-    panels = figure.subplots(lines, columns, sharey=True, squeeze=False)
-    for axes, mean in zip(panels.flat, means, strict=False):
+    figure, panels = _panels(len(means), 4, 0.0, 1.2 + 0.24 * len(rows), sharex=False)
+    for axes, mean in zip(panels, means, strict=True):
         for place, (_, found) in enumerate(rows):
             one = found.get(mean.name)
             if one is not None and one.determined:
@@ -244,15 +250,9 @@ def spread_figure(
         axes.tick_params(left=False)
         axes.xaxis.get_major_formatter().set_useOffset(False)
         axes.locator_params(axis='x', nbins=3)
-    for axes in panels.flat[len(means) :]:
-        axes.set_visible(False)
-    panels[0, 0].set_yticks(range(len(rows)), [name for name, _ in rows])
-    panels[0, 0].set_ylim(len(rows) - 0.5, -0.5)
+    panels[0].set_yticks(range(len(rows)), [name for name, _ in rows])
+    panels[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
-
-
-def _new_figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), layout='constrained')
 
 
 def _label(axes: Axes, xlabel: str, ylabel: str) -> None:

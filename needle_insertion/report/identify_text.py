@@ -147,12 +147,7 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
 def warned(
     summary: FrictionSummary | StiffnessSummary, origin: Origin
 ) -> tuple[list[str], list[str]]:
-    """
-    Return the warnings about a result, grouped and in full.
-
-    The first list has a warning of each group that differs in numbers only, with the number of
-    others; the second list has all warnings.
-    """
+    """Return one warning of each group that differs in numbers only, and all warnings."""
     names = short_names([one.name for one in summary.estimates])
     found = [('', words) for words in summary.warnings]
     found += origin.lost

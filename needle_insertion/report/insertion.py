@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import csv
-from io import StringIO
 from pathlib import Path
-from typing import Final, TYPE_CHECKING
+from typing import Final, TYPE_CHECKING, TypeVar
 
 from needle_dynamics import FloatArray, Insertion, NeedlePath, NeedleShape
-from needle_insertion.report.content import png
+from needle_insertion.report.content import csv_table, png
 from needle_ros.files import write_whole
 import numpy as np
 
@@ -17,6 +15,8 @@ if TYPE_CHECKING:
     # Take half a second each to import; only pictures need them.
     from matplotlib.figure import Figure
     from needle_controller.steering.laws.multi_hypothesis import Reach
+
+_Item = TypeVar('_Item')
 
 #: Columns of the CSV, with the names that friction and steering identification expect.
 COLUMNS: Final = (
@@ -70,13 +70,18 @@ class InsertionRecord:
     @property
     def shapes(self) -> list[NeedleShape]:
         """Needle shapes at evenly spaced samples, including the last."""
-        at = np.linspace(0, len(self._shapes) - 1, _DRAWN + 1).round().astype(int)
-        return [self._shapes[k] for k in at[1:]]
+        return evenly(self._shapes, _DRAWN + 1)[1:]
 
     @property
     def punctured(self) -> int:
         """Number of punctured membranes."""
         return sum(self._one.punctured)
+
+
+def evenly(items: Sequence[_Item], count: int) -> list[_Item]:
+    """Return items at evenly spaced places, including the first and the last."""
+    places = np.linspace(0, len(items) - 1, count).round().astype(int)
+    return [items[place] for place in places.tolist()]
 
 
 def summary(record: InsertionRecord) -> dict[str, float]:
@@ -100,11 +105,7 @@ def summary(record: InsertionRecord) -> dict[str, float]:
 def write(path: Path, record: InsertionRecord) -> None:
     """Write an insertion to a ``.csv`` or ``.png`` file."""
     if path.suffix == '.csv':
-        text = StringIO(newline='')
-        writer = csv.writer(text)
-        writer.writerow(COLUMNS)
-        writer.writerows(record.table.tolist())
-        write_whole(path, text.getvalue().encode())
+        write_whole(path, csv_table(COLUMNS, record.table))
     else:
         shapes = [np.insert(one.deflections, 1, one.depths, axis=1) for one in record.shapes]
         cut = np.insert(record.path.deflections, 1, record.path.depths, axis=1)

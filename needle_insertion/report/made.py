@@ -14,11 +14,7 @@ COMMAND: Final[ContextVar[str]] = ContextVar('COMMAND', default='')
 
 
 def made() -> str:
-    """
-    Return version, command and date of a page in a line.
-
-    The environment variable SOURCE_DATE_EPOCH fixes the date, for reproducible pages.
-    """
+    """Return version, command and date of a page, fixed by SOURCE_DATE_EPOCH, in a line."""
     at = float(os.environ.get('SOURCE_DATE_EPOCH', time.time()))
     date = datetime.fromtimestamp(at, timezone.utc).strftime('%Y-%m-%d %H:%M UTC')
     return ', '.join(

@@ -17,58 +17,31 @@ _PIECE: Final = 1 << 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingSource:
-    """
-    Recording of a result.
-
-    Attributes
-    ----------
-    name : str
-        Name of the recording.
-    losses : tuple of str
-        Lost, discarded or corrected data.
-    clock_offset : float
-        Stamps of the force minus stamps of the motion [s], already corrected.
-    samples : int
-        Number of samples of force and motion.
-    files : tuple of (str, str)
-        Paths and SHA-256 of the files.
-
-    """
+    """Recording of a result."""
 
     name: str
+    #: Lost, discarded or corrected data.
     losses: tuple[str, ...]
+    #: Stamps of the force minus stamps of the motion [s], already corrected.
     clock_offset: float
     samples: int
+    #: Paths and SHA-256.
     files: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
-    """
-    Recordings and settings of a result.
-
-    Attributes
-    ----------
-    settings : object
-        Dataclass of settings.
-    reading : Mapping[str, Any]
-        Options of the reader; None for automatic selection by type.
-    result : Path or None
-        Written parameter file, if any.
-    sources : sequence of RecordingSource
-        Recordings.
-    failures : sequence of (str, str)
-        Unusable recordings with reason.
-    copies : sequence of (str, str)
-        Recordings with the same samples as another, with its name; used once.
-
-    """
+    """Recordings and settings of a result."""
 
     settings: Any
+    #: Options of the reader; None for automatic selection by type.
     reading: Mapping[str, Any]
+    #: Written parameter file, if any.
     result: Path | None
     sources: Sequence[RecordingSource] = ()
+    #: Unusable recordings with reason.
     failures: Sequence[tuple[str, str]] = ()
+    #: Recordings with the same samples as another, with its name; used once.
     copies: Sequence[tuple[str, str]] = ()
 
     @property
@@ -138,13 +111,7 @@ def identify_all(
     *,
     digest: bool,
 ) -> tuple[list[Any], Origin]:
-    """
-    Identify recordings, and skip copies and unusable recordings.
-
-    ``read`` and ``identify`` handle a single recording; ``digest`` enables the checksums of the
-    files, for which they are read again. Returns the estimates, and the origin with sources and
-    failures.
-    """
+    """Identify recordings except copies and unusable ones; return estimates and origin."""
     estimates, sources, failures, copies = [], [], [], []
     seen: dict[bytes, str] = {}
     for bag in tqdm(bags, desc='bags', disable=None, leave=False):

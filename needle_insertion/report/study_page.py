@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import ceil, floor, isfinite, log10, nan, sqrt
 from pathlib import Path
 from typing import Final
@@ -76,78 +76,55 @@ def write_study(results: Results, path: Path) -> None:
     units[main] = figures[main].unit
     limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
     sections = [
-        ReportSection(
-            title='Probabilities',
-            paragraphs=('95 % intervals by the method of Wilson.', _MISSING),
-            tables=(
-                Grid(
-                    caption='Probabilities',
-                    heads=('metric', 'probability', '95 % interval', 'samples', 'meaning'),
-                    rows=tuple(
-                        (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
-                        for name, one in chances.items()
-                        if np.isfinite(one.value)
-                    ),
-                ),
-            ),
-            pictures=(),
+        _section(
+            'Probabilities',
+            ('95 % intervals by the method of Wilson.', _MISSING),
+            ('metric', 'probability', '95 % interval', 'samples', 'meaning'),
+            [
+                (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
+                for name, one in chances.items()
+                if np.isfinite(one.value)
+            ],
         ),
-        ReportSection(
-            title='Quantiles',
-            paragraphs=('With distribution-free 95 % intervals.', _MISSING, *limited),
-            tables=(
-                Grid(
-                    caption='Quantiles',
-                    heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
-                    rows=tuple(quantiles),
-                ),
-            ),
+        _section(
+            'Quantiles',
+            ('With distribution-free 95 % intervals.', _MISSING, *limited),
+            ('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
+            quantiles,
             pictures=(_distribution(main, figures[main], values),),
         ),
-    ]  # fmt: skip
+    ]
     if drawn:
         sections.append(
-            ReportSection(
-                title='Sensitivity',
-                paragraphs=(
+            _section(
+                'Sensitivity',
+                (
                     f'Fraction of the variance of {main} explained by each variable alone.',
                     'The remainder to 100 % is noise, and interactions of variables.',
                     'Correlated variables share a part of their fractions.',
                     *limited,
                 ),
-                tables=(
-                    Grid(
-                        caption='Shares of the variance',
-                        heads=('variable', main, 'meaning'),
-                        rows=tuple(
-                            (name, _share(shares[name]), study.protocol.quantities[name].meaning)
-                            for name in order
-                        ),
-                    ),
-                ),
-                pictures=_map(
-                    main, figures[main], values, most, study
-                ),
+                ('variable', main, 'meaning'),
+                [
+                    (name, _share(shares[name]), study.protocol.quantities[name].meaning)
+                    for name in order
+                ],
+                'Shares of the variance',
+                _map(main, figures[main], values, most, study),
             )
-        )  # fmt: skip
-    sections.append(
-        ReportSection(
-            title='Worst samples',
-            paragraphs=('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
-            tables=(
-                Grid(
-                    caption=f'Samples with the largest {main}',
-                    heads=('sample', *(_head(name, units[name]) for name in listed)),
-                    rows=tuple(
-                        (str(number),
-                         *(_number(of_bad[name][place], units[name]) for name in listed))
-                        for place, number in enumerate(bad)
-                    ),
-                ),
-            ),
-            pictures=(),
         )
-    )  # fmt: skip
+    sections.append(
+        _section(
+            'Worst samples',
+            ('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
+            ('sample', *(_head(name, units[name]) for name in listed)),
+            [
+                (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
+                for place, number in enumerate(bad)
+            ],
+            f'Samples with the largest {main}',
+        )
+    )
     pictures = [one for section in sections for one in section.pictures]
     hit = chances.get('hit')
     cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
@@ -167,6 +144,19 @@ def write_study(results: Results, path: Path) -> None:
         sections=sections,
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
+
+
+def _section(
+    title: str,
+    paragraphs: tuple[str, ...],
+    heads: tuple[str, ...],
+    rows: Sequence[tuple[str, ...]],
+    caption: str = '',
+    pictures: tuple[Picture, ...] = (),
+) -> ReportSection:
+    """Return a section with one table; its caption is the title unless given."""
+    grid = Grid(caption=caption or title, heads=heads, rows=tuple(rows))
+    return ReportSection(title=title, paragraphs=paragraphs, tables=(grid,), pictures=pictures)
 
 
 def _shown(unit: str) -> tuple[str, float]:

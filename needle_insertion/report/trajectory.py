@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-import csv
-from io import StringIO
 from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics import linearize, NeedleModel, Trajectory
-from needle_insertion.report.content import png
+from needle_insertion.report.content import csv_table, png
 from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.files import write_whole
 from needle_ros.timing import NANOSECONDS
@@ -79,7 +77,7 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
 def write(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a ``.csv`` or ``.png`` file, or as a bag to a new folder."""
     if path.suffix == '.csv':
-        write_whole(path, _csv(trajectory).encode())
+        write_whole(path, _csv(trajectory))
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
@@ -90,15 +88,12 @@ def write(path: Path, trajectory: Trajectory) -> None:
             _write_bag(bag, trajectory)
 
 
-def _csv(trajectory: Trajectory) -> str:
+def _csv(trajectory: Trajectory) -> bytes:
     """Return time, state and tip deflection of each sample, in SI units."""
     names = NeedleModel(trajectory.parameters).coordinate_names
-    text = StringIO(newline='')
-    writer = csv.writer(text)
-    writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
+    heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
     rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
-    writer.writerows(rows.tolist())
-    return text.getvalue()
+    return csv_table(heads, rows)
 
 
 def _figure(trajectory: Trajectory) -> Figure:

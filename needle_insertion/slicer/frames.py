@@ -22,19 +22,7 @@ _LARGEST_SKIPPED: Final = 1 << 30
 
 
 class Frame(NamedTuple):
-    """
-    Unparsed message: header and body.
-
-    Attributes
-    ----------
-    kind : str
-        Type, such as ``POINT``.
-    device : str
-        Name of the device.
-    data : bytes
-        Header and body.
-
-    """
+    """Unparsed message: its type, such as ``POINT``, name of the device, header and body."""
 
     kind: str
     device: str
@@ -45,13 +33,8 @@ class Frames:
     """
     Splitter of a byte stream into messages; unwanted messages are skipped and never stored.
 
-    Parameters
-    ----------
-    wanted : callable
-        Returns whether a message of a type and a device name is wanted.
-    refuse : callable
-        Called with a line about a wanted message that is too large.
-
+    `wanted` returns whether a message of a type and a device name is wanted; `refuse` is called
+    with a line about a wanted message that is too large.
     """
 
     def __init__(

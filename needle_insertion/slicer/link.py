@@ -42,30 +42,7 @@ _MOST_STRANGERS: Final = 8
 
 
 class Connection:
-    """
-    Connection to a peer, which is restored whenever it is lost.
-
-    Parameters
-    ----------
-    settings : LinkSettings
-        Role and address.
-    wanted : callable
-        Returns whether a message of a type and a device name is wanted.
-    events : EventLog
-        Event log.
-    steady : callable
-        Returns the time of a monotonic clock [s].
-
-    Attributes
-    ----------
-    peer : str
-        Address of the peer, '' without a connection.
-    complaint : str
-        Reason why no connection is possible, or ''.
-    left_out : int
-        Number of messages that were dropped because the peer reads too slowly.
-
-    """
+    """Connection to a peer, which is restored whenever it is lost; `wanted` as in `Frames`."""
 
     def __init__(
         self,
@@ -74,7 +51,9 @@ class Connection:
         events: EventLog,
         steady: Callable[[], float] = monotonic,
     ) -> None:
+        #: Address of the peer, '' without a connection; reason why no connection is possible.
         self.peer = self.complaint = ''
+        #: Number of messages that were dropped because the peer reads too slowly.
         self.left_out = 0
         self._settings, self._wanted = settings, wanted
         self._events, self._steady = events, steady

@@ -58,13 +58,7 @@ class Interpreter:
     """
     Converter from messages of the peer to targets, and from the needle to messages.
 
-    Parameters
-    ----------
-    registration : Registration
-        Pose of the needle frame in the images.
-    reach : float
-        Largest accepted distance of a target from the entry point [m].
-
+    `reach` is the largest accepted distance of a target from the entry point [m].
     """
 
     def __init__(self, registration: Registration, reach: float) -> None:

@@ -25,42 +25,20 @@ LINE: Final = 'line from guide to tip, not measured'
 
 
 class Shape(NamedTuple):
-    """
-    Shape of the needle in ``needle_entry``.
+    """Shape of the needle in ``needle_entry``."""
 
-    Attributes
-    ----------
-    stamp : int
-        Time of the measurement [ns].
-    points : ndarray, shape (n, 3)
-        From the guide to the tip [m]; at least two.
-    turn : ndarray, shape (4,)
-        Orientation of the tip, with y along the needle: quaternion x, y, z, w.
-    source : str
-        `MEASURED` or `LINE`.
-
-    """
-
+    #: Time of the measurement [ns].
     stamp: int
+    #: From the guide to the tip, shape (n, 3) [m]; at least two.
     points: FloatArray
+    #: Orientation of the tip, with y along the needle: quaternion x, y, z, w.
     turn: FloatArray
+    #: `MEASURED` or `LINE`.
     source: str
 
 
 class EntryPose(NamedTuple):
-    """
-    Pose in ``needle_entry``.
-
-    Attributes
-    ----------
-    stamp : int
-        Time [ns].
-    position : ndarray, shape (3,)
-        Position [m].
-    turn : ndarray, shape (4,)
-        Orientation: quaternion x, y, z, w.
-
-    """
+    """Pose in ``needle_entry``: time [ns], position [m], quaternion x, y, z, w."""
 
     stamp: int
     position: FloatArray
@@ -68,17 +46,10 @@ class EntryPose(NamedTuple):
 
 
 class NeedleView:
-    """
-    Latest measurements of the needle; times of arrival are of a monotonic clock [s].
-
-    Attributes
-    ----------
-    expected : EntryPose or None
-        Last prediction of the tip.
-
-    """
+    """Latest measurements of the needle; times of arrival are of a monotonic clock [s]."""
 
     def __init__(self) -> None:
+        #: Last prediction of the tip.
         self.expected: EntryPose | None = None
         self._shape: tuple[float, Shape] | None = None
         self._tip: tuple[float, int, FloatArray] | None = None

@@ -11,6 +11,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 #: Millimeters per meter: OpenIGTLink and 3D Slicer use mm.
 MILLIMETERS: Final = 1e3
@@ -31,14 +32,7 @@ def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
         raise ParameterError(
             f'must be a quaternion x, y, z, w of norm 1, got {given.tolist()} of norm {norm:g}'
         )
-    x, y, z, w = given / norm
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray(Rotation.from_quat(given).as_matrix())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,12 +84,7 @@ class Registration:
         return np.asarray((lengths - self.translation) @ rotation_matrix(self.rotation))
 
     def pose_to_image(self, position: ArrayLike, quaternion: ArrayLike) -> FloatArray:
-        """
-        Transform a pose in ``needle_entry`` to a homogeneous matrix in the frame of the images.
-
-        The position is in m, the quaternion x, y, z, w, and lengths of the matrix, shape (4, 4),
-        in mm.
-        """
+        """Transform a pose (position in m) to a homogeneous matrix of the images (in mm)."""
         pose = np.eye(4)
         pose[:3, :3] = rotation_matrix(self.rotation) @ rotation_matrix(quaternion)
         pose[:3, 3] = self.to_image(position)

@@ -15,7 +15,7 @@ ROLES: Final = ('server', 'client')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """Role and address of the connection."""
+    """Role and address of the connection, and the limit of targets."""
 
     role: str = field(
         default=ROLES[0],
@@ -31,6 +31,9 @@ class LinkSettings:
         },
     )
     port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0)
+    reach: float = constant(
+        0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
+    )
 
     def __post_init__(self) -> None:
         if self.role not in ROLES:
@@ -46,15 +49,3 @@ class LinkSettings:
         if self.port != int(self.port):
             raise ParameterError(f'port must be a whole number, got {self.port!r}')
         object.__setattr__(self, 'port', int(self.port))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TargetSettings:
-    """Limits of targets."""
-
-    reach: float = constant(
-        0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
-    )
-
-    def __post_init__(self) -> None:
-        check_constants(self)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 import sys
@@ -10,12 +12,14 @@ from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
+from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
-from needle_insertion.slicer.settings import LinkSettings, TargetSettings
+from needle_insertion.slicer.settings import LinkSettings
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
+from needle_ros.contract import Topic
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.publishers_node import request_stamp
@@ -73,7 +77,6 @@ class SlicerNode(BaseNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('slicer', **node_options)
         self.declare_settings('', LinkSettings())
-        self.declare_settings('', TargetSettings())
         self.declare_settings('registration.', Registration())
         self._link: Connection | None = None
         self._events, self._view = EventLog(), NeedleView()
@@ -110,9 +113,10 @@ class SlicerNode(BaseNode):
             )
         from needle_insertion.slicer.messages import Interpreter, is_wanted
 
+        settings = self.settings('', LinkSettings)
         registration = self.settings('registration.', Registration)
-        self._interpreter = Interpreter(registration, self.settings('', TargetSettings).reach)
-        self._link = Connection(self.settings('', LinkSettings), is_wanted, self._events)
+        self._interpreter = Interpreter(registration, settings.reach)
+        self._link = Connection(settings, is_wanted, self._events)
 
     def cleanup(self) -> None:
         """Discard the connection."""
@@ -141,15 +145,21 @@ class SlicerNode(BaseNode):
 
     # Messages of the nodes.
 
+    @contextmanager
+    def _rejecting(self, topic: Topic) -> Iterator[None]:
+        """Report an invalid message of a topic."""
+        try:
+            yield
+        except MessageError as error:
+            self._events.reject(f'{topic.name} refused: {error}')
+
     def _on_poses(self, message: PoseArray) -> None:
         points = [(p.position.x, p.position.y, p.position.z) for p in message.poses]
         turn = _quaternion(message.poses[-1].orientation) if message.poses else []
-        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
-        try:
-            _check_frame(frame)
+        stamp = nanoseconds(message.header.stamp)
+        with self._rejecting(contract.NEEDLE_POSES):
+            _check_frame(message.header.frame_id)
             self._view.take_poses(stamp, points, turn, monotonic())
-        except MessageError as error:
-            self._events.reject(f'{contract.NEEDLE_POSES.name} refused: {error}')
 
     def _on_joints(self, reading: Reading) -> None:
         found = dict(zip(reading.names, reading.values[0], strict=False))
@@ -157,29 +167,22 @@ class SlicerNode(BaseNode):
             return
         # A guide without joints is at the entry point.
         x, z = found.get(contract.GUIDE_X, 0.0), found.get(contract.GUIDE_Z, 0.0)
-        try:
+        with self._rejecting(contract.JOINT_STATES):
             self._view.take_guide(x, z, monotonic())
-        except MessageError as error:
-            self._events.reject(f'{contract.JOINT_STATES.name} refused: {error}')
 
     def _on_tip(self, reading: Reading) -> None:
-        try:
+        with self._rejecting(contract.TIP_DEFLECTION):
             _check_frame(reading.frame)
             self._view.take_tip(reading.stamp, reading.values[0], monotonic())
-        except MessageError as error:
-            self._events.reject(f'{contract.TIP_DEFLECTION.name} refused: {error}')
 
     def _on_expected(self, message: PoseWithCovarianceStamped) -> None:
         pose = message.pose.pose
         at = [pose.position.x, pose.position.y, pose.position.z]
-        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
-        try:
-            _check_frame(frame)
+        stamp = nanoseconds(message.header.stamp)
+        with self._rejecting(contract.TIP_EXPECTED):
+            _check_frame(message.header.frame_id)
             self._view.take_expected(stamp, at, _quaternion(pose.orientation))
-        except MessageError as error:
-            self._events.reject(f'{contract.TIP_EXPECTED.name} refused: {error}')
-            return
-        self._state_changed = monotonic()
+            self._state_changed = monotonic()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         now = monotonic()
@@ -254,13 +257,10 @@ class SlicerNode(BaseNode):
         if newest is None:
             return
         frame, (x, y, z) = newest
-        message = PointStamped()
-        message.header.frame_id = contract.ENTRY
         # The clock of the peer is not synchronized.
-        message.header.stamp = request_stamp(self)
-        message.point.x, message.point.y, message.point.z = x, y, z
+        stamp = nanoseconds(request_stamp(self))
+        message = target_message(stamp, (x, y, z))
         self._target.publish(message)
-        stamp = nanoseconds(message.header.stamp)
         self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
         self._targets += 1
         heard = self._target.get_subscription_count()

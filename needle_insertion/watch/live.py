@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 import json
 from time import monotonic
 from typing import Any, Final
@@ -22,24 +22,12 @@ def _json(content: object) -> str:
 
 
 class Live:
-    """
-    Generator of frames at a fixed rate, the same for all readers.
-
-    Parameters
-    ----------
-    view : View
-        State of the page.
-    poll : callable
-        Updates the view at a time [s].
-    control : bool
-        Whether the page has buttons.
-
-    """
+    """Frames at a fixed rate, the same for all readers; `poll` updates the view at a time [s]."""
 
     def __init__(self, view: View, poll: Callable[[float], None], *, control: bool) -> None:
         self._view, self._poll = view, poll
-        self._setting = {'control': control, 'recording': None}
-        self._history: deque[list[float | None]] = deque(maxlen=round(SPAN * RATE))
+        self.setting = {'control': control, 'recording': None}
+        self.history: deque[list[float | None]] = deque(maxlen=round(SPAN * RATE))
         self._changed = asyncio.Condition()
         self.scene: dict[str, Any] = {}
         self.number, self.frame = 0, ''
@@ -51,7 +39,7 @@ class Live:
             now = monotonic()
             self._poll(now)
             frame = self._view.frame(now)
-            self._history.append(row(frame))
+            self.history.append(row(frame))
             self.scene = self._view.scene
             self.number, self.frame = self.number + 1, _json(frame)
             async with self._changed:
@@ -63,11 +51,6 @@ class Live:
     def reader(self) -> LiveReader:
         """Return the interface of a new reader."""
         return LiveReader(self)
-
-    @property
-    def beginning(self) -> dict[str, Any]:
-        """Content that a reader needs before its first frame."""
-        return {'setting': self._setting, 'history': list(self._history)}
 
     async def newer(self, number: int) -> None:
         """Wait for a frame newer than ``number``."""
@@ -93,7 +76,7 @@ class LiveReader:
             self._scene = live.scene
             parts.append(f'"scene":{_json(self._scene)}')
         if first:
-            parts += [f'"{key}":{_json(value)}' for key, value in live.beginning.items()]
+            parts += [f'"setting":{_json(live.setting)}', f'"history":{_json([*live.history])}']
         return '{' + ','.join(parts) + '}'
 
     def take(self, message: dict[str, Any]) -> None:
@@ -102,27 +85,19 @@ class LiveReader:
 
 
 class RecordedReader:
-    """
-    Frames of a recording for one reader.
+    """Frames of a recording for one reader."""
 
-    Parameters
-    ----------
-    recording : ShownRecording
-        Recording.
-    losses : sequence of str
-        Descriptions of unreadable parts.
-
-    """
-
-    def __init__(self, recording: ShownRecording, losses: Sequence[str] = ()) -> None:
+    def __init__(self, recording: ShownRecording) -> None:
         self._recording = recording
         self._playback = PagePlayback(recording.duration)
         self._setting = {
             'control': False,
             'recording': {
-                'name': recording.name, 'duration': recording.duration, 'losses': list(losses)
+                'name': recording.name,
+                'duration': recording.duration,
+                'losses': list(recording.losses),
             },
-        }  # fmt: skip
+        }
         self._scene: dict[str, Any] | None = None
         self._jumped = True
         self._due = monotonic()

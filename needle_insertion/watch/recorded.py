@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -40,10 +39,6 @@ SLOWEST, FASTEST = 0.02, 50.0
 _Item = TypeVar('_Item')
 
 
-def _same(item: _Item) -> _Item:
-    return item
-
-
 class _Kept(Generic[_Item]):
     """Messages of a topic by time, decimated to an interval [s] and to `_MOST` messages."""
 
@@ -73,25 +68,8 @@ class ShownRecording:
     """
     Content of a bag for the page, by time from its start.
 
-    Parameters
-    ----------
-    path : Path
-        Bag in a format of `needle_identification.Bag`.
-
-    Attributes
-    ----------
-    name : str
-        Name of the bag.
-    duration : float
-        Time from the first to the last shown message [s].
-    losses : tuple of str
-        Descriptions of unreadable parts.
-
-    Raises
-    ------
-    RecordingError
-        If it is not readable, is empty, or has nothing to show.
-
+    `duration` is the time from the first to the last shown message [s], and `losses` describes
+    unreadable parts. Raises `RecordingError` if the bag is unreadable or has nothing to show.
     """
 
     def __init__(self, path: Path) -> None:
@@ -149,7 +127,8 @@ class ShownRecording:
             self._expected.add(time, lambda: deserialize(message.topic, data))
         elif name == contract.DIAGNOSTICS.name:
             for status in deserialize(message.topic, data).status:
-                self._nodes.setdefault(status.name, _Kept()).add(time, partial(_same, status))
+                # Called at once.
+                self._nodes.setdefault(status.name, _Kept()).add(time, lambda: status)  # noqa: B023
         else:
             parameters = parameters_of(read_string(data))
             self._configurations[name].add(time, lambda: parameters)
@@ -189,24 +168,7 @@ class ShownRecording:
 
 
 class PagePlayback:
-    """
-    Playback of a recording for one reader.
-
-    Parameters
-    ----------
-    duration : float
-        Length of the recording [s].
-    steady : callable
-        Returns the time of a monotonic clock [s].
-
-    Attributes
-    ----------
-    playing : bool
-        Whether the playback runs.
-    speed : float
-        Playback speed relative to real time.
-
-    """
+    """Playback of a recording of a duration [s] for one reader; `speed` is 1 in real time."""
 
     def __init__(self, duration: float, steady: Callable[[], float] = monotonic) -> None:
         self._duration = duration
@@ -227,11 +189,7 @@ class PagePlayback:
         return self._at
 
     def take(self, message: dict[str, Any]) -> bool:
-        """
-        Process a playback message: ``at`` (a time [s]), ``play`` (bool) or ``speed``.
-
-        Returns whether the time has jumped; `ParameterError` if the message is invalid.
-        """
+        """Process a message ``at`` (a time [s]), ``play`` or ``speed``; return if time jumped."""
         now = self.at
         match message:
             case {'at': int() | float() as at, **rest} if not rest and at is not True:

@@ -8,11 +8,8 @@ from typing import Any, Final
 
 from needle_ros.documents import DocumentError, read_document
 
-#: Nodes with parameters of needle and tissue; the first available node is used.
-_KNOWING: Final = ('plant', 'steering', 'controller')
-
-#: Nodes whose configurations are read.
-CONFIGURED: Final = _KNOWING
+#: Nodes whose configurations are read; needle and tissue are of the first available node.
+CONFIGURED: Final = ('plant', 'steering', 'controller')
 
 #: Parameters of the limits of the controller, by their names on the page.
 _LIMITS: Final = {
@@ -44,7 +41,7 @@ def scene(configurations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     error, deflection and the depths ``low`` and ``high`` [m], if configured in the controller.
     ``steered``: whether a node aims the tip.
     """
-    whose = next((name for name in _KNOWING if name in configurations), None)
+    whose = next((name for name in CONFIGURED if name in configurations), None)
     return {
         'tissue': None if whose is None else _tissue(whose, configurations[whose]),
         'limits': _limits(configurations.get('controller', {})),

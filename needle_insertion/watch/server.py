@@ -86,38 +86,15 @@ class Control(Protocol):
         """Send a target [m]; return acceptance and answer, `JobError` without an answer."""
 
     async def ask(self, what: str) -> tuple[bool, str]:
-        """
-        Call the services of a request, a key of `needle_insertion.live.requests.REQUESTS`.
-
-        Returns success and the answers of the nodes; `JobError` without an answer.
-        """
+        """Call the services of a key of `REQUESTS`; return success and the answers."""
 
 
 class Server:
     """
-    HTTP and WebSocket server of the page.
+    HTTP and WebSocket server of the page; without a control the page is read-only.
 
-    Parameters
-    ----------
-    readers : callable
-        Returns the source of frames for a new reader.
-    host : str
-        Address to listen on.
-    port : int
-        Port; 0 for a free port.
-    control : Control, optional
-        Requests of the buttons; without it the page is read-only.
-
-    Attributes
-    ----------
-    token : str
-        Token that authorizes commands; '' without a control.
-
-    Raises
-    ------
-    ParameterError
-        If the address is invalid, or a control would be open to other machines.
-
+    `readers` returns the source of frames for a new reader; `port` 0 is a free port. Raises
+    `ParameterError` if the address is invalid, or a control would be open to other machines.
     """
 
     def __init__(
@@ -140,6 +117,7 @@ class Server:
             )
         if not 0 <= port <= 65535:
             raise ParameterError(f'--port must be 0 to 65535, got {port}')
+        #: Authorizes commands.
         self.token = token_urlsafe(24) if control is not None else ''
         self._readers, self._host, self._port = readers, host, port
         self._control = control

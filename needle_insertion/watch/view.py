@@ -17,8 +17,7 @@ import numpy as np
 #: Frames per second.
 RATE: Final = 30.0
 
-#: Columns of the history, and its duration [s].
-HISTORY: Final = ('time', 'depth', 'reference', 'force', 'tip_x', 'tip_z')
+#: Duration of the history [s].
 SPAN: Final = 20.0
 
 #: Timeout of the status of a node, which is published every second [s].
@@ -41,11 +40,7 @@ def number(value: float | None) -> float | None:
 
 
 def line(points: FloatArray) -> list[list[float]]:
-    """
-    Return points (n, 3) [m] as columns x, y and z, decimated to 120 points.
-
-    Points that are not finite are left out.
-    """
+    """Return finite points (n, 3) [m] as columns x, y and z, decimated to 120 points."""
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) > _POINTS:
         points = points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
@@ -53,25 +48,12 @@ def line(points: FloatArray) -> list[list[float]]:
 
 
 class View:
-    """
-    Newest message of each topic; all times are of a single clock [s].
-
-    Parameters
-    ----------
-    silent : float
-        Timeout of a topic [s].
-
-    Attributes
-    ----------
-    invalid : int
-        Number of unreadable messages.
-    scene : dict
-        Needle, tissue and limits, from `scene.scene`.
-
-    """
+    """Newest message of each topic; all times, also the timeout `silent`, are of one clock [s]."""
 
     def __init__(self, silent: float = 1.0) -> None:
+        #: Number of unreadable messages.
         self.invalid = 0
+        #: Needle, tissue and limits.
         self.scene = scene({})
         self._silence = silent
         #: Newest reading of each topic and its time of arrival.
@@ -248,7 +230,7 @@ def _progress(status: NodeStatus | None) -> dict[str, int]:
 
 
 def row(frame: Mapping[str, Any]) -> list[float | None]:
-    """Return the values of a frame for the strip charts, in the columns `HISTORY`."""
+    """Return time, depth, reference, force, tip x and z of a frame for the strip charts."""
     tip = frame['tip'] or [None] * 3
     charted = [frame['time'], frame['depth'], frame['reference'], frame['force']]
     return [*charted, tip[0], tip[2]]

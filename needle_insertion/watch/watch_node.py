@@ -50,14 +50,6 @@ class WatchNode(Node):
     The node is not spun: messages wait in the middleware, which keeps the newest only, and `poll`
     takes them. Subscriptions are best effort, so that no publisher waits or resends, and the node
     publishes nothing.
-
-    Parameters
-    ----------
-    view : View
-        Receiver of the messages.
-    context : Context
-        Context of the node.
-
     """
 
     def __init__(self, view: View, context: Context) -> None:
@@ -163,11 +155,7 @@ class Buttons:
 
 @contextmanager
 def watching(*, control: bool) -> Iterator[tuple[View, Callable[[float], None], Buttons | None]]:
-    """
-    Join the ROS graph of the user; yield the view, a function to update it, and the buttons.
-
-    The buttons are None unless ``control`` is true.
-    """
+    """Join the ROS graph of the user; yield the view, a function to update it, and buttons."""
     stay_local(os.environ)
     context = Context()
     context.init(domain_id=domain_of(os.environ))

@@ -12,8 +12,6 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.demo import demo
-from needle_insertion.demo.demo import DemoError, run
 from needle_insertion.demo.insertion import (
     COUNTED,
     insertion_checks,
@@ -21,9 +19,11 @@ from needle_insertion.demo.insertion import (
     TARGET_DEPTH,
 )
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.truth import compare_friction, compare_stiffness, TruthComparison
 import numpy as np
 import pytest
+from reproduction import demo
+from reproduction.demo import DemoError, run
+from reproduction.truth import compare_friction, compare_stiffness, TruthComparison
 
 
 def insertion(

@@ -10,7 +10,6 @@ from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.experiment.truth import _stiffness, Coverage, TruthComparison
 from needle_insertion.report import controllability
 from needle_insertion.report.content import ReportSection
 import numpy as np
@@ -23,6 +22,7 @@ from reproduction.identified import (
     identify_table,
     PublishedValue,
 )
+from reproduction.truth import _stiffness, Coverage, TruthComparison
 from support.pages import look_at
 
 

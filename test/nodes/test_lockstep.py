@@ -19,7 +19,7 @@ from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, target_message
+from needle_insertion.graph.simulated_run import RunSample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import ControllerStatus, SteeringPhase, SteeringStatus
@@ -314,17 +314,13 @@ def busy(number: int) -> Iterator[None]:
 def steer(folder: Path) -> Path:
     """Steer a needle by two steps; return the bag."""
     bag, common = folder / 'bag', {'model.preset': 'bending_35mm'}
-    waiting, end = True, inf
+    end = inf
     with Graph(folder / 'logs') as graph:
         run = SimulatedRun(graph, lambda *_: None)
-        aim = run.publisher(PointStamped, 'target')
 
-        def act(sample: RunSample) -> bool:
-            nonlocal waiting, end
-            if waiting and sample.time >= 0.1:
-                waiting = False
-                aim(target_message(sample.stamp, (1e-3, 0.015, 0.0)))
-            status = run.statuses['steering']
+        def proceeds(sample: RunSample) -> bool:
+            nonlocal end
+            status = run.states['steering'].status
             assert isinstance(status, SteeringStatus)
             if end == inf and status.phase is SteeringPhase.DONE:
                 end = sample.time + 0.5
@@ -343,7 +339,7 @@ def steer(folder: Path) -> Path:
                 'tip.noise': 1.8e-4, 'tip.delay': 0.02, 'steering.cutting_force': [1.0],
             },
         }  # fmt: skip
-        run.record(bag, nodes, act)
+        run.insert(bag, nodes, 5e-3, (1e-3, 0.015, 0.0), proceeds)
     return bag
 
 

@@ -44,7 +44,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Record the bags that are missing in the folder."""
     # Takes a second to import; invalid options of the parser are reported without it.
-    from needle_insertion.experiment.campaign import Campaign
+    from reproduction.campaign import Campaign
 
     campaign = Campaign(
         protocol=PROTOCOLS[options.which],
@@ -57,7 +57,7 @@ def _run(options: argparse.Namespace) -> int:
         raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')
     check_folder(options.output)
     # Needs ROS; invalid options are reported without it.
-    from needle_insertion.experiment.record import record
+    from reproduction.record import record
 
     record(campaign, options.output, options.speed)
     return 0

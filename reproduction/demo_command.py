@@ -29,7 +29,7 @@ def _run(options: argparse.Namespace) -> int:
     """Run the demo; return 1 if a check failed."""
     check_folder(options.output)
     from needle_insertion.compilation import compile_nodes
-    from needle_insertion.demo import demo
+    from reproduction import demo
 
     compile_nodes()
     return demo.run(options.output, options.bags, lockstep=not options.realtime)

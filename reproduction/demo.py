@@ -40,15 +40,7 @@ from needle_insertion.demo.insertion import (
     START_DEPTH,
     TARGET_DEPTH,
 )
-from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS
-from needle_insertion.experiment.record import rig
-from needle_insertion.experiment.truth import (
-    compare_friction,
-    compare_stiffness,
-    Coverage,
-    TruthComparison,
-)
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_figures import (
@@ -59,6 +51,14 @@ from needle_insertion.report.identify_figures import (
 from needle_insertion.report.page import write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 from needle_ros.errors import NeedleError
+from reproduction.campaign import Campaign
+from reproduction.record import rig
+from reproduction.truth import (
+    compare_friction,
+    compare_stiffness,
+    Coverage,
+    TruthComparison,
+)
 
 #: Speed of the recorded experiments, as a multiple of real time.
 EXPERIMENT_SPEED: Final = 25.0

@@ -1,0 +1,70 @@
+"""Messages to and from running nodes: targets, and the status of each node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import monotonic
+from typing import NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from needle_ros import contract
+from needle_ros.base_node import profile
+from needle_ros.errors import printable
+from needle_ros.requests import RequestStatus
+from needle_ros.status import NodeStatus, read_status
+from needle_ros.timing import NANOSECONDS
+from rclpy.node import Node
+
+
+class State(NamedTuple):
+    """Latest status of a node on /diagnostics."""
+
+    #: 0 OK, 1 warning, 2 error.
+    level: int
+    message: str
+    #: Typed status of a node of the suite.
+    status: NodeStatus | None
+    #: Requests that the node accepts, and its answers.
+    requests: RequestStatus
+    #: Time of receipt by `time.monotonic` [s].
+    heard: float
+
+    @property
+    def age(self) -> float:
+        """Time since receipt [s]; the node publishes every second."""
+        return monotonic() - self.heard
+
+
+def listen_states(
+    node: Node, on_state: Callable[[str, State], object] = lambda _name, _state: None
+) -> dict[str, State]:
+    """Subscribe to /diagnostics; return the latest state of each node, by its bare name."""
+    states: dict[str, State] = {}
+
+    def hear(array: DiagnosticArray) -> None:
+        for status in array.status:
+            name = printable(status.name.rpartition('/')[2])
+            values = {printable(one.key): printable(one.value) for one in status.values}
+            states[name] = State(
+                # rclpy represents a byte as bytes.
+                int.from_bytes(status.level, 'little'),
+                printable(status.message),
+                read_status(values),
+                RequestStatus.from_values(values),
+                monotonic(),
+            )
+            on_state(name, states[name])
+
+    topic = contract.DIAGNOSTICS
+    node.create_subscription(DiagnosticArray, topic.name, hear, profile(topic.qos))
+    return states
+
+
+def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
+    """Return a target x, y, z [m] with a stamp [ns]."""
+    message = PointStamped()
+    message.header.frame_id = contract.ENTRY
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+    message.point.x, message.point.y, message.point.z = point
+    return message
