@@ -45,6 +45,8 @@ class NeedleModel(NeedleStatics):
     """
     Lagrangian model of needle and tissue for one set of constants.
 
+    Its states and shapes, such as `state_at` and `shape`, are methods of `NeedleStatics`.
+
     Attributes
     ----------
     parameters : NeedleParameters
