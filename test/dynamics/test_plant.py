@@ -78,7 +78,7 @@ def test_force_ramp_moves_the_needle_when_it_exceeds_friction(
     # The needle moves under the mean force of each quarter of an interval.
     ends = np.arange(1, len(samples) + 1)
     felt, force = 2.0 * way * ends / RATE, 2.0 * way * (ends - 0.125) / RATE
-    speed, depth = column(samples, 'speed'), column(samples, 'depth')
+    speed, depth = column(samples, 'velocity'), column(samples, 'depth')
     at_rest = np.abs(force) <= mu_s
     assert at_rest.sum() == np.floor(mu_s / 2.0 * RATE + 0.125)
     assert np.all(speed[at_rest] == 0.0)
@@ -100,7 +100,7 @@ def test_push_respects_the_speed_limit(preset: str, force: float) -> None:
     plant = robot(parameters, speed_limit=0.03)
     follow(plant, (0.5, None, force))
     samples = run(plant, 1.0)
-    speed = column(samples, 'speed')
+    speed = column(samples, 'velocity')
     # The velocity is prescribed: rounding only.
     assert np.abs(speed).max() <= 0.03 * (1.0 + 1e-12)
     assert_allclose(speed[-250:], np.copysign(0.03, force), rtol=1e-12)
@@ -131,7 +131,7 @@ def test_motion_after_a_push_starts_at_the_actual_position() -> None:
     # The velocity at the end of the push, (2 - 0.56) / 300 m/s, is braked at 0.5 m/s^2.
     lead = (1.44 / 300.0) ** 2
     assert np.abs(column(back, 'depth') - line).max() < lead
-    assert np.abs(np.diff(column(back, 'speed'))).max() <= 0.5 / RATE * (1.0 + 1e-12)
+    assert np.abs(np.diff(column(back, 'velocity'))).max() <= 0.5 / RATE * (1.0 + 1e-12)
     assert run(plant, 0.5)[-1].depth == pytest.approx(0.11, abs=1e-7)
 
 
@@ -283,7 +283,7 @@ def test_force_and_velocity_of_a_moved_base_refer_to_one_instant() -> None:
     parameters = plant.integrator.model.parameters
     follow(plant, (0.1, 0.1, None), (0.5, 0.112, None), (0.9, 0.1, None))
     samples = run(plant, 1.0)
-    speed = column(samples, 'speed')
+    speed = column(samples, 'velocity')
     moving = np.flatnonzero(speed[1:] * speed[:-1] > 0.0) + 1
     inertia = parameters.moving_mass * np.diff(speed, prepend=0.0) * RATE
     friction = np.array([parameters.friction.force(v, 0.0) for v in speed])
