@@ -225,6 +225,8 @@ class Terminal:
         # The timeout is above, with the position of the needle in its error.
         self._spin_until(done, 'the needle', inf)
         self._say(self._readings.line())
+        if self._steers:
+            self._say(f'{STEERING}: {self._state(STEERING).message}')
 
     def _law(self, *words: str) -> None:
         if len(words) != 1 or words[0] not in LAWS:

@@ -166,6 +166,9 @@ def test_tip_is_steered_to_a_target(ros_graph: RosGraph, tmp_path: Path) -> None
     )  # fmt: skip
     assert (status, complained) == (0, ''), said
     assert re.search(r'steering +OK +done: the tip is', said), said
+    assert re.search(r'^steering: done: the tip is at .* from the target$', said, re.MULTILINE), (
+        said
+    )
     *_, end = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
     assert float(end) == pytest.approx(5.0, abs=0.3)
 
