@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 import subprocess
+import sys
 import time
 from typing import Final, NamedTuple
 
@@ -71,6 +72,7 @@ def kill_workers(
     the next result is awaited.
     """
     killed = young = errors = hangs = 0
+    skew = _clock_skew()
     while not (folder / TABLE).exists() and hangs + errors <= times:
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
         progress = _Progress(folder / 'parts', _PATIENCE + (_MOST + 1) * between)
@@ -90,7 +92,7 @@ def kill_workers(
             age = kill_worker(process.pid, rng, youngest=row > 0)
             if age is not None:
                 killed += 1
-                young += age < _SPAWNED
+                young += age - skew < _SPAWNED
                 row = row + 1 if row < _ROW and rng.random() < _YOUNG else 0
                 moment = time.monotonic() + rng.uniform(0.0, _SPAWNED if row else between)
         errors += process.wait() > 0
@@ -125,6 +127,14 @@ def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> flo
             one.kill()
             return age
     return None
+
+
+def _clock_skew() -> float:
+    """Return the age of a new process [s]: not 0 if the clock was set after the system start."""
+    process = psutil.Popen([sys.executable, '-c', ''])
+    age = time.time() - float(process.create_time())
+    process.wait()
+    return age
 
 
 def workers(parent: int) -> list[psutil.Process]:

@@ -46,7 +46,7 @@ def _transform(seen: MeasuredShape, stamp: int) -> TransformStamped:
 
 
 class PlantDisplay:
-    """Publishers of the needle shape for displays, on ``needle_shape``, ``needle_poses`` and `/tf`."""
+    """Publishers for displays: ``needle_shape``, ``needle_poses`` and `/tf`."""
 
     def __init__(self, node: BaseNode) -> None:
         self._node = node
