@@ -216,7 +216,7 @@ class _Pieces:
                 watch('breaks away inward', lambda t, z: self._excess(t, z, 1))
             watch('breaks away outward', lambda t, z: self._excess(t, z, -1))
         else:
-            watch('comes to rest', lambda _, z: float(way * z[m]))
+            watch('stops', lambda _, z: float(way * z[m]))
             watch('leaves its range', lambda _, z: float(z[0] - self.high))
             end_stop = 'touches the hub' if self.plant.parameters.hub_stop else 'leaves its range'
             watch(end_stop, lambda _, z: self.low - float(z[0]))

@@ -12,10 +12,10 @@ from needle_ros.timing import NANOSECONDS
 
 class TimingMonitor:
     """
-    Compare rate and latency with the settings of a controller, if there is one.
+    Monitor the latency, and compare rate and latency with the settings of a controller.
 
-    Without `stamped`, stamps are receive times: they do not resolve single periods, and the rate
-    is not compared.
+    Without `settings`, only the latency is measured. Without `stamped`, stamps are receive times:
+    they do not resolve single periods, and the rate is not compared.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
     'open_loop': f'{_LAWS}.open_loop:OpenLoopLaw',
 }
 
-#: Law of the node, of `needle steer` and of studies, unless another one is set.
+#: Default law of the node, of `needle steer` and of studies.
 DEFAULT_LAW: Final = 'multi_hypothesis'
 
 

@@ -127,7 +127,7 @@ class InsertionPlanner:
         return request, job
 
     def cancel(self) -> PlannedInsertion | None:
-        """Cancel the computation; return its request, if there is one."""
+        """Cancel the computation and return its request, None without one."""
         if self.job is not None:
             self.job.cancel()
         request = self.request

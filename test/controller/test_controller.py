@@ -327,6 +327,7 @@ def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
         before = steering.command(
             Measurement(time=10.0 + i * PERIOD, depth=0.02 + 1e-5 * i, velocity=0.01)
         )
+    # Cruising at the speed limit: the setpoint is the limit itself, to rounding.
     assert before.setpoint.velocity == pytest.approx(0.01, rel=1e-12)
     where = 0.02 + 1e-5 * 500
     for i in range(200):

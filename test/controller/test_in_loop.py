@@ -75,13 +75,13 @@ def test_sliding_is_linear_flow_with_constant_dry_friction() -> None:
 
 
 def test_needle_sticks_within_friction_bound_and_reports_the_time() -> None:
-    """An underdamped PID oscillates, comes to rest, and stays where abs(kp e) <= mu_s, exactly."""
+    """An underdamped PID oscillates, stops, and stays where abs(kp e) <= mu_s, exactly."""
     model = NeedleModel(replace(MODEL.parameters, viscous_friction=0.01))
     law = ContinuousPid(model=model, kp=[5.0, 1e-6], kd=[0.005, 1e-8])
     run = run_continuous(law, model, STRAIGHT, goal(0.17), np.linspace(0.0, 1.0, 201))
     names = [name for _, name in run.events]
-    assert names[-1] == 'comes to rest'
-    assert names.count('comes to rest') >= 2
+    assert names[-1] == 'stops'
+    assert names.count('stops') >= 2
     late = run.time > run.events[-1][0]
     assert late.sum() > 100
     assert np.ptp(run.depth[late]) == 0.0

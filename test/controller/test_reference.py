@@ -98,7 +98,7 @@ def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
 def test_minimum_jerk_reaches_its_speed_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
-    # Peak of the quintic at half time: 15/8 of the mean speed.
+    # Peak of the quintic at half time: 15/8 of the mean speed; tolerance of rounding.
     assert motion.at(0.5 * motion.duration).velocity == pytest.approx(LIMITS.speed, rel=1e-12)
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
 

@@ -124,7 +124,7 @@ def test_constant_readings_of_a_noisy_sensor_are_frozen() -> None:
 @pytest.mark.parametrize(
     'readings',
     [[0.0] * 2000, [0.1 * 0.9**i if i < 300 else 0.0 for i in range(2000)]],
-    ids=['still from the start', 'comes to rest'],
+    ids=['still from the start', 'stops'],
 )
 def test_constant_readings_of_a_noise_free_sensor_are_valid(readings: list[float]) -> None:
     """A perfect sensor at rest is not frozen."""

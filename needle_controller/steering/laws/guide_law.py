@@ -41,7 +41,7 @@ class GuideLaw(ABC):
         self.prepare(model)
 
     def prepare(self, model: SteeringModel) -> None:  # noqa: B027
-        """Compute constants before the first step; there are none by default."""
+        """Compute constants before the first step; the default computes nothing."""
 
     def aim(self, target: ArrayLike) -> None:
         """Continue to another target at the same depth, x and z [m]."""
