@@ -236,14 +236,14 @@ class IdentificationNode(BaseNode):
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
         """Identify each distinct recording; log its losses and warnings."""
         estimates = []
-        seen: dict[bytes, str] = {}
+        digests: dict[bytes, str] = {}
         for bag in self._bags:
             recording = read(bag)
-            if recording.digest in seen:
-                same = seen[recording.digest]
+            if recording.digest in digests:
+                same = digests[recording.digest]
                 self.get_logger().warning(f'{bag}: the same samples as {same}: counts once')
                 continue
-            seen[recording.digest] = bag
+            digests[recording.digest] = bag
             estimate = identify(recording)
             for words in (*recording.losses, *estimate.warnings):
                 self.get_logger().warning(f'{bag}: {words}')
@@ -263,8 +263,8 @@ class IdentificationNode(BaseNode):
         at, sign = reading.names.index(self._joint), self._joint_sign
         position, velocity, _ = reading.values
         if len(position) > at:
-            speed = sign * velocity[at] if len(velocity) > at else None
-            self._live.take_motion(reading.stamp, sign * position[at], speed)
+            along = sign * velocity[at] if len(velocity) > at else None
+            self._live.take_motion(reading.stamp, sign * position[at], along)
 
     def _on_force(self, reading: Reading) -> None:
         if self._live is not None:

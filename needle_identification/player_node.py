@@ -35,7 +35,7 @@ _TICK: Final = 1e-3
 _LONGEST_BURST: Final = 1e-3
 
 #: Time between checks for other publishers [s].
-_LOOK: Final = 0.25
+_CHECK: Final = 0.25
 
 #: Message by phase, before the path of the bag.
 _STATES: Final = {
@@ -181,7 +181,7 @@ class PlayerNode(BaseNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers_of_play = [
             self.create_timer(_TICK, self._on_timer, clock=steady),
-            self.create_timer(_LOOK, self._look, clock=steady),
+            self.create_timer(_CHECK, self._check_publishers, clock=steady),
         ]
 
     def about(self) -> str:
@@ -290,7 +290,7 @@ class PlayerNode(BaseNode):
 
     # Diagnostics.
 
-    def _look(self) -> None:
+    def _check_publishers(self) -> None:
         contested = {
             name
             for name in self._outputs

@@ -147,7 +147,7 @@ class BagPlayback:
             days, name = pause / _LONGEST_PAUSE, self._next.topic.name
             raise RecordingError(
                 f'{self.bag.path} has a damaged receive time at {self.seconds(self._last):.3f} s: '
-                f'a message of {name} came {days:.3g} days later'
+                f'a message of {name} arrives {days:.3g} days later'
             )
         if self._settings.rate > 0.0:
             late = self.position - self._next.received

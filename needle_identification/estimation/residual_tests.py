@@ -69,7 +69,7 @@ def residual_tests(
     residual: FloatArray,
     *,
     time: FloatArray,
-    speed: FloatArray,
+    velocity: FloatArray,
     parts: Parts,
     memory: Memory,
     parameters: int,
@@ -82,8 +82,8 @@ def residual_tests(
     if len(parts.limits) < _FEWEST_PARTS:
         return ()
     means = memory.whitened(parts.means(residual), parts)
-    speeds, times = parts.means(speed), parts.means(time)
-    groups = np.array_split(np.argsort(speeds), min(10, len(means) // 5))
+    velocities, times = parts.means(velocity), parts.means(time)
+    groups = np.array_split(np.argsort(velocities), min(10, len(means) // 5))
     with np.errstate(invalid='ignore', divide='ignore'):
         found = {'normality': _normality(means), 'trend': _trend(times, means)}
         if len(groups) > parameters:

@@ -190,8 +190,8 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     without[start : start + len(columns_of(more, settings))] = False
     fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
     misfits = np.zeros(2)
-    for held in range(int(fold.max()) + 1):
-        out = fold == held
+    for omitted in range(int(fold.max()) + 1):
+        out = fold == omitted
         for k, chosen in enumerate((without, slice(None))):
             solution = np.linalg.lstsq(x[~out][:, chosen], y[~out], rcond=None)[0]
             misfits[k] += float(np.sum((y[out] - x[out][:, chosen] @ solution) ** 2))

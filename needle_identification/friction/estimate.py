@@ -31,7 +31,7 @@ class Fit:
     ----------
     time : ndarray
         Evenly spaced time on the clock of the recording [s].
-    speed : ndarray
+    velocity : ndarray
         Filtered velocity [m/s], delayed by the lag of the force.
     force, model : ndarray
         Filtered and fitted force [N]; the fitted force is nan for samples that were not used.
@@ -41,7 +41,7 @@ class Fit:
     """
 
     time: FloatArray
-    speed: FloatArray
+    velocity: FloatArray
     force: FloatArray
     model: FloatArray
     used: BoolArray

@@ -63,7 +63,7 @@ class FilteredSignals:
     lost: BoolArray  # in a gap of the recording, or saturated
     half_filter: int  # half the length of the filter [samples]
     margin: int  # reach of a change of the velocity in the force [samples]
-    speed_noise: float  # standard deviation after the filter [m/s]
+    velocity_noise: float  # standard deviation after the filter [m/s]
     acceleration_noise: float  # likewise [m/s^2]
     from_positions: bool  # velocity differentiated from the depth
     cut_off: float  # fraction of samples with a saturated force
@@ -75,7 +75,7 @@ class FilteredSignals:
 
     @property
     def moving_speed(self) -> float:
-        return max(self.settings.moving_speed, _CLEARLY * self.speed_noise)
+        return max(self.settings.moving_speed, _CLEARLY * self.velocity_noise)
 
 
 def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
@@ -104,14 +104,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     taps = filter_taps(settings.cutoff, period)
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
-    from_positions = recording.speed is None
-    measured = recording.depth if recording.speed is None else recording.speed
+    from_positions = recording.velocity is None
+    measured = recording.depth if recording.velocity is None else recording.velocity
     raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
-    motion = _filtered_speed(grid, raw, taps, step, from_positions)
+    motion = _filtered_velocity(grid, raw, taps, step, from_positions)
     impulse = np.zeros(8 * half + 8 * step + 17)
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
-    response = _filtered_speed(around, impulse, taps, 1, from_positions)
+    response = _filtered_velocity(around, impulse, taps, 1, from_positions)
     noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
     return FilteredSignals(
         settings=settings,
@@ -123,7 +123,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
         half_filter=ceil(half / step),
         margin=max(1, ceil(2 * (half - 1) / step)),
-        speed_noise=noise * float(np.linalg.norm(response(around))),
+        velocity_noise=noise * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
         from_positions=from_positions,
         cut_off=float(cut.mean()),
@@ -175,7 +175,7 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
     return np.asarray(parts[:, :step].ravel()[overlap : len(padded)])
 
 
-def _filtered_speed(
+def _filtered_velocity(
     time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, from_depth: bool
 ) -> BSpline:
     """Return the filtered velocity as a spline of time, from velocity or from depth."""
@@ -191,13 +191,13 @@ def _filtered_speed(
     return spline
 
 
-def _white_noise(raw: FloatArray, speed: FloatArray, acceleration: FloatArray) -> float:
+def _white_noise(raw: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> float:
     """Return a robust estimate of the white noise standard deviation from fourth differences."""
     size = np.abs(acceleration)
     # Large noise dominates the acceleration most of the time.
     unsteady = size > max(0.1 * float(size.max()), 3.0 * float(np.median(size)))
     steady = maximum_filter1d(unsteady.astype(np.uint8), 9) == 0
-    steady &= np.abs(speed) > 0.1 * np.max(np.abs(speed))
+    steady &= np.abs(velocity) > 0.1 * np.max(np.abs(velocity))
     differences = np.abs(np.diff(raw, 4))[steady[2:-2]]
     # 80th percentile: encoder counts at constant velocity may show no noise in half the strokes.
     # The fourth difference of white noise has 70 times its variance.

@@ -94,12 +94,12 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     """Return the mean squared misfit at a lag of every n-th sample; nan if too few move."""
     settings, time, force = signals.settings, signals.time[::every], signals.force[::every]
     then = np.clip(time - lag, time[0], time[-1])
-    speed, acceleration = signals.motion(then), signals.motion(then, 1)
-    moving = np.abs(speed) > signals.moving_speed
+    velocity, acceleration = signals.motion(then), signals.motion(then, 1)
+    moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
     motion = NeedleMotion(
-        speed[moving],
+        velocity[moving],
         acceleration[moving],
         time[moving] - time[0],
         np.interp(then[moving], signals.time, signals.depth),

@@ -102,7 +102,7 @@ def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Pun
     half_width = float(ndtri(0.975))
     # Variance of two means, with extrapolation by half a window and half the filter.
     error = noise * sqrt(1.0 + 1.5 * (1.0 + 2.0 * reach / width) ** 2)
-    place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
+    place = hypot(reach * signals.period * float(design.velocity[at]), 1e-6) / sqrt(3.0)
     return Puncture(
         time=float(signals.time[at]),
         depth=with_half_width(_DEPTH, float(design.depth[at]), place, half_width * place),

@@ -84,8 +84,8 @@ class RecursiveFriction:
     >>> from needle_identification import FrictionSettings, RecursiveFriction
     >>> live = RecursiveFriction(FrictionSettings(), rate=250.0, forgetting=30.0)
     >>> for time in np.arange(0.0, 20.0, 0.004):
-    ...     speed = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
-    ...     live.update(time, speed, force=0.56 * np.sign(speed) + 300.0 * speed)
+    ...     velocity = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    ...     live.update(time, velocity, force=0.56 * np.sign(velocity) + 300.0 * velocity)
     >>> {found.name: round(found.value, 3) for found in live.estimate()}
     {'coulomb_friction': 0.56, 'viscous_friction': 300.0}
 
@@ -124,7 +124,7 @@ class RecursiveFriction:
         self._regime = 0.0
         self._since_change = 0
 
-    def update(self, time: float, speed: float, force: float) -> None:
+    def update(self, time: float, velocity: float, force: float) -> None:
         """
         Add one sample.
 
@@ -132,12 +132,12 @@ class RecursiveFriction:
         ----------
         time : float
             Time [s]. After a gap or a backward step, the filter restarts.
-        speed, force : float
+        velocity, force : float
             Insertion velocity [m/s] and force of the base on the needle [N], positive into the
             tissue. A sample that is not finite counts as a gap.
 
         """
-        if not abs(speed) + abs(force) < inf:
+        if not abs(velocity) + abs(force) < inf:
             self._time = -inf
             return
         if not 0.0 < time - self._time < GAP * self._period:
@@ -145,7 +145,7 @@ class RecursiveFriction:
             self._smooth.clear()
             self._drop_pending()
         self._time = time
-        self._raw.append((speed, force))
+        self._raw.append((velocity, force))
         if len(self._raw) < len(self._taps):
             return
         smooth = self._taps @ np.array(self._raw)
@@ -159,10 +159,10 @@ class RecursiveFriction:
         self._pending.clear()
         self._since_change = 0
 
-    def _select(self, speed: float, acceleration: float, force: float) -> None:
+    def _select(self, velocity: float, acceleration: float, force: float) -> None:
         """Use samples in steady motion, after the motion has remained steady for the margin."""
         settings = self._settings
-        regime = float(np.sign(speed)) if abs(speed) > settings.moving_speed else 0.0
+        regime = float(np.sign(velocity)) if abs(velocity) > settings.moving_speed else 0.0
         if self._estimates_lag and abs(acceleration) > settings.largest_acceleration:
             regime = nan
         if regime != self._regime:
@@ -171,20 +171,22 @@ class RecursiveFriction:
         self._since_change += 1
         if self._since_change <= self._margin or abs(regime) != 1.0:
             return
-        self._pending.append((speed, acceleration, force))
+        self._pending.append((velocity, acceleration, force))
         if len(self._pending) > self._margin:
             self._learn(*self._pending.popleft())
 
-    def _learn(self, speed: float, acceleration: float, force: float) -> None:
+    def _learn(self, velocity: float, acceleration: float, force: float) -> None:
         none = np.zeros(1)
-        motion = NeedleMotion(np.array([speed]), np.array([acceleration]), none, none, none > 0.0)
+        motion = NeedleMotion(
+            np.array([velocity]), np.array([acceleration]), none, none, none > 0.0
+        )
         row = regressors(motion, self._settings.terms, self._settings)[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)
         products = np.outer(row, np.append(row, force))
         self._known = self._decay * self._known + products
         self._part = self._decay * self._part + products
-        self._speed_sum = self._decay * self._speed_sum + abs(speed)
+        self._speed_sum = self._decay * self._speed_sum + abs(velocity)
         self._weight = self._decay * self._weight + 1.0
         self._count += 1
         if self._count % self._length == 0:
@@ -288,19 +290,19 @@ class LiveFriction:
         """Number of discarded samples by reason."""
         return dict(self._dropped)
 
-    def take_motion(self, stamp: int, depth: float, speed: float | None) -> None:
+    def take_motion(self, stamp: int, depth: float, velocity: float | None) -> None:
         """Add depth [m] and velocity [m/s], or depth to differentiate, at a stamp [ns]."""
-        time = self._time('motion', stamp, depth if speed is None else speed)
+        time = self._time('motion', stamp, depth if velocity is None else velocity)
         if time is None:
             return
-        if speed is None:
+        if velocity is None:
             before, self._last_depth = self._last_depth, (time, depth)
             if before is None:
                 return
             # The difference quotient is the velocity at the midpoint.
-            speed = (depth - before[1]) / (time - before[0])
+            velocity = (depth - before[1]) / (time - before[0])
             time = (time + before[0]) / 2.0
-        self._motion.append((time, speed))
+        self._motion.append((time, velocity))
         self._pair()
 
     def take_force(self, stamp: int, force: float) -> None:
@@ -317,7 +319,7 @@ class LiveFriction:
     def _time(self, topic: str, stamp: int, value: float) -> float | None:
         """Return the time since the start [s], or None if the sample is discarded."""
         if not abs(value) <= _LARGEST[topic]:
-            self._dropped['absurd' if isfinite(value) else 'not finite'] += 1
+            self._dropped['implausible' if isfinite(value) else 'not finite'] += 1
             return None
         if self._start is None:
             self._start = stamp
@@ -339,18 +341,18 @@ class LiveFriction:
             time, force = self._force.popleft()
             while len(motion) > 1 and motion[1][0] <= time:
                 motion.popleft()
-            speed = _interpolated(motion, time)
-            if isfinite(speed):
-                self._pass_on(time, speed, force)
+            velocity = _interpolated(motion, time)
+            if isfinite(velocity):
+                self._pass_on(time, velocity, force)
             else:
                 self._dropped['no motion at their time'] += 1
 
-    def _pass_on(self, time: float, speed: float, force: float) -> None:
+    def _pass_on(self, time: float, velocity: float, force: float) -> None:
         self.samples += 1
         if self._estimator is not None:
-            self._estimator.update(time, speed, force)
+            self._estimator.update(time, velocity, force)
             return
-        self._first.append((time, speed, force))
+        self._first.append((time, velocity, force))
         if len(self._first) == _FIRST:
             period = median(after[0] - before[0] for before, after in pairwise(self._first))
             self._estimator = RecursiveFriction(self._settings, 1.0 / period, self._forgetting)
@@ -359,10 +361,10 @@ class LiveFriction:
 
 
 def _interpolated(motion: deque[tuple[float, float]], time: float) -> float:
-    before, speed = motion[0]
+    before, velocity = motion[0]
     if before == time:
-        return speed
+        return velocity
     if before > time or motion[1][0] - before > _LARGEST_STEP:
         return nan
     after, later = motion[1]
-    return speed + (later - speed) * (time - before) / (after - before)
+    return velocity + (later - velocity) * (time - before) / (after - before)

@@ -30,7 +30,7 @@ import numpy as np
 class NeedleMotion(NamedTuple):
     """Motion of the needle, (n,) each, positive into the tissue."""
 
-    speed: FloatArray  # [m/s]
+    velocity: FloatArray  # [m/s]
     acceleration: FloatArray  # [m/s^2]
     time: FloatArray  # since the start of the recording [s]
     depth: FloatArray  # insertion depth [m]
@@ -48,18 +48,20 @@ class Regressor:
 
 
 _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
-    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
-    'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
-    'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
+    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.velocity)),),
+    'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.velocity),),
+    'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.velocity)),),
     # Drift of sensor or tissue since the start of the recording.
     'drift': (Regressor('force_drift', 'c', 'N/s', lambda x, _: x.time),),
     'inertia': (Regressor('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
     # Additional Coulomb and viscous friction on withdrawal.
     'direction': (
         Regressor(
-            'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.speed), 0)
+            'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.velocity), 0)
         ),
-        Regressor('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
+        Regressor(
+            'withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.velocity, 0.0)
+        ),
     ),
     # Excess of the breakaway friction over mu_s.
     'stribeck': (
@@ -67,16 +69,16 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
             'stribeck_friction',
             'mu_b - mu_s',
             'N',
-            lambda x, s: np.sign(x.speed) * np.exp(-((x.speed / s.stribeck_speed) ** 2)),
+            lambda x, s: np.sign(x.velocity) * np.exp(-((x.velocity / s.stribeck_speed) ** 2)),
         ),
     ),
     'length': (
-        Regressor('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.speed) * x.depth),
+        Regressor('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.velocity) * x.depth),
     ),
     'cutting': (
         Regressor(
             'cutting_force', 'f_c', 'N',
-            lambda x, _: np.where(x.fresh & (x.speed > 0.0), 1.0, 0.0),
+            lambda x, _: np.where(x.fresh & (x.velocity > 0.0), 1.0, 0.0),
         ),
     ),
 }  # fmt: skip
@@ -97,7 +99,7 @@ def _in_layer(
     begin: float, thickness: float, motion: NeedleMotion, _: FrictionSettings
 ) -> FloatArray:
     inside = np.clip(motion.depth - begin, 0.0, thickness)
-    return np.asarray(np.sign(motion.speed) * inside)
+    return np.asarray(np.sign(motion.velocity) * inside)
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:

@@ -35,7 +35,7 @@ _MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOM
 _FORCE: Final = (wire.WRENCH,)
 
 #: Message types of velocities.
-_SPEEDS: Final = (wire.TWIST,)
+_VELOCITIES: Final = (wire.TWIST,)
 
 #: Smallest speed in motion, as a fraction of the largest speed.
 _MOVING: Final = 0.05
@@ -320,13 +320,13 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     every = max(1, len(motion.stamps) // _TRIED)
     time = 1e-9 * (motion.stamps[::every] - start)
     values = motion.values[::every]
-    speed = values if motion.topic.type_name in _SPEEDS else np.gradient(values, time)
+    velocity = values if motion.topic.type_name in _VELOCITIES else np.gradient(values, time)
     read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
-    moving = np.abs(speed) > _MOVING * np.quantile(np.abs(speed), 0.99)
+    moving = np.abs(velocity) > _MOVING * np.quantile(np.abs(velocity), 0.99)
     moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))
     if np.count_nonzero(moving) < 10:
         return 0.0, 0.0
-    x = np.column_stack([np.sign(speed), speed, np.ones_like(speed)])[moving]
+    x = np.column_stack([np.sign(velocity), velocity, np.ones_like(velocity)])[moving]
     y = read[moving]
     solution = np.linalg.lstsq(x, y, rcond=None)[0]
     variance = float(np.var(y))
@@ -336,5 +336,5 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     along = float(np.var(x[:, :2] @ solution[:2]))
     left = float(np.var(y - x @ solution))
     return max(0.0, min(along, variance - left) / variance), float(
-        np.mean((x[:, :2] @ solution[:2]) * np.sign(speed[moving]))
+        np.mean((x[:, :2] @ solution[:2]) * np.sign(velocity[moving]))
     )

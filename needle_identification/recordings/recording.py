@@ -89,7 +89,7 @@ class Recording(_AnyRecording):
         Time [s], strictly increasing.
     force : ndarray, shape (n,)
         Force of the base on the needle f_y [N], positive into the tissue.
-    speed : ndarray, shape (n,), or None
+    velocity : ndarray, shape (n,), or None
         Insertion velocity [m/s], positive into the tissue; None if only positions were recorded.
     depth : ndarray, shape (n,)
         Insertion depth s [m]; default: integral of the velocity from zero.
@@ -104,12 +104,13 @@ class Recording(_AnyRecording):
     Raises
     ------
     ShapeError
-        If the arrays differ in length or are not finite, time does not increase, or both speed
-        and depth are missing.
+        If the arrays differ in length or are not finite, time does not increase, or both
+        velocity and depth are missing.
 
     Examples
     --------
-    >>> recording = Recording(time=[0.0, 0.1, 0.2], speed=[0.0, 0.01, 0.01], force=[0.0, 3.5, 3.6])
+    >>> velocity = [0.0, 0.01, 0.01]
+    >>> recording = Recording(time=[0.0, 0.1, 0.2], velocity=velocity, force=[0.0, 3.5, 3.6])
     >>> recording
     <Recording recording: 3 samples in 0.2 s>
     >>> recording.depth.tolist()
@@ -118,16 +119,16 @@ class Recording(_AnyRecording):
     """
 
     force: FloatArray
-    speed: FloatArray | None = None
+    velocity: FloatArray | None = None
     depth: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        if self.speed is not None:
-            self._freeze(speed=None)
+        if self.velocity is not None:
+            self._freeze(velocity=None)
             if self.depth is None:
-                object.__setattr__(self, 'depth', integrated(self.time, self.speed))
+                object.__setattr__(self, 'depth', integrated(self.time, self.velocity))
         elif self.depth is None:
-            raise ShapeError(f'{self.name}: speed or depth must be given')
+            raise ShapeError(f'{self.name}: velocity or depth must be given')
         self._freeze(depth=None, force=None)
 
 
@@ -164,7 +165,7 @@ class IndentationRecording(_AnyRecording):
         self._freeze(position=2, off_plane=None, force=2)
 
 
-def integrated(time: FloatArray, speed: FloatArray) -> FloatArray:
+def integrated(time: FloatArray, velocity: FloatArray) -> FloatArray:
     """Integrate a velocity [m/s], (n,), from zero over time [s] (trapezoidal rule)."""
-    steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2.0
+    steps = np.diff(time) * (velocity[1:] + velocity[:-1]) / 2.0
     return np.concatenate([[0.0], np.cumsum(steps)])

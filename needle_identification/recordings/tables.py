@@ -282,7 +282,7 @@ def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) 
         name=str(path),
         time=times,
         depth=found['depth'],
-        speed=found.get('speed'),
+        velocity=found.get('speed'),
         force=found['force'],
         losses=tuple(losses),
     )
@@ -387,10 +387,10 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    seen: set[str] = set()
+    used: set[str] = set()
     for k, name in enumerate(names):
-        unique = name if name and name not in seen else f'{name}{k + 1}'
-        seen.add(unique)
+        unique = name if name and name not in used else f'{name}{k + 1}'
+        used.add(unique)
         yield unique
 
 

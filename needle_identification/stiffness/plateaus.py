@@ -83,13 +83,13 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     zero = np.column_stack([np.interp(time[first], middle[rest], c) for c in mean[rest, :2].T])
     size = np.hypot(*(means[:, :2] - zero).T)
     pressed = size > settings.rest_force
-    held = np.zeros(len(means), dtype=np.bool_)
+    in_hold = np.zeros(len(means), dtype=np.bool_)
     for (start, length), is_rest in zip(runs, rest, strict=True):
-        held[start : start + length] = not is_rest
+        in_hold[start : start + length] = not is_rest
     edges = np.flatnonzero(np.diff(np.pad(pressed.astype(np.int8), 1))).reshape(-1, 2)
     # Noise may cross the limit of a rest repeatedly, but not twice the limit.
     high = size > 2.0 * settings.rest_force
-    missed = sum(high[up:down].any() and not held[up:down].any() for up, down in edges)
+    missed = sum(high[up:down].any() and not in_hold[up:down].any() for up, down in edges)
     return Plateaus(middle, mean, _variances(channels, parts), rest, missed)
 
 

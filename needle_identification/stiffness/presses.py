@@ -183,15 +183,15 @@ def _follow_zero(
     """
     mean: FloatArray = rests.mean(axis=0)
     knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)
-    seen, asked = place[: len(times)], place[len(times) :]
+    measured, asked = place[: len(times)], place[len(times) :]
     precision = np.zeros((len(knots), len(knots)))
-    precision[seen, seen] = 1.0 / variance
+    precision[measured, measured] = 1.0 / variance
     rate = _drift_rate(times, rests, variance) if len(times) > 1 else variance[0]
     if len(knots) > 1:
         difference = np.diff(np.eye(len(knots)), axis=0)
         precision += difference.T @ (difference / (rate * np.diff(knots))[:, np.newaxis])
     covariance = np.linalg.inv(precision)
-    gain = covariance[np.ix_(asked, seen)] / variance
+    gain = covariance[np.ix_(asked, measured)] / variance
     zero: FloatArray = mean + gain @ (rests - mean)
     return zero, np.asarray(covariance[np.ix_(asked, asked)])
 

@@ -176,8 +176,8 @@ def test_only_collinear_parameters_are_not_determined(estimator: str) -> None:
 @pytest.mark.parametrize(('spread', 'determined'), [(0.05, False), (0.3, True)])
 def test_nearly_collinear_parameters_are_not_determined(spread: float, determined: bool) -> None:
     rng = np.random.default_rng(0)
-    speed = 5e-3 * (1.0 + spread * rng.normal(size=1000))
-    x = np.column_stack([np.ones(1000), speed])
+    velocity = 5e-3 * (1.0 + spread * rng.normal(size=1000))
+    x = np.column_stack([np.ones(1000), velocity])
     found = regress(x, x @ [0.56, 300.0])
     assert (found.determined == determined).all()
 
