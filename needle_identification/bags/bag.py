@@ -33,19 +33,7 @@ _BATCHES: Final = {'.mcap': mcap_batches, '.db3': sqlite_batches, '.bag': _ros1_
 
 
 class Recorded(NamedTuple):
-    """
-    A message of a bag.
-
-    Attributes
-    ----------
-    received : int
-        Receive time [ns].
-    topic : BagTopic
-        Topic of the message.
-    data : bytes
-        Serialized message (CDR).
-
-    """
+    """A message of a bag: receive time [ns], topic, and serialized message (CDR)."""
 
     received: int
     topic: BagTopic

@@ -66,44 +66,20 @@ _MAX_ITERATIONS: Final = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Regression:
-    """
-    Solution of a linear regression with k parameters and n samples.
+    """Solution of a linear regression with k parameters and n samples."""
 
-    Attributes
-    ----------
-    values, errors : ndarray, shape (k,)
-        Parameters and their standard errors; nan and inf where not determined.
-    covariance : ndarray, shape (k, k)
-        Covariance of the parameters; nan, and inf on the diagonal, where not determined.
-    determined : ndarray of bool, shape (k,)
-        Whether the regressors distinguish the parameter from the others.
-    condition : float
-        Condition number of the regressors, each scaled to unit norm.
-    residual : ndarray, shape (n,)
-        Response minus model; zero where not used.
-    determination : float
-        Coefficient of determination R^2.
-    samples : int
-        Number of samples used.
-    effective_samples : float
-        Number of independent samples with the same information.
-    degrees_of_freedom : ndarray, shape (k,)
-        Degrees of freedom of the errors; few where few samples determine a parameter.
-    memory : Memory or None
-        Autocorrelation of the noise, included in the errors; None if not requested.
-
-    """
-
-    values: FloatArray
-    covariance: FloatArray
-    errors: FloatArray
-    determined: BoolArray
-    condition: float
-    residual: FloatArray
-    determination: float
-    samples: int
-    effective_samples: float
+    values: FloatArray  #: (k,) parameters; nan where not determined
+    covariance: FloatArray  #: (k, k) of the parameters; nan, and inf on the diagonal, likewise
+    errors: FloatArray  #: (k,) standard errors; inf likewise
+    determined: BoolArray  #: (k,) whether the regressors distinguish the parameter from the others
+    condition: float  #: condition number of the regressors, each scaled to unit norm
+    residual: FloatArray  #: (n,) response minus model; zero where not used
+    determination: float  #: coefficient of determination R^2
+    samples: int  #: number of samples used
+    effective_samples: float  #: number of independent samples with the same information
+    #: (k,) degrees of freedom of the errors; few where few samples determine a parameter.
     degrees_of_freedom: FloatArray
+    #: Autocorrelation of the noise, included in the errors; None if not requested.
     memory: Memory | None = None
 
     def __repr__(self) -> str:

@@ -43,22 +43,12 @@ _WORDS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualTest:
-    """
-    A test of the residuals of a fit.
+    """A test of the residuals of a fit."""
 
-    Attributes
-    ----------
-    name, words : str
-        ``normality``, ``trend``, ``speed`` or ``spread``, and the result in words.
-    statistic, p_value : float
-        Statistic and p-value of the test; a small p-value is evidence against the model.
-
-    """
-
-    name: str
+    name: str  #: ``normality``, ``trend``, ``speed`` or ``spread``
     statistic: float
-    p_value: float
-    words: str
+    p_value: float  #: a small value is evidence against the model
+    words: str  #: result in words
 
     @property
     def failed(self) -> bool:

@@ -33,35 +33,19 @@ _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateFit:
-    """
-    Comparison of an alternative set of terms with the chosen set.
+    """Comparison of an alternative set of terms with the chosen set."""
 
-    Attributes
-    ----------
-    terms : tuple of str
-        Alternative set: one term more or less, or two more.
-    criterion : str
-        Criterion of the comparison: BIC, with the effective number of samples.
-    difference : float
-        BIC of the alternative set minus BIC of the chosen set; negative if the alternative is
-        better, nan if it is not determined.
-    p_value : float
-        p-value of the Wald test that the differing terms are zero, with standard errors that
-        account for autocorrelation, corrected for the number of terms tried (Holm).
-    supported : bool
-        Whether the data support the alternative set; an additional term must also improve the
-        prediction of held-out samples.
-    words : str
-        Result as a sentence.
-
-    """
-
-    terms: tuple[str, ...]
-    criterion: str = 'BIC'
+    terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
+    criterion: str = 'BIC'  #: with the effective number of samples
+    #: BIC of the alternative set minus BIC of the chosen set; nan if it is not determined.
     difference: float = nan
+    #: Of the Wald test that the differing terms are zero, with errors for autocorrelated noise,
+    #: corrected for the number of terms tried (Holm).
     p_value: float = 1.0
+    #: Whether the data support the set; an additional term must also improve the prediction of
+    #: held-out samples.
     supported: bool = False
-    words: str
+    words: str  #: result as a sentence
 
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:

@@ -32,21 +32,11 @@ _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Puncture:
-    """
-    Puncture of a tissue boundary.
+    """Puncture of a tissue boundary."""
 
-    Attributes
-    ----------
-    time : float
-        Time on the clock of the recording [s].
-    depth, drop : ParameterEstimate
-        Insertion depth [m] and drop of the force [N].
-
-    """
-
-    time: float
-    depth: ParameterEstimate
-    drop: ParameterEstimate
+    time: float  #: on the clock of the recording [s]
+    depth: ParameterEstimate  #: insertion depth [m]
+    drop: ParameterEstimate  #: drop of the force [N]
 
 
 def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:

@@ -51,17 +51,7 @@ _TRIED: Final = 20_000
 
 
 class ColumnSummary(NamedTuple):
-    """
-    One component of a topic, or one column of a table.
-
-    Attributes
-    ----------
-    name : str
-        Axis, joint, or name of the column.
-    low, high : float
-        Range of its values.
-
-    """
+    """One component of a topic or one column of a table, with the range of its values."""
 
     name: str
     low: float
@@ -70,57 +60,25 @@ class ColumnSummary(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Content:
-    """
-    One topic of a bag, or a whole table.
+    """One topic of a bag, or a whole table."""
 
-    Attributes
-    ----------
-    name, type_name : str
-        Name and type of the topic, or file name and ``table``.
-    count : int
-        Number of messages or rows.
-    rate : float
-        Messages per second, from the median step; nan if not inspected.
-    gaps : int
-        Number of pauses of more than ten steps.
-    columns : tuple of ColumnSummary
-        Components with their ranges; none if the type is not supported.
-
-    """
-
-    name: str
-    type_name: str
-    count: int
-    rate: float = float('nan')
-    gaps: int = 0
-    columns: tuple[ColumnSummary, ...] = ()
+    name: str  #: of the topic, or of the file
+    type_name: str  #: of the messages, or ``table``
+    count: int  #: number of messages or rows
+    rate: float = float('nan')  #: messages per second, from the median step; nan if not inspected
+    gaps: int = 0  #: number of pauses of more than ten steps
+    columns: tuple[ColumnSummary, ...] = ()  #: components; none if the type is not supported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """
-    Content of a recording, and a command to identify from it.
+    """Content of a recording, and a command to identify from it."""
 
-    Attributes
-    ----------
-    path : str
-        Path of the recording.
-    contents : tuple of Content
-        Topics, or the table.
-    losses : tuple of str
-        Missing or damaged parts.
-    words : tuple of str
-        Probable force and motion, with the reason.
-    command : str
-        Command for identification; '' if no force and motion were found.
-
-    """
-
-    path: str
-    contents: tuple[Content, ...]
-    losses: tuple[str, ...]
-    words: tuple[str, ...]
-    command: str
+    path: str  #: of the recording
+    contents: tuple[Content, ...]  #: topics, or the table
+    losses: tuple[str, ...]  #: missing or damaged parts
+    words: tuple[str, ...]  #: probable force and motion, with the reason
+    command: str  #: for identification; '' if no force and motion were found
 
 
 def inspect_recording(path: Path | str) -> Inspection:

@@ -24,32 +24,16 @@ _WORTH_WARNING: Final = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Presses:
-    """
-    Presses of a recording, relative to the adjacent rests.
+    """Presses of a recording, relative to the adjacent rests; x and z in columns."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (m,)
-        Center of the hold [s].
-    displacement, force : ndarray, shape (m, 2)
-        Mean displacement [m] and force on the tissue [N] along x and z.
-    displacement_error, force_error : ndarray, shape (m, 2)
-        Their standard errors, which account for the autocorrelation of the samples.
-    off_plane : ndarray, shape (m,)
-        Displacement out of the plane [m].
-    level, direction : ndarray of int, shape (m,)
-        Index of the force level and of the direction.
-
-    """
-
-    time: FloatArray
-    displacement: FloatArray
-    force: FloatArray
-    displacement_error: FloatArray
-    force_error: FloatArray
-    off_plane: FloatArray
-    level: IntArray
-    direction: IntArray
+    time: FloatArray  #: (m,) center of the hold [s]
+    displacement: FloatArray  #: (m, 2) mean displacement [m]
+    force: FloatArray  #: (m, 2) mean force on the tissue [N]
+    displacement_error: FloatArray  #: (m, 2) standard error, for autocorrelated samples
+    force_error: FloatArray  #: (m, 2) likewise
+    off_plane: FloatArray  #: (m,) displacement out of the plane [m]
+    level: IntArray  #: (m,) index of the force level
+    direction: IntArray  #: (m,) index of the direction
 
     def __repr__(self) -> str:
         levels, directions = int(self.level.max()) + 1, int(self.direction.max()) + 1
