@@ -11,7 +11,6 @@ of the force.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
 from itertools import pairwise
 from math import ceil, exp, inf, isfinite, nan
 from statistics import median
@@ -106,19 +105,17 @@ class RecursiveFriction:
         self._taps = filter_taps(settings.cutoff, self._period)
         # The filtered acceleration needs a neighbor on either side, the lag another neighbor.
         self._margin = len(self._taps) // 2 + 2
-        self._decay = exp(-self._period / forgetting)
-        self._length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
-        self._parts: deque[tuple[FloatArray, int]] = deque(
-            maxlen=ceil(_REMEMBERED * forgetting * rate / self._length)
-        )
         self._raw: deque[tuple[float, float]] = deque(maxlen=len(self._taps))
         self._smooth: deque[tuple[float, float]] = deque(maxlen=3)
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
-        k = len(columns_of(settings.terms, settings)) + self._estimates_lag
-        #: Information A and, in the last column, b: of all samples, and of the current block.
-        self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
-        self._count = 0
+        length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
+        self._information = _Information(
+            len(columns_of(settings.terms, settings)) + self._estimates_lag,
+            exp(-self._period / forgetting),
+            length,
+            ceil(_REMEMBERED * forgetting * rate / length),
+        )
         self._speed_sum = self._weight = 0.0
         self._time = -inf
         self._regime = 0.0
@@ -183,30 +180,40 @@ class RecursiveFriction:
         row = regressors(motion, self._settings.terms, self._settings)[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)
+        self._information.add(row, force)
+        decay = self._information.decay
+        self._speed_sum = decay * self._speed_sum + abs(velocity)
+        self._weight = decay * self._weight + 1.0
+
+    def estimate(self) -> tuple[ParameterEstimate, ...]:
+        """Return the parameters of `identify_friction`; undetermined until the motion suffices."""
+        mean_speed = self._speed_sum / max(self._weight, 1.0)
+        fit = self._information.regression()
+        return parameter_estimates(fit, self._settings, mean_speed, self._period)
+
+
+class _Information:
+    """Information of k parameters with exponential forgetting, of all samples and by block."""
+
+    def __init__(self, k: int, decay: float, length: int, blocks: int) -> None:
+        """Start empty; decay per sample, length of a block, and number of blocks."""
+        self.decay, self._length = decay, length
+        #: A and, in the last column, b: of all samples, and of the current block.
+        self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
+        self._count = 0
+        self._parts: deque[tuple[FloatArray, int]] = deque(maxlen=blocks)
+
+    def add(self, row: FloatArray, force: float) -> None:
+        """Add the regressors (k,) and the force of a sample."""
         products = np.outer(row, np.append(row, force))
-        self._known = self._decay * self._known + products
-        self._part = self._decay * self._part + products
-        self._speed_sum = self._decay * self._speed_sum + abs(velocity)
-        self._weight = self._decay * self._weight + 1.0
+        self._known = self.decay * self._known + products
+        self._part = self.decay * self._part + products
         self._count += 1
         if self._count % self._length == 0:
             self._parts.append((self._part, self._count))
             self._part = np.zeros_like(self._part)
 
-    def estimate(self) -> tuple[ParameterEstimate, ...]:
-        """
-        Return the current parameters of the terms.
-
-        Returns
-        -------
-        tuple of ParameterEstimate
-            Parameters named as by `identify_friction`; undetermined until the motion suffices.
-
-        """
-        mean_speed = self._speed_sum / max(self._weight, 1.0)
-        return parameter_estimates(self._regression(), self._settings, mean_speed, self._period)
-
-    def _regression(self) -> Regression:
+    def regression(self) -> Regression:
         """Solve; standard errors use the scores of blocks longer than the noise correlation."""
         known, moment = self._known[:, :-1], self._known[:, -1]
         k = len(moment)
@@ -245,7 +252,7 @@ class RecursiveFriction:
         """Return score covariance, effective blocks per parameter, and their total number."""
         now = self._count
         parts = [*self._parts, (self._part, now)]
-        ages = np.array([self._decay ** (now - count) for _, count in parts])
+        ages = np.array([self.decay ** (now - count) for _, count in parts])
         weighed = ages[:, np.newaxis, np.newaxis] * np.array([part for part, _ in parts])
         information = weighed[:, :, :-1]
         scores = weighed[:, :, -1] - information @ values
@@ -272,7 +279,8 @@ class LiveFriction:
         # Checks the arguments except the sampling rate, which is determined later.
         RecursiveFriction(settings, 1.0, forgetting)
         self._settings, self._forgetting = settings, forgetting
-        self._dropped: Counter[str] = Counter()
+        #: Number of discarded samples by reason.
+        self.dropped: Counter[str] = Counter()
         self._restart()
 
     def _restart(self) -> None:
@@ -284,11 +292,6 @@ class LiveFriction:
         self._first: list[tuple[float, float, float]] = []
         self._estimator: RecursiveFriction | None = None
         self.samples = 0
-
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """Number of discarded samples by reason."""
-        return dict(self._dropped)
 
     def take_motion(self, stamp: int, depth: float, velocity: float | None) -> None:
         """Add depth [m] and velocity [m/s], or depth to differentiate, at a stamp [ns]."""
@@ -319,17 +322,17 @@ class LiveFriction:
     def _time(self, topic: str, stamp: int, value: float) -> float | None:
         """Return the time since the start [s], or None if the sample is discarded."""
         if not abs(value) <= _LARGEST[topic]:
-            self._dropped['implausible' if isfinite(value) else 'not finite'] += 1
+            self.dropped['implausible' if isfinite(value) else 'not finite'] += 1
             return None
         if self._start is None:
             self._start = stamp
         time = 1e-9 * (stamp - self._start)
         if time < self._last[topic] - _SET_BACK:
             self._restart()
-            self._dropped['clock set back'] += 1
+            self.dropped['clock set back'] += 1
             return None
         if time <= self._last[topic]:
-            self._dropped['out of order'] += 1
+            self.dropped['out of order'] += 1
             return None
         self._last[topic] = time
         return time
@@ -345,7 +348,7 @@ class LiveFriction:
             if isfinite(velocity):
                 self._pass_on(time, velocity, force)
             else:
-                self._dropped['no motion at their time'] += 1
+                self.dropped['no motion at their time'] += 1
 
     def _pass_on(self, time: float, velocity: float, force: float) -> None:
         self.samples += 1
