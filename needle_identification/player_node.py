@@ -170,7 +170,7 @@ class PlayerNode(BaseNode):
             self._clock_publisher = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        self._playback.settings = self.settings('', PlaybackSettings, changes)
+        self._playback.change(self.settings('', PlaybackSettings, changes))
 
     def activate(self) -> None:
         """Play from the start."""

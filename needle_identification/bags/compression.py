@@ -44,15 +44,15 @@ _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
 
-def open_file(file: Path) -> Any:
-    """Open a file, compressed or not, as a binary stream of its decompressed content."""
+def open_file(file: Path, budget: Budget) -> Any:
+    """Open the decompressed content of a file as a binary stream; count each byte read."""
     if file.suffix == '.lz4':
         archive = lz4.frame.LZ4FrameFile(file)
         # `read` would discard the last data of a truncated file.
         archive.read = archive.read1
-        return archive
+        return _Metered(archive, budget)
     stream = file.open('rb')
-    return _zstd_stream(stream) if file.suffix in COMPRESSED else stream
+    return _Metered(_zstd_stream(stream) if file.suffix in COMPRESSED else stream, budget)
 
 
 def read_up_to(stream: Any, length: int) -> bytes:
@@ -117,10 +117,6 @@ class Budget:
             f'a {what} of {size} bytes, at most {_bytes(self.largest)} are read; {FACTOR}=10 '
             'raises this limit tenfold'
         )
-
-    def metered(self, stream: Any) -> Any:
-        """Wrap a stream of decompressed bytes so that each byte read is counted."""
-        return _Metered(stream, self)
 
 
 class _Metered:

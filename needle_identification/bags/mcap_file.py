@@ -1,8 +1,4 @@
-"""
-Read messages of MCAP files, also of truncated or damaged files.
-
-A file is read from its start, chunk by chunk, in bounded memory.
-"""
+"""Read messages of MCAP files chunk by chunk, also of truncated or damaged files."""
 
 from __future__ import annotations
 
@@ -113,7 +109,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     channels = _Channels()
     loose = bytearray()
     is_complete = False
-    with tally.budget.metered(open_file(file)) as stream:
+    with open_file(file, tally.budget) as stream:
         magic = read_up_to(stream, len(_MAGIC))
         if magic != _MAGIC:
             begin = repr(magic) if magic else 'nothing'

@@ -33,11 +33,11 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())
-            unfolded = tally.budget.metered(open_file(file))
-            with unfolded as stream, Path(folder, file.stem).open('wb') as copy:
+            unfolded = Path(folder, file.stem)
+            with open_file(file, tally.budget) as stream, unfolded.open('wb') as copy:
                 while part := read_up_to(stream, BLOCK):
                     copy.write(part)
-            file = Path(folder, file.stem)
+            file = unfolded
         # An unmerged journal contains the end of the recording.
         journal = file.with_name(f'{file.name}-wal').exists()
         uri = f'file:{quote(str(file.resolve()))}?{"mode=ro" if journal else "immutable=1"}'

@@ -110,11 +110,7 @@ def make_topic(
     definition: str = '',
     profiles: str = '',
 ) -> BagTopic:
-    """
-    Build a topic; ``std_msgs/String`` (ROS 1, some writers) becomes ``std_msgs/msg/String``.
-
-    A message encoding other than ``cdr`` (ROS 2) is appended to the type.
-    """
+    """Build a topic; ``std_msgs/String`` (ROS 1, some writers) becomes ``std_msgs/msg/String``."""
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'
     # Escaped names keep error messages of damaged files on one line.

@@ -47,18 +47,12 @@ class Statistic:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
 
 
-def with_value(
-    unknown: ParameterEstimate, value: float, error: float, low: float, high: float
-) -> ParameterEstimate:
-    """Return a determined copy with a value, its standard error and its 95 % interval."""
-    return replace(unknown, value=value, error=error, interval=(low, high), determined=True)
-
-
 def with_half_width(
     unknown: ParameterEstimate, value: float, error: float, half_width: float
 ) -> ParameterEstimate:
     """Return a determined copy, with an interval symmetric about the value."""
-    return with_value(unknown, value, error, value - half_width, value + half_width)
+    interval = (value - half_width, value + half_width)
+    return replace(unknown, value=value, error=error, interval=interval, determined=True)
 
 
 _Named = TypeVar('_Named', ParameterEstimate, Statistic)

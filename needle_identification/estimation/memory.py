@@ -142,12 +142,9 @@ class Memory:
 def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
-    """
-    Estimate the autocorrelation of noise from the residuals (n,); white with too few parts.
-
-    `influence` (n, k) is the change of each parameter with the response of each sample. Regressors
-    and influence are zero for unused samples.
-    """
+    """Estimate the autocorrelation of noise from the residuals (n,); white with too few parts."""
+    # Influence (n, k): change of each parameter with the response of each sample. Regressors and
+    # influence are zero for unused samples.
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
     x = x[:, strengths > _ROUNDING * strengths[0]]

@@ -33,7 +33,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimators import check_estimator
+from needle_identification.estimation import check_estimator
 from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -93,15 +93,7 @@ class Regression:
         return 1.0 - self.determination < _ROUNDING
 
     def interval(self) -> FloatArray:
-        """
-        Return the 95 % confidence intervals of the parameters (Student's t).
-
-        Returns
-        -------
-        ndarray, shape (k, 2)
-            Lower and upper limits; infinite where not determined.
-
-        """
+        """Return the 95 % confidence intervals (k, 2); infinite where not determined."""
         half_widths = stdtrit(self.degrees_of_freedom, 0.975) * self.errors
         centers = np.where(self.determined, self.values, 0.0)
         return np.column_stack([centers - half_widths, centers + half_widths])
@@ -123,11 +115,8 @@ def wald_test(fit: Regression, at: list[int]) -> float:
 
 
 def hausman_test(part: Regression, whole: Regression, count: int) -> float:
-    """
-    Return the p-value that the first parameters agree in fits to some and to all samples.
-
-    Including the errors of ``whole`` would increase the power, but not the safety.
-    """
+    """Return the p-value that the first parameters agree in fits to some and to all samples."""
+    # Including the errors of `whole` would increase the power, but not the safety.
     at = np.flatnonzero(part.determined[:count] & whole.determined[:count])
     if not len(at) or not np.diag(part.covariance)[at].all():
         return 1.0
@@ -225,30 +214,12 @@ def regress(
         solution = _weighted(x, y, _group_weights(x, y, used, groups, span))
     elif estimator == 'huber':
         solution = _huber(x, y, used)
+    elif regressor_noise is None or len(regressor_noise) != k:
+        raise ParameterError('total needs the noise of each column')
     else:
-        if regressor_noise is None or len(regressor_noise) != k:
-            raise ParameterError('total needs the noise of each column')
         noise = np.diag(np.asarray(regressor_noise) / norms) ** 2
         solution = _total(x, y, used, basis.T @ noise @ basis)
-    return _with_errors(
-        solution, x, y, used, correlation, basis / norms[:, np.newaxis], unknown, singular, colored
-    )
-
-
-def _with_errors(
-    solution: _Solution,
-    x: FloatArray,
-    y: FloatArray,
-    used: BoolArray,
-    correlation: int,
-    back: FloatArray,
-    unknown: BoolArray,
-    singular: FloatArray,
-    colored: bool,
-) -> Regression:
-    """Add covariance and degrees of freedom, and transform back to the given columns."""
-    samples, k = int(np.count_nonzero(used)), len(unknown)
-    effective = samples / independent_span(correlation)
+    back = basis / norms[:, np.newaxis]
     residual = y - x @ solution.values
     # The fit uses one degree of freedom per parameter.
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
@@ -320,12 +291,9 @@ def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:
 def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
-    """
-    Weight each sample by the inverse of the noise variance about the mean of its group.
-
-    The noise of all groups enters with the weight of a few correlation windows, because a group of
-    few samples may have a small variance by chance.
-    """
+    """Weight each sample by the inverse of the noise variance about the mean of its group."""
+    # The noise of all groups enters with the weight of a few correlation windows, because a group
+    # of few samples may have a small variance by chance.
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
     residual = y - x @ _weighted(x, y, used.astype(np.float64)).values
@@ -376,11 +344,7 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """
-    Return a basis (k, r) of the directions that regressors determine, and unknown parameters.
-
-    Inputs are the singular values (k,) of regressors of unit norm, and directions (k, k) by row.
-    """
+    """Return a basis (k, r) of the determined directions, and unknown parameters, of an SVD."""
     null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
     unknown = (np.abs(directions[null]) > np.sqrt(_ROUNDING)).any(axis=0)

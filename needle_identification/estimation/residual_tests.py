@@ -64,11 +64,7 @@ def residual_tests(
     memory: Memory,
     parameters: int,
 ) -> tuple[ResidualTest, ...]:
-    """
-    Test the means of the residual over parts, whitened by the noise model; none for too few parts.
-
-    These means are nearly independent, although the samples are correlated.
-    """
+    """Test the means of the residual over parts, whitened, hence nearly independent."""
     if len(parts.limits) < _FEWEST_PARTS:
         return ()
     means = memory.whitened(parts.means(residual), parts)

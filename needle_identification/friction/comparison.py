@@ -161,17 +161,14 @@ def _judged(
 
 
 def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
-    """
-    Test whether additional terms lower the prediction error of held-out samples.
-
-    Folds consist of consecutive strokes, so that fitting autocorrelated noise is no advantage.
-    """
+    """Test whether additional terms lower the prediction error of held-out samples."""
     used = design.used
     settings = design.signals.settings
     x, y = design.regressors((*settings.terms, *more))[used], design.signals.force[used]
     without = np.ones(x.shape[1], dtype=np.bool_)
     start = len(columns_of(settings.terms, settings))
     without[start : start + len(columns_of(more, settings))] = False
+    # Consecutive strokes in a fold: fitting autocorrelated noise is no advantage.
     fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
     misfits = np.zeros(2)
     for omitted in range(int(fold.max()) + 1):

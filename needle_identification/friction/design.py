@@ -92,13 +92,9 @@ class Design:
         return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
-        """
-        Test whether enough samples lie where a term has an effect.
-
-        At higher speeds only velocity noise would support ``stribeck``; without motion into old
-        tissue ``cutting`` is an offset.
-        """
+        """Test whether enough samples lie where a term has an effect."""
         if term == 'cutting':
+            # Without motion into old tissue, it is an offset.
             inward = self.used & (self.velocity > 0.0)
             few = min(
                 np.count_nonzero(inward & self.fresh), np.count_nonzero(inward & ~self.fresh)
@@ -106,6 +102,7 @@ class Design:
             return bool(few >= self.signals.correlation)
         if term != 'stribeck':
             return True
+        # At higher speeds, only velocity noise would support it.
         column = self.columns([term])
         affected = np.count_nonzero(np.abs(column[self.used]) >= _EFFECT)
         return bool(affected >= self.signals.correlation)
@@ -167,11 +164,7 @@ class Design:
 
 
 def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
-    """
-    Select samples in steady regimes, outside the filter windows around changes.
-
-    ``settling_lag`` [s] is the lag of the sensor filters, for which more samples are left out.
-    """
+    """Select samples in steady regimes, after the sensor filters with a lag [s] have settled."""
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
     velocity, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))

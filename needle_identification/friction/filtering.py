@@ -131,11 +131,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
 
 
 def cut_off(force: FloatArray) -> BoolArray:
-    """
-    Mark samples, (n,), at which the force sensor is saturated.
-
-    The largest or smallest value is a limit if it is held for much longer than any other value.
-    """
+    """Mark samples, (n,), at the largest or smallest force, if it lasts longer than others."""
     limits = force.max(), force.min()
     found = np.zeros(force.shape, dtype=np.bool_)
     if limits[0] == limits[1]:

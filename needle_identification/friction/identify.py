@@ -183,7 +183,11 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
     settings, whole = chosen.design.signals.settings, chosen.fit
     count = len(columns_of(settings.terms, settings))
     design = chosen.design.far_from_changes(_TRANSITION)
-    if whole.is_exact or not design.is_enough or _agree(design, whole, count):
+    if whole.is_exact or not design.is_enough:
+        return None
+    few = design.screening()
+    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
+    if (close | ~whole.determined)[:count].all():
         return None
     try:
         if design.estimates_lag:
@@ -199,13 +203,6 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
         'terms (presliding, play, stick-slip, or a force that settles): left out'
     )
     return _Candidate(design, fit, chosen.coarse, (*chosen.remarks, remark))
-
-
-def _agree(design: Design, whole: Regression, count: int) -> bool:
-    """Whether a subset of samples gives the same parameters within small standard errors."""
-    few = design.screening()
-    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
-    return bool((close | ~whole.determined)[:count].all())
 
 
 def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:

@@ -46,14 +46,10 @@ _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 
 def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
-    """
-    Search for the lag of the force, except with the term inertia, which resembles a lag.
-
-    Returns the coarse lag [s], or 0 if no lag fits much better; and the lag of least misfit [s],
-    or None if the motion does not determine it.
-    """
+    """Return the coarse lag [s] (0: none), and the lag of least misfit [s] (None: unknown)."""
     terms = signals.settings.terms
     if 'inertia' in terms:
+        # It resembles a lag.
         return 0.0, None
     lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):

@@ -51,8 +51,6 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     drops, others = np.full(len(force), np.nan), np.zeros(len(force))
     inner = stretches(inward) + np.array([signals.margin, -signals.margin])
     for start, end in inner:
-        if start >= end:
-            continue
         middle = np.arange(start + width + reach, end - width - reach)
         if not len(middle):
             continue

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import pairwise
 from math import inf
 from typing import Final, NamedTuple
 
@@ -36,6 +36,10 @@ class NeedleMotion(NamedTuple):
     depth: FloatArray  # insertion depth [m]
     fresh: BoolArray  # at the largest insertion depth so far
 
+    @property
+    def sign(self) -> FloatArray:
+        return np.asarray(np.sign(self.velocity))
+
 
 @dataclass(frozen=True, slots=True)
 class Regressor:
@@ -48,7 +52,7 @@ class Regressor:
 
 
 _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
-    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.velocity)),),
+    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: x.sign),),
     'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.velocity),),
     'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.velocity)),),
     # Drift of sensor or tissue since the start of the recording.
@@ -56,25 +60,17 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
     'inertia': (Regressor('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
     # Additional Coulomb and viscous friction on withdrawal.
     'direction': (
-        Regressor(
-            'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.velocity), 0)
-        ),
-        Regressor(
-            'withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.velocity, 0.0)
-        ),
+        Regressor('withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(x.sign, 0)),
+        Regressor('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.velocity, 0)),
     ),
     # Excess of the breakaway friction over mu_s.
     'stribeck': (
         Regressor(
-            'stribeck_friction',
-            'mu_b - mu_s',
-            'N',
-            lambda x, s: np.sign(x.velocity) * np.exp(-((x.velocity / s.stribeck_speed) ** 2)),
+            'stribeck_friction', 'mu_b - mu_s', 'N',
+            lambda x, s: x.sign * np.exp(-((x.velocity / s.stribeck_speed) ** 2)),
         ),
     ),
-    'length': (
-        Regressor('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.velocity) * x.depth),
-    ),
+    'length': (Regressor('length_friction', 'c', 'N/m', lambda x, _: x.sign * x.depth),),
     'cutting': (
         Regressor(
             'cutting_force', 'f_c', 'N',
@@ -86,20 +82,13 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
 
 def _layers(boundaries: Sequence[float]) -> list[Regressor]:
     """Return a column per layer; the last layer is unbounded."""
-    ends = [*boundaries[1:], inf]
     return [
         Regressor(
-            f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low)
+            f'layer_{k}_friction', f'c_{k}', 'N/m',
+            lambda x, _, low=low, end=end: x.sign * np.clip(x.depth - low, 0.0, end - low),
         )
-        for k, (low, end) in enumerate(zip(boundaries, ends, strict=True))
-    ]
-
-
-def _in_layer(
-    begin: float, thickness: float, motion: NeedleMotion, _: FrictionSettings
-) -> FloatArray:
-    inside = np.clip(motion.depth - begin, 0.0, thickness)
-    return np.asarray(np.sign(motion.velocity) * inside)
+        for k, (low, end) in enumerate(pairwise([*boundaries, inf]), 1)
+    ]  # fmt: skip
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:

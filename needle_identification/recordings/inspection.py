@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 import shlex
@@ -20,8 +20,6 @@ from needle_identification.recordings.samples import (
     AXES,
     EachJoint,
     Gathering,
-    Samples,
-    SignalSource,
     source_of,
 )
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
@@ -156,12 +154,16 @@ class _Signal(NamedTuple):
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
     topics = [topic for topic in bag.topics() if topic.type_name in (*_MOTION, *_FORCE)]
-    names = _joints(bag, topics)
-    read = {topic: tuple(names.get(topic, AXES)) for topic in topics if names.get(topic, AXES)}
-    gathered = {
-        topic: Gathering(topic, _source(topic, axes), by_header=True)
-        for topic, axes in read.items()
-    }
+    read: dict[BagTopic, list[str]] = {}
+    gathered: dict[BagTopic, Gathering] = {}
+    for topic in topics:
+        axes, source = list(AXES), source_of(topic.type_name, AXES)
+        if topic.type_name == wire.JOINT_STATE:
+            names = dict.fromkeys(chain.from_iterable(first_names(bag, topic)))
+            axes = list(names)[:_MAX_JOINTS]
+            source = EachJoint(*axes)
+        if axes:
+            read[topic], gathered[topic] = axes, Gathering(topic, source, by_header=True)
     for batch in bag.batches(lambda topic: topic in gathered):
         gathered[batch.topic].add(batch)
     contents, signals = [], []
@@ -176,56 +178,30 @@ def _bag(path: Path) -> Inspection:
                 losses.append(str(error))
             else:
                 losses += bag.losses
-                content = _content(topic, count, read[topic], samples)
-                signals += list(_signals(topic, read[topic], samples))
+                columns = dict(zip(read[topic], samples.values.T, strict=True))
+                steps = np.diff(samples.stamps)
+                content = replace(
+                    content,
+                    rate=float(1e9 / np.median(steps)),
+                    gaps=int(np.count_nonzero(are_gaps(steps))),
+                    columns=tuple(_column(axis, values) for axis, values in columns.items()),
+                )
+                signals += [
+                    _Signal(topic, axis, samples.stamps, values)
+                    for axis, values in columns.items()
+                    if np.isfinite(values).all() and np.ptp(values) > 0.0
+                ]
         contents.append(content)
     words, command = _suggestion(path, signals)
-    if not command and _presses(path):
-        words = ['presses at several places and forces: stiffness can be identified']
-        command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
+    if not command:
+        with suppress(NeedleError):
+            identify_stiffness(read_indentation_recording(path))
+            words = ['presses at several places and forces: stiffness can be identified']
+            command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
     return Inspection(
         path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
         command=command,
     )  # fmt: skip
-
-
-def _presses(path: Path) -> bool:
-    with suppress(NeedleError):
-        return bool(identify_stiffness(read_indentation_recording(path)).levels)
-    return False
-
-
-def _joints(bag: Bag, topics: Sequence[BagTopic]) -> Mapping[BagTopic, list[str]]:
-    """Return the joint names of each JointState topic, from its first messages."""
-    return {
-        topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
-        for topic in topics
-        if topic.type_name == wire.JOINT_STATE
-    }
-
-
-def _source(topic: BagTopic, axes: Sequence[str]) -> SignalSource:
-    is_joint = topic.type_name == wire.JOINT_STATE
-    return EachJoint(*axes) if is_joint else source_of(topic.type_name, axes)
-
-
-def _content(topic: BagTopic, count: int, axes: Sequence[str], samples: Samples) -> Content:
-    steps = np.diff(samples.stamps)
-    return Content(
-        name=topic.name,
-        type_name=topic.type_name,
-        count=count,
-        rate=float(1e9 / np.median(steps)),
-        gaps=int(np.count_nonzero(are_gaps(steps))),
-        columns=tuple(_column(axis, samples.values[:, k]) for k, axis in enumerate(axes)),
-    )
-
-
-def _signals(topic: BagTopic, axes: Sequence[str], samples: Samples) -> Iterator[_Signal]:
-    for k, axis in enumerate(axes):
-        values = samples.values[:, k]
-        if np.isfinite(values).all() and np.ptp(values) > 0.0:
-            yield _Signal(topic, axis, samples.stamps, values)
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:

@@ -14,12 +14,7 @@ import numpy as np
 
 
 def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | None) -> None:
-    """
-    Replace arrays (n,) or (n, columns) by validated read-only copies.
-
-    The field ``first`` determines n; only the field ``missing`` may have values that are not
-    finite.
-    """
+    """Replace arrays (n,) or (n, columns) by finite read-only copies; ``missing`` may be nan."""
     object.__setattr__(recording, 'name', shown(recording.name))
     object.__setattr__(recording, 'losses', tuple(map(shown, recording.losses)))
     length = np.shape(getattr(recording, first))
@@ -39,12 +34,16 @@ def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | No
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class _AnyRecording:
-    name: str = 'recording'
-    time: FloatArray
+class BaseRecording:
+    """Force of one experiment over time, and its source."""
+
+    name: str = 'recording'  #: for messages
+    time: FloatArray  #: (n,) time [s], strictly increasing
     force: FloatArray
-    losses: tuple[str, ...] = ()
-    configuration: str = ''
+    losses: tuple[str, ...] = ()  #: lost, discarded or repaired data, one sentence each
+    configuration: str = ''  #: parameter file of the recorded plant; empty if not recorded
+    #: Clock of the force minus clock of the motion [s], estimated from the receive times and
+    #: already corrected; 0 if equal.
     clock_offset: float = 0.0
 
     @property
@@ -77,29 +76,9 @@ class _AnyRecording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class Recording(_AnyRecording):
+class Recording(BaseRecording):
     """
     Force and motion of the needle base during one experiment.
-
-    Attributes
-    ----------
-    name : str
-        Name of the recording, for messages.
-    time : ndarray, shape (n,)
-        Time [s], strictly increasing.
-    force : ndarray, shape (n,)
-        Force of the base on the needle f_y [N], positive into the tissue.
-    velocity : ndarray, shape (n,), or None
-        Insertion velocity [m/s], positive into the tissue; None if only positions were recorded.
-    depth : ndarray, shape (n,)
-        Insertion depth s [m]; default: integral of the velocity from zero.
-    losses : tuple of str
-        Lost, discarded or repaired data, one sentence each.
-    configuration : str
-        Parameter file of the recorded plant; empty if not recorded.
-    clock_offset : float
-        Clock of the force minus clock of the motion [s], estimated from the receive times and
-        already corrected; 0 if equal.
 
     Raises
     ------
@@ -118,8 +97,10 @@ class Recording(_AnyRecording):
 
     """
 
-    force: FloatArray
+    force: FloatArray  #: (n,) force of the base on the needle f_y [N], positive into the tissue
+    #: (n,) insertion velocity [m/s], positive into the tissue; None for positions only.
     velocity: FloatArray | None = None
+    #: (n,) insertion depth s [m]; default: integral of the velocity from zero.
     depth: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -133,20 +114,9 @@ class Recording(_AnyRecording):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class IndentationRecording(_AnyRecording):
+class IndentationRecording(BaseRecording):
     """
     Force and motion of an end-effector that presses a tissue in the plane.
-
-    Attributes
-    ----------
-    name, time, losses, configuration, clock_offset
-        As in `Recording`.
-    force : ndarray, shape (n, 2)
-        Force of the end-effector on the tissue, x and z [N].
-    position : ndarray, shape (n, 2)
-        Position of the end-effector in the plane, x and z [m].
-    off_plane : ndarray, shape (n,)
-        Position of the end-effector along the third axis [m]; default zero.
 
     Raises
     ------
@@ -155,8 +125,9 @@ class IndentationRecording(_AnyRecording):
 
     """
 
-    force: FloatArray
-    position: FloatArray
+    force: FloatArray  #: (n, 2) force of the end-effector on the tissue, x and z [N]
+    position: FloatArray  #: (n, 2) position of the end-effector in the plane, x and z [m]
+    #: (n,) position of the end-effector along the third axis [m]; default zero.
     off_plane: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:

@@ -193,13 +193,7 @@ def _position_and_velocity(position: FloatArray, velocity: FloatArray) -> FloatA
 
 
 def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> SignalSource:
-    """
-    Return the source for messages of a type.
-
-    `axes` has one axis of motion, or two axes of a plane and the off-plane axis. `joint` is the
-    moving joint of a JointState. The motion along one axis has position, velocity, and whether it
-    is valid.
-    """
+    """Return the source of an axis, of a plane (two axes and the third), or of a joint."""
     if type_name == wire.JOINT_STATE:
         return _PlaneJoints(*axes) if len(axes) == 3 else _Joint(joint)
     if type_name == wire.ODOMETRY and len(axes) == 1:

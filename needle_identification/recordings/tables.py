@@ -308,17 +308,13 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
-    if not _ends_with_a_line(path):
-        losses.append('the last line has no end: the file may be cut off')
+    with path.open('rb') as stream:
+        stream.seek(-1, os.SEEK_END)
+        if stream.read(1) not in b'\r\n':
+            losses.append('the last line has no end: the file may be cut off')
     known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
-
-
-def _ends_with_a_line(path: Path) -> bool:
-    with path.open('rb') as stream:
-        stream.seek(-1, os.SEEK_END)
-        return stream.read(1) in b'\r\n'
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:

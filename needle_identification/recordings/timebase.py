@@ -33,12 +33,7 @@ _CERTAINTY: Final = 3.0
 def merge(
     bag: Bag, force: Samples, motion: Samples
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """
-    Interpolate the motion at the stamps of the force, where both are available.
-
-    Returns time from the first sample [s], (n,), force (n, k), motion (n, m) and the clock of the
-    force minus the clock of the motion [s].
-    """
+    """Return time [s], force, motion at the stamps of the force, and its clock offset [s]."""
     offset = _clock_offset(bag, force, motion)
     stamps = force.stamps - offset
     covered = _covered(stamps, motion.stamps)

@@ -37,11 +37,7 @@ class TipResponses(NamedTuple):
 def responses(
     recording: SteeringRecording, free: float, length: float, skin: float, order: str
 ) -> TipResponses:
-    """
-    Simulate a recorded insertion for each cause, with free and bending length [m].
-
-    ``skin`` is the stiffness of the skin over tissue stiffness per length [m].
-    """
+    """Simulate a recorded insertion for each cause; lengths in m, skin over tissue stiffness."""
     depth, guide = recording.depth, recording.guide - recording.guide[0]
     poses = np.zeros((3, len(depth), 6))
     poses[:, :, 0] = depth

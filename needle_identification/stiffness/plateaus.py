@@ -175,12 +175,9 @@ def _rests(force: FloatArray, rest_force: float) -> BoolArray:
 
 
 def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray:
-    """
-    Return the variance of the mean of each part, with a common autocorrelation.
-
-    The sum of autocorrelations ends at a lag of five correlation times (A. Sokal, "Monte Carlo
-    methods in statistical mechanics", 1997).
-    """
+    """Return the variance of the mean of each part, with a common autocorrelation."""
+    # The sum of autocorrelations ends at a lag of five correlation times (A. Sokal, "Monte Carlo
+    # methods in statistical mechanics", 1997).
     rows, shapes = [], []
     for begin, end in parts:
         line = np.linspace(-1.0, 1.0, end - begin)

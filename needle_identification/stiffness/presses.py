@@ -57,7 +57,10 @@ class PressNoise(NamedTuple):
                 np.full_like(a, a.mean()) for a in (force, displacement, squares)
             )
         else:
-            force, displacement = _bounded(force), _bounded(displacement)
+            # Rounding may give a hold too small a variance.
+            force, displacement = (
+                np.maximum(a, 0.1 * a.mean(axis=0)) for a in (force, displacement)
+            )
         among = np.ix_(chosen, chosen)
         return np.array(
             [
@@ -67,11 +70,6 @@ class PressNoise(NamedTuple):
                 for row in range(2)
             ]
         )
-
-
-def _bounded(variance: FloatArray) -> FloatArray:
-    """Bound variances from below: rounding may give a hold too small a variance."""
-    return np.asarray(np.maximum(variance, 0.1 * variance.mean(axis=0)))
 
 
 def find_presses(
@@ -160,11 +158,8 @@ def _directions(force: FloatArray) -> IntArray:
 def _follow_zero(
     times: FloatArray, rests: FloatArray, variance: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """
-    Estimate the zero between rests (r, c) as a random walk with measurement noise.
-
-    Returns the zeros ``at`` other times, (m, c), and their covariance in each channel, (m, m).
-    """
+    """Return the zero ``at`` times between rests (r, c), (m, c), and its covariance (m, m)."""
+    # A random walk with measurement noise.
     mean: FloatArray = rests.mean(axis=0)
     knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)
     measured, asked = place[: len(times)], place[len(times) :]

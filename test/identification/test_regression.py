@@ -5,13 +5,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, ParameterError, ShapeError
-from needle_identification import (
-    ESTIMATORS,
-    IdentificationError,
-    ParameterEstimate,
-    regress,
-    statistic,
-)
+from needle_identification import ESTIMATORS, IdentificationError, ParameterEstimate, regress
+from needle_identification.estimation.estimate import statistic
 from needle_identification.estimation.regression import Regression, wald_test
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
