@@ -45,8 +45,7 @@ from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-#: Quantities that can be identified.
-WHAT: Final = ('friction', 'stiffness')
+WHAT: Final = ('friction', 'stiffness')  #: quantities that can be identified
 
 #: Parameters that a running plant can change; all others are fixed.
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')

@@ -34,8 +34,7 @@ from std_srvs.srv import SetBool, Trigger
 _TICK: Final = 1e-3
 _LONGEST_BURST: Final = 1e-3
 
-#: Time between checks for other publishers [s].
-_CHECK: Final = 0.25
+_CHECK: Final = 0.25  # time between checks for other publishers [s]
 
 #: Message by phase, before the path of the bag.
 _STATES: Final = {
@@ -44,17 +43,13 @@ _STATES: Final = {
     PlayerPhase.ENDED: 'at the end of',
 }
 
-#: Queue length of a topic that is not latched.
-_DEPTH: Final = 1000
-
-#: Shortest time between two messages on /clock [ns].
-_CLOCK_PERIOD: Final = 1_000_000
+_DEPTH: Final = 1000  # queue length of a topic that is not latched
+_CLOCK_PERIOD: Final = 1_000_000  # shortest time between two messages on /clock [ns]
 
 #: Delay that is reported on /diagnostics [s]; smaller delays are normal on a busy machine.
 _LATE: Final = 0.1
 
-#: Timeout of the acknowledgment of the last messages [s].
-_FAREWELL: Final = 2.0
+_FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
 
 #: QoS of the subscription of rclpy to /clock.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

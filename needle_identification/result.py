@@ -17,8 +17,7 @@ from needle_identification.stiffness.estimate import StiffnessSummary
 from needle_ros.files import write_whole
 import yaml
 
-#: Nodes that use the result.
-NODES: Final = ('plant', 'controller')
+NODES: Final = ('plant', 'controller')  #: nodes that use the result
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:

@@ -17,8 +17,7 @@ from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 
-#: Size of the buffer for sorting messages by receive time [bytes].
-_WINDOW: Final = 2**22
+_WINDOW: Final = 2**22  # size of the buffer for sorting messages by receive time [bytes]
 
 
 def _ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:

@@ -13,11 +13,8 @@ import lz4.frame
 from needle_identification.errors import RecordingError
 import zstandard
 
-#: File name suffixes of compressed files.
-COMPRESSED: Final = ('.zstd', '.zst', '.lz4')
-
-#: Block size of reads [bytes].
-BLOCK: Final = 2**20
+COMPRESSED: Final = ('.zstd', '.zst', '.lz4')  #: file name suffixes of compressed files
+BLOCK: Final = 2**20  #: block size of reads [bytes]
 
 #: Exceptions of the readers for damaged bytes.
 DAMAGED: Final = (
@@ -32,8 +29,7 @@ DAMAGED: Final = (
     ValueError,
 )
 
-#: Environment variable: factor of all limits of this module.
-FACTOR: Final = 'NEEDLE_BAG_FACTOR'
+FACTOR: Final = 'NEEDLE_BAG_FACTOR'  #: environment variable: factor of all limits of this module
 
 #: Largest record or chunk, and largest message that was compressed individually [bytes].
 LARGEST_RECORD: Final = 2**27

@@ -31,14 +31,12 @@ from numpy.typing import NDArray
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
 
-#: Opcode and length of a record.
-_HEAD: Final = struct.Struct('<BQ')
+_HEAD: Final = struct.Struct('<BQ')  # opcode and length of a record
 
 #: Start, end, size, checksum and length of the name of the compression of a chunk.
 _CHUNK: Final = struct.Struct('<QQQII')
 
-#: The end of a file: a footer record and the magic bytes.
-_TAIL: Final = struct.Struct('<BQQQI8s')
+_TAIL: Final = struct.Struct('<BQQQI8s')  # the end of a file: a footer record and the magic bytes
 
 #: Header of a message record.
 _MESSAGE: Final = np.dtype(
@@ -46,8 +44,7 @@ _MESSAGE: Final = np.dtype(
 )
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
-#: Exceptions for damaged bytes.
-DAMAGED_MCAP: Final = (*DAMAGED, McapError)
+DAMAGED_MCAP: Final = (*DAMAGED, McapError)  #: exceptions for damaged bytes
 
 
 class _Channels:

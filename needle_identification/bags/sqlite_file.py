@@ -18,8 +18,7 @@ from needle_identification.errors import RecordingError
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
-#: Size of a row in addition to its data [bytes].
-_ROW: Final = 16
+_ROW: Final = 16  # size of a row in addition to its data [bytes]
 
 #: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
 #: A message takes about 20 steps and 40 bytes.

@@ -19,8 +19,7 @@ _WORDS: Final = {
     'liveliness': {1: 'automatic', 3: 'manual_by_topic'},
 }
 
-#: Value of the middleware for no limit [ns].
-UNLIMITED: Final = 2**63 - 1
+UNLIMITED: Final = 2**63 - 1  #: value of the middleware for no limit [ns]
 
 
 class OfferedQos(NamedTuple):

@@ -22,8 +22,7 @@ _COMPRESSIONS: Final = {
     'none': CompressionType.NONE,
 }
 
-#: Compressions of the chunks of a bag, by name.
-COMPRESSIONS: Final = tuple(_COMPRESSIONS)
+COMPRESSIONS: Final = tuple(_COMPRESSIONS)  #: compressions of the chunks of a bag, by name
 
 
 class BagWriter:

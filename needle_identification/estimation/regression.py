@@ -48,8 +48,7 @@ LARGEST_CONDITION: Final = 20.0
 #: Largest component of a determined parameter in such a direction; its error includes it.
 _LARGEST_SHARE: Final = 0.1
 
-#: Relative size of rounding errors.
-_ROUNDING: Final = 1e-9
+_ROUNDING: Final = 1e-9  # relative size of rounding errors
 
 #: Weight of the noise of all groups in the variance of each group [correlation windows].
 _PRIOR: Final = 5.0

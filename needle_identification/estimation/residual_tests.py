@@ -11,8 +11,7 @@ from needle_identification.estimation.memory import Memory, Parts
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
-#: Smallest number of parts for any test.
-_FEWEST_PARTS: Final = 10
+_FEWEST_PARTS: Final = 10  # smallest number of parts for any test
 
 #: Smallest number of parts for the test of d'Agostino and Pearson; below, Shapiro and Wilk.
 _FEWEST_FOR_MOMENTS: Final = 20

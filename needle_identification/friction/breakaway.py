@@ -20,14 +20,12 @@ from needle_identification.friction.filtering import CORRELATION_LENGTH
 import numpy as np
 from scipy.special import stdtrit
 
-#: Time before the motion in which the rise of the force is measured [s].
-_RISING: Final = 0.3
+_RISING: Final = 0.3  # time before the motion in which the rise of the force is measured [s]
 
 #: Smallest rise of the force in that time, as a fraction of the force and of mu_s.
 _SMALLEST_RISE: Final = 0.05
 
-#: Smallest slope of the rise [standard errors].
-_CLEAR_RISE: Final = 5.0
+_CLEAR_RISE: Final = 5.0  # smallest slope of the rise [standard errors]
 
 #: Fraction of the usual correlation length used here, because the rise of the force is short.
 _WINDOW_PART: Final = 0.4

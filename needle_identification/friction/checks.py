@@ -13,8 +13,7 @@ from needle_identification.friction.design import Design
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Largest lag of usual sensor filters [s].
-_UNUSUAL_LAG: Final = 0.01
+_UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
 
 #: Growth of the standard errors by autocorrelated noise above which a warning is given.
 _MUCH_LARGER: Final = 1.5

@@ -17,18 +17,14 @@ from needle_identification.friction.settings import TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Probability of a false alarm of all comparisons.
-SIGNIFICANCE: Final = 0.02
+SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
 
 
 #: Growth of the standard errors by autocorrelation that two missing terms may explain.
 _LIKE_MEMORY: Final = 1.5
 
-#: Folds of the cross-validation over strokes.
-_FOLDS: Final = 5
-
-#: Terms whose coefficient cannot be negative.
-_POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
+_FOLDS: Final = 5  # folds of the cross-validation over strokes
+_POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -31,20 +31,14 @@ HALF_LENGTH: Final = 0.36
 #: Length over which filtered noise is correlated [periods of the cutoff].
 CORRELATION_LENGTH: Final = 3.0
 
-#: Longest step between samples that is not a gap [sampling periods].
-GAP: Final = 3.5
-
-#: Speed above which the needle moves [standard deviations of the noise].
-_CLEARLY: Final = 5.0
-
-#: Samples per period of the cutoff that are kept after the filter.
-_KEPT: Final = 8.0
+GAP: Final = 3.5  #: longest step between samples that is not a gap [sampling periods]
+_CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations of the noise]
+_KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
 
 #: Ratio of the hold time at a limit of the sensor to the longest hold time at other values.
 _LONGER: Final = 3
 
-#: Largest fraction of samples that may count as saturated.
-_MOST_CUT_OFF: Final = 0.5
+_MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
 
 #: Largest number of resampled points per sample; with more, most of the time base is gaps.
 _LARGEST_GRID: Final = 10.0

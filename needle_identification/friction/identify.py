@@ -32,8 +32,7 @@ from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
-#: Largest velocity noise threshold, as a fraction of the median speed.
-_HIDDEN: Final = 0.2
+_HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
 
 #: Positions replace velocities if their velocity noise is below this fraction.
 _CLEANER: Final = 0.5

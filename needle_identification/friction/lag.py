@@ -19,14 +19,9 @@ from needle_identification.friction.terms import NeedleMotion, regressors
 import numpy as np
 from scipy.special import ndtri
 
-#: Largest lag of the coarse search [s].
-_LARGEST_LAG: Final = 0.25
-
-#: Largest fraction of the misfit that remains with an accepted coarse lag.
-_BETTER: Final = 0.5
-
-#: Largest number of samples for the coarse search.
-_MAX_SAMPLES: Final = 1000
+_LARGEST_LAG: Final = 0.25  # largest lag of the coarse search [s]
+_BETTER: Final = 0.5  # largest fraction of the misfit that remains with an accepted coarse lag
+_MAX_SAMPLES: Final = 1000  # largest number of samples for the coarse search
 
 _MAX_ITERATIONS: Final = 10
 

@@ -23,8 +23,7 @@ from scipy.special import ndtri
 #: Smallest drop of a puncture [standard deviations of other changes of the force].
 _CLEAR: Final = 8.0
 
-#: Model error of a change of friction, as a fraction.
-_UNKNOWN_FRICTION: Final = 0.5
+_UNKNOWN_FRICTION: Final = 0.5  # model error of a change of friction, as a fraction
 
 _DEPTH: Final = ParameterEstimate(name='puncture_depth', symbol='s_p', unit='m')
 _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')

@@ -32,8 +32,7 @@ _OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 #: Smallest number of independent blocks for a meaningful standard error.
 _FEWEST_PARTS: Final = 10.0
 
-#: Length of a block [correlation lengths of filtered noise].
-_PART_LENGTH: Final = 2.0
+_PART_LENGTH: Final = 2.0  # length of a block [correlation lengths of filtered noise]
 
 #: Age at which a block is discarded [forgetting times]; its weight is then below 4e-4.
 _REMEMBERED: Final = 8.0
@@ -41,11 +40,8 @@ _REMEMBERED: Final = 8.0
 #: Relative threshold below which singular values of the information are rounding errors.
 _ROUNDING: Final = 1e-7
 
-#: Number of pairs that determine the sampling rate.
-_FIRST: Final = 50
-
-#: Largest step for interpolation of the motion [s].
-_LARGEST_STEP: Final = 0.1
+_FIRST: Final = 50  # number of pairs that determine the sampling rate
+_LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
 
 #: Backward step of a stamp above which the clock was set back [s]; after a smaller step, the
 #: message arrived late.
@@ -54,8 +50,7 @@ _SET_BACK: Final = 1.0
 #: Largest plausible values: forces [N]; depths [m] or velocities [m/s].
 _LARGEST: Final = {'force': 1e4, 'motion': 100.0}
 
-#: Largest number of samples that wait for the other topic.
-_MAX_WAITING: Final = 20_000
+_MAX_WAITING: Final = 20_000  # largest number of samples that wait for the other topic
 
 
 class RecursiveFriction:

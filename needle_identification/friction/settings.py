@@ -17,8 +17,7 @@ TERMS: Final = (
     'layers', 'cutting',
 )  # fmt: skip
 
-#: Automatic choice of the estimator.
-AUTO: Final = 'auto'
+AUTO: Final = 'auto'  #: automatic choice of the estimator
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

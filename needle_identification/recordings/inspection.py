@@ -32,20 +32,14 @@ import numpy as np
 _MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
 _FORCE: Final = (wire.WRENCH,)
 
-#: Message types of velocities.
-_VELOCITIES: Final = (wire.TWIST,)
-
-#: Smallest speed in motion, as a fraction of the largest speed.
-_MOVING: Final = 0.05
+_VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
+_MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
 
 #: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
 _EXPLAINED: Final = 0.3
 
-#: Largest number of joints of a topic that are inspected.
-_MAX_JOINTS: Final = 64
-
-#: Largest number of samples on which a pair of force and motion is fitted.
-_TRIED: Final = 20_000
+_MAX_JOINTS: Final = 64  # largest number of joints of a topic that are inspected
+_TRIED: Final = 20_000  # largest number of samples on which a pair of force and motion is fitted
 
 
 class ColumnSummary(NamedTuple):

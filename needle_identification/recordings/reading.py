@@ -33,8 +33,7 @@ from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
 
-#: Number of messages that are read for joint names.
-_FIRST: Final = 50
+_FIRST: Final = 50  # number of messages that are read for joint names
 
 
 class Wanted(NamedTuple):

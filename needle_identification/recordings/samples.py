@@ -18,23 +18,12 @@ from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
 
-#: Axes of a frame, in the order of message fields.
-AXES: Final = ('x', 'y', 'z')
-
-#: Upper limit of a plausible measurement [SI].
-_LARGEST: Final = 1e100
-
-#: Largest number of joint names kept for error messages.
-_MAX_NAMES: Final = 100
-
-#: Shortest gap between samples [sampling periods].
-_GAP: Final = 10.0
-
-#: Smaller fractions of messages with other joint names are reported as faults.
-_STRAY: Final = 0.1
-
-#: Largest number of latencies kept of a batch, and of a topic.
-_LATENCIES: Final = (64, 2**16)
+AXES: Final = ('x', 'y', 'z')  #: axes of a frame, in the order of message fields
+_LARGEST: Final = 1e100  # upper limit of a plausible measurement [SI]
+_MAX_NAMES: Final = 100  # largest number of joint names kept for error messages
+_GAP: Final = 10.0  # shortest gap between samples [sampling periods]
+_STRAY: Final = 0.1  # smaller fractions of messages with other joint names are reported as faults
+_LATENCIES: Final = (64, 2**16)  # largest number of latencies kept of a batch, and of a topic
 
 
 class SignalSource(ABC):

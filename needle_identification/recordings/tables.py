@@ -71,11 +71,8 @@ _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 _MATLAB_HEAD: Final = 128
 _COMPRESSED: Final = 15
 
-#: Number of lines searched for the first line of numbers.
-_HEAD: Final = 200
-
-#: Longest plausible line of a sample [characters].
-_LONGEST_LINE: Final = 2**16
+_HEAD: Final = 200  # number of lines searched for the first line of numbers
+_LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
 
 #: Ranges above which a depth or speed without unit is probably not in SI units.
 _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}

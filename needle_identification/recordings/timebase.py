@@ -23,11 +23,8 @@ from numpy.typing import NDArray
 #: have up to 0.2 s; unsynchronized clocks differ by more.
 LARGEST_LATENCY: Final = 0.25
 
-#: Smallest difference of latencies that is reported [s].
-_NOTABLE_LATENCY: Final = 0.05
-
-#: Smallest clock offset, as a multiple of the variation of the latencies.
-_CERTAINTY: Final = 3.0
+_NOTABLE_LATENCY: Final = 0.05  # smallest difference of latencies that is reported [s]
+_CERTAINTY: Final = 3.0  # smallest clock offset, as a multiple of the variation of the latencies
 
 
 def merge(

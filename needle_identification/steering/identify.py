@@ -41,14 +41,9 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import stdtrit
 
-#: Smallest number of recordings of a medium whose spread determines the errors.
-_SEVERAL: Final = 8
-
-#: Relative difference of residuals below which fits are equivalent.
-_AS_GOOD: Final = 0.02
-
-#: Number of nonlinear constants of a medium.
-_LENGTHS: Final = 2
+_SEVERAL: Final = 8  # smallest number of recordings of a medium whose spread determines the errors
+_AS_GOOD: Final = 0.02  # relative difference of residuals below which fits are equivalent
+_LENGTHS: Final = 2  # number of nonlinear constants of a medium
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

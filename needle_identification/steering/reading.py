@@ -50,8 +50,7 @@ _JOINTS: Final = {
 _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
-#: Largest change of a constant tilt [rad].
-_MOVED: Final = 1e-4
+_MOVED: Final = 1e-4  # largest change of a constant tilt [rad]
 
 #: Largest number of tip samples; denser samples are averaged. The spacing over a path of 100 mm
 #: is then 0.2 mm.

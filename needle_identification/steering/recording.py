@@ -13,17 +13,13 @@ from needle_identification.recordings.recording import freeze
 from needle_ros.errors import ShapeError
 import numpy as np
 
-#: Number of equal consecutive tip measurements that indicate a frozen sensor.
-_FROZEN: Final = 3
+_FROZEN: Final = 3  # number of equal consecutive tip measurements that indicate a frozen sensor
 
 #: Change of depth over these measurements [m]; above the position noise of robots.
 _GONE: Final = 5e-4
 
-#: Largest first depth that is measured from the skin [m].
-_AT_THE_SKIN: Final = 0.03
-
-#: Largest height above the skin of a robot at rest on it [m].
-_JITTER: Final = 1e-3
+_AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
+_JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
 
 #: Largest plausible lateral tip position, in addition to the guide and half the depth [m].
 _ASIDE: Final = 0.03

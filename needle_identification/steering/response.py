@@ -11,8 +11,7 @@ from needle_dynamics.steering.needle import empty_cut
 from needle_identification.steering.recording import SteeringRecording
 import numpy as np
 
-#: Order of guide motion and insertion between samples.
-ORDERS: Final = ('together', 'guide first')
+ORDERS: Final = ('together', 'guide first')  #: order of guide motion and insertion between samples
 
 #: Drift terms and their constants.
 TERMS: Final = {

@@ -28,17 +28,10 @@ from needle_identification.stiffness.presses import find_presses, Presses
 from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 
-#: Relative deviation above which a warning is given.
-_WORTH_WARNING: Final = 0.1
-
-#: Largest ratio of scatter to noise for presses that follow a matrix.
-_LARGEST_SCATTER: Final = 2.0
-
-#: Significant change [standard errors].
-_CLEARLY: Final = 3.0
-
-#: Smallest number of directions without a warning.
-_FEWEST_DIRECTIONS: Final = 4
+_WORTH_WARNING: Final = 0.1  # relative deviation above which a warning is given
+_LARGEST_SCATTER: Final = 2.0  # largest ratio of scatter to noise for presses that follow a matrix
+_CLEARLY: Final = 3.0  # significant change [standard errors]
+_FEWEST_DIRECTIONS: Final = 4  # smallest number of directions without a warning
 
 
 def identify_stiffness(

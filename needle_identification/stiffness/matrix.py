@@ -31,11 +31,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import brentq
 from scipy.special import fdtri, stdtr, stdtrit
 
-#: Entries of the matrix, by row.
-ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')
-
-#: Smallest number of presses of a level.
-_FEWEST_PRESSES: Final = 3
+ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')  #: entries of the matrix, by row
+_FEWEST_PRESSES: Final = 3  # smallest number of presses of a level
 
 #: Smallest ratio of scatter and error of the displacements that determines the matrix:
 #: attenuation by the noise of the displacements is then below 1 %.

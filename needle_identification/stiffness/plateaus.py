@@ -18,11 +18,8 @@ from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 from numpy.linalg import norm
 
-#: Number of bins in the shortest plateau; steadiness is tested on bin means.
-_BINS: Final = 10.0
-
-#: Largest step between bins within a plateau [bins].
-_GAP: Final = 4
+_BINS: Final = 10.0  # number of bins in the shortest plateau; steadiness is tested on bin means
+_GAP: Final = 4  # largest step between bins within a plateau [bins]
 
 #: Largest range of positions in a plateau, as a fraction of their whole range.
 _STEADY_MOTION: Final = 0.05
@@ -31,17 +28,13 @@ _STEADY_MOTION: Final = 0.05
 #: extends over the whole tolerance.
 _STEADY_TREND: Final = 1.0 / 3.0
 
-#: Width of the band that contains noise [standard deviations].
-_BAND: Final = 12.0
+_BAND: Final = 12.0  # width of the band that contains noise [standard deviations]
 
 #: Deviation from the middle half of a plateau that indicates a ramp [standard deviations].
 _RAMP: Final = 3.0
 
-#: Smallest number of samples of a plateau.
-_FEWEST_SAMPLES: Final = 4
-
-#: Relative noise below which values differ by rounding.
-ROUNDING: Final = 1e-8
+_FEWEST_SAMPLES: Final = 4  # smallest number of samples of a plateau
+ROUNDING: Final = 1e-8  #: relative noise below which values differ by rounding
 
 
 class Plateaus(NamedTuple):

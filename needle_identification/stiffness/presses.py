@@ -15,11 +15,8 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
-#: Largest angle between forces of the same direction [rad].
-_SAME_DIRECTION: Final = pi / 18.0
-
-#: Relative drift of the zero above which a warning is given.
-_WORTH_WARNING: Final = 0.1
+_SAME_DIRECTION: Final = pi / 18.0  # largest angle between forces of the same direction [rad]
+_WORTH_WARNING: Final = 0.1  # relative drift of the zero above which a warning is given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
