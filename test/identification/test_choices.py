@@ -179,7 +179,7 @@ def test_presliding_samples_are_discarded(seed: int) -> None:
 
 
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
-    recording, truth = recorded(NoiseKind(velocity_noise=1e-3), np.random.default_rng(3))
+    recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
     assert any('took the speed from the positions' in words for words in found.warnings)
     for name, value in truth.items():
