@@ -82,13 +82,14 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
 
 def _layers(boundaries: Sequence[float]) -> list[Regressor]:
     """Return a column per layer; the last layer is unbounded."""
-    return [
-        Regressor(
-            f'layer_{k}_friction', f'c_{k}', 'N/m',
-            lambda x, _, low=low, end=end: x.sign * np.clip(x.depth - low, 0.0, end - low),
-        )
-        for k, (low, end) in enumerate(pairwise([*boundaries, inf]), 1)
-    ]  # fmt: skip
+
+    def column(number: int, low: float, end: float) -> Regressor:
+        return Regressor(
+            f'layer_{number}_friction', f'c_{number}', 'N/m',
+            lambda x, _: x.sign * np.clip(x.depth - low, 0.0, end - low),
+        )  # fmt: skip
+
+    return [column(k, *span) for k, span in enumerate(pairwise([*boundaries, inf]), 1)]
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:
