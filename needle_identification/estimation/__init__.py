@@ -6,7 +6,7 @@ from typing import Final
 
 from needle_ros.errors import ParameterError
 
-ESTIMATORS: Final = ('ordinary', 'weighted', 'huber', 'total')  #: estimators of `regress`
+ESTIMATORS: Final = ('ordinary', 'weighted', 'huber', 'total')  # estimators of `regress`
 
 
 def check_estimator(estimator: str, *more: str) -> None:
