@@ -293,7 +293,7 @@ def friction(seed: int, number: int) -> list[CalibrationResult]:
             name=f'{name} {number}',
             time=motion.time,
             depth=depth,
-            speed=speed if case.speed else None,
+            velocity=speed if case.speed else None,
             force=readings[case.kind],
         )
         estimate = identify_friction(recording, settings)

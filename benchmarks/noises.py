@@ -105,7 +105,9 @@ def recorded(
         name=name or 'noise',
         time=time,
         depth=_counted(depth, kind.position_counts),
-        speed=None if kind.positions_only else speed + kind.speed_noise * rng.standard_normal(n),
+        velocity=None
+        if kind.positions_only
+        else speed + kind.speed_noise * rng.standard_normal(n),
         force=_counted(force + _noise(kind, rng, n), kind.counts),
     )
     return recording, truth

@@ -26,7 +26,7 @@ def strokes(rng: np.random.Generator) -> Recording:
         name='my recording',
         time=np.arange(velocity.size) / RATE,
         depth=0.1 + np.cumsum(velocity) / RATE,
-        speed=velocity,
+        velocity=velocity,
         force=force + rng.normal(0.0, 0.01, velocity.size),
     )
 

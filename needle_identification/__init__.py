@@ -17,13 +17,11 @@ if TYPE_CHECKING:
     from needle_identification.bags.bag import Bag, message_counts, read_topic, Recorded
     from needle_identification.bags.messages import deserialize, encode, message_type
     from needle_identification.bags.topics import BagTopic, OfferedQos
-    from needle_identification.bags.writer import BagWriter, COMPRESSIONS
+    from needle_identification.bags.writer import BagWriter
     from needle_identification.errors import IdentificationError, RecordingError
-    from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
-    from needle_identification.estimation.estimators import ESTIMATORS
+    from needle_identification.estimation import ESTIMATORS
+    from needle_identification.estimation.estimate import ParameterEstimate, Statistic
     from needle_identification.estimation.regression import regress, Regression
-    from needle_identification.estimation.residual_tests import ResidualTest
-    from needle_identification.friction.comparison import CandidateFit
     from needle_identification.friction.estimate import (
         Fit,
         FrictionEstimate,
@@ -31,49 +29,38 @@ if TYPE_CHECKING:
         summarize,
     )
     from needle_identification.friction.identify import identify_friction
-    from needle_identification.friction.punctures import Puncture
     from needle_identification.friction.recursive import RecursiveFriction
     from needle_identification.friction.settings import FrictionSettings, TERMS
-    from needle_identification.recordings.inspection import (
-        ColumnSummary,
-        Content,
-        inspect_recording,
-        Inspection,
-    )
+    from needle_identification.recordings.inspection import inspect_recording, Inspection
     from needle_identification.recordings.reading import (
         read_friction_recording,
         read_indentation_recording,
     )
     from needle_identification.recordings.recording import IndentationRecording, Recording
-    from needle_identification.result import result_yaml, write_result
-    from needle_identification.steering.estimate import MediumEstimate, SteeringEstimate
+    from needle_identification.result import write_result
+    from needle_identification.steering.estimate import SteeringEstimate
     from needle_identification.steering.identify import identify_steering, SteeringSettings
     from needle_identification.steering.reading import read_steering_recording
     from needle_identification.steering.recording import SteeringRecording
     from needle_identification.stiffness.estimate import (
         LevelEstimate,
-        LevelSummary,
         StiffnessEstimate,
         StiffnessSummary,
         summarize_stiffness,
     )
     from needle_identification.stiffness.identify import identify_stiffness
+    from needle_identification.stiffness.matrix import asymmetry
     from needle_identification.stiffness.presses import Presses
     from needle_identification.stiffness.settings import StiffnessSettings
-    from needle_identification.stiffness.spring import asymmetry
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 
 __all__ = [
-    'COMPRESSIONS',
     'ESTIMATORS',
     'TERMS',
     'Bag',
     'BagTopic',
     'BagWriter',
-    'CandidateFit',
-    'ColumnSummary',
-    'Content',
     'Fit',
     'FrictionEstimate',
     'FrictionSettings',
@@ -82,18 +69,14 @@ __all__ = [
     'IndentationRecording',
     'Inspection',
     'LevelEstimate',
-    'LevelSummary',
-    'MediumEstimate',
     'OfferedQos',
     'ParameterEstimate',
     'Presses',
-    'Puncture',
     'Recorded',
     'Recording',
     'RecordingError',
     'RecursiveFriction',
     'Regression',
-    'ResidualTest',
     'Statistic',
     'SteeringEstimate',
     'SteeringRecording',
@@ -115,8 +98,6 @@ __all__ = [
     'read_steering_recording',
     'read_topic',
     'regress',
-    'result_yaml',
-    'statistic',
     'summarize',
     'summarize_stiffness',
     'write_result',

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import sys
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from needle_identification.application import Application
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from needle_identification.estimation.estimate import Statistic, statistic
 from needle_identification.friction.estimate import summarize
 from needle_identification.friction.identify import identify_friction
@@ -19,11 +18,12 @@ from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
+    signed,
     signed_axis,
 )
 from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.status import live_statuses, sentence, Status, summary_statuses
+from needle_identification.status_node import live_statuses, sentence, summary_statuses
 from needle_identification.stiffness.estimate import summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
@@ -32,6 +32,7 @@ from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
+from needle_ros.requests import no_answer
 from needle_ros.run_node import run
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import Diagnosis, IdentificationStatus
@@ -44,8 +45,10 @@ from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-#: Quantities that can be identified.
-WHAT: Final = ('friction', 'stiffness')
+WHAT: Final = ('friction', 'stiffness')  #: quantities that can be identified
+
+#: Parameters that a running plant can change; all others are fixed.
+_COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +65,43 @@ class IdentificationSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+
+
+class _Application(NamedTuple):
+    """Parameters sent to other nodes, and futures of the responses (None: no such node)."""
+
+    values: Mapping[str, float | str]
+    answers: Mapping[str, Future | None]
+    response: Trigger.Response
+    later: Future  # of the response
+
+    def is_over(self) -> bool:
+        """Whether all calls are answered or have failed."""
+        return all(answer is None or answer.done() for answer in self.answers.values())
+
+    def outcome(self) -> Trigger.Response:
+        """Return whether each existing node set all that it can, and a message by node."""
+        outcomes = [self._of_node(name, answer) for name, answer in self.answers.items()]
+        verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
+        self.response.success = bool(verdicts) and all(verdicts)
+        self.response.message = '; '.join(words for _, words in outcomes)
+        return self.response
+
+    def _of_node(self, node: str, answer: Future | None) -> tuple[bool | None, str]:
+        if answer is None:
+            return None, f'{node}: no such node'
+        response = answer.result()
+        if response is None:
+            return False, no_answer(f'{node}/set_parameters')
+        results = dict(zip(self.values, response.results, strict=True))
+        taken = [name for name, result in results.items() if result.successful]
+        values = {k: v if isinstance(v, str) else f'{v:.6g}' for k, v in self.values.items()}
+        words = [f'{name} = {values[name]}' for name in taken]
+        words += [
+            f'not {name}: {one.reason}' for name, one in results.items() if name not in taken
+        ]
+        needed = [name for name in _COEFFICIENTS if name in self.values] or list(self.values)
+        return all(name in taken for name in needed), f'{node}: {", ".join(words)}'
 
 
 class IdentificationNode(BaseNode):
@@ -105,7 +145,7 @@ class IdentificationNode(BaseNode):
         self._found: Sequence[Statistic] = ()
         self._words = ''
         self._live: LiveFriction | None = None
-        self._applications: list[tuple[Application, Trigger.Response, Future]] = []
+        self._applications: list[_Application] = []
         self._setters: dict[str, Client] = {}
         self._calls = Calls(self)
         self._friction = self.publisher(contract.FRICTION, always=True)
@@ -117,16 +157,14 @@ class IdentificationNode(BaseNode):
 
     def configure(self) -> None:
         """Read the recordings, axes and settings of identification."""
-        self._what = self.text('what', WHAT)
+        self.text('what', WHAT)
         self.text('time', TIMES)
-        self._friction_settings = self.settings('friction.', FrictionSettings)
-        self._stiffness_settings = self.settings('stiffness.', StiffnessSettings)
-        self._own = self.settings('', IdentificationSettings)
+        self.settings('friction.', FrictionSettings)
+        self.settings('stiffness.', StiffnessSettings)
+        self.settings('', IdentificationSettings)
         self._is_live = bool(self.get_parameter('live').value)
-        self._force_sign, self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
-        joint = self.text('motion_axis') or contract.INSERTION
-        self._joint_sign = -1.0 if joint.startswith('-') else 1.0
-        self._joint = joint.removeprefix('-')
+        self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
+        self._joint = signed(self.text('motion_axis') or contract.INSERTION)
         if len(self.get_parameter('axes').value) != 2:
             raise ParameterError(f'axes must be two, got {list(self.get_parameter("axes").value)}')
         self._bags = [name for name in self.get_parameter('bags').value if name]
@@ -147,7 +185,8 @@ class IdentificationNode(BaseNode):
         if self._bags:
             self._identify()
         if self._is_live:
-            self._live = LiveFriction(self._friction_settings, self._own.forgetting)
+            forgetting = self.settings('', IdentificationSettings).forgetting
+            self._live = LiveFriction(self.settings('friction.', FrictionSettings), forgetting)
             self._listening = (
                 self.listen(contract.JOINT_STATES, self._on_motion),
                 self.listen(contract.BASE_WRENCH, self._on_force),
@@ -155,9 +194,9 @@ class IdentificationNode(BaseNode):
             self._timer = self.create_timer(1.0, self._publish_live)
 
     def about(self) -> str:
-        live = (contract.JOINT_STATES.name, contract.BASE_WRENCH.name) if self._is_live else ()
-        heard = f', and live from {" and ".join(live)}' if live else ''
-        return f'{self._what} from {len(self._bags)} recordings at ~/identify{heard}'
+        topics = f'{contract.JOINT_STATES.name} and {contract.BASE_WRENCH.name}'
+        live = f', and live from {topics}' if self._is_live else ''
+        return f'{self.text("what")} from {len(self._bags)} recordings at ~/identify{live}'
 
     def deactivate(self) -> None:
         if self._is_live:
@@ -171,10 +210,10 @@ class IdentificationNode(BaseNode):
     def diagnose(self) -> Diagnosis[IdentificationStatus]:
         status = IdentificationStatus()
         if self._live is not None:
-            samples, discarded = self._live.samples, self._live.dropped
+            samples, discarded = self._live.samples, dict(self._live.dropped)
             status = IdentificationStatus(samples=samples, discarded=discarded)
             if not samples:
-                message = f'no joint_states of {self._joint} paired with base_wrench'
+                message = f'no joint_states of {self._joint[1]} paired with base_wrench'
                 return Diagnosis(Severity.WARNING, message, status)
             return Diagnosis(Severity.INFO, sentence(self._live_statistics()), status)
         message = self._words if self._found else 'nothing identified yet'
@@ -201,14 +240,16 @@ class IdentificationNode(BaseNode):
             'time': self.text('time'),
         }
         output = self.text('output')
-        if self._what == 'friction':
+        if self.text('what') == 'friction':
             reading['force_axis'] = self.text('force_axis')
             reading['motion_axis'] = self.text('motion_axis') or None
             friction = summarize(
                 self._estimates(
                     partial(read_friction_recording, **reading),
                     partial(
-                        identify_friction, settings=self._friction_settings, among=len(self._bags)
+                        identify_friction,
+                        settings=self.settings('friction.', FrictionSettings),
+                        among=len(self._bags),
                     ),
                 )
             )
@@ -218,13 +259,14 @@ class IdentificationNode(BaseNode):
             self._publish(self._friction, summary_statuses(friction))
         else:
             reading['axes'] = tuple(self.get_parameter('axes').value)
+            settings = self.settings('stiffness.', StiffnessSettings)
             stiffness = summarize_stiffness(
                 self._estimates(
                     partial(read_indentation_recording, **reading),
-                    partial(identify_stiffness, settings=self._stiffness_settings),
+                    partial(identify_stiffness, settings=settings),
                 ),
-                force=self._own.level or None,
-                level_tolerance=self._stiffness_settings.level_tolerance,
+                force=self.settings('', IdentificationSettings).level or None,
+                level_tolerance=settings.level_tolerance,
             )
             if output:
                 write_result(output, None, stiffness)
@@ -236,40 +278,41 @@ class IdentificationNode(BaseNode):
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
         """Identify each distinct recording; log its losses and warnings."""
         estimates = []
-        seen: dict[bytes, str] = {}
+        digests: dict[bytes, str] = {}
         for bag in self._bags:
             recording = read(bag)
-            if recording.digest in seen:
-                same = seen[recording.digest]
+            if recording.digest in digests:
+                same = digests[recording.digest]
                 self.get_logger().warning(f'{bag}: the same samples as {same}: counts once')
                 continue
-            seen[recording.digest] = bag
+            digests[recording.digest] = bag
             estimate = identify(recording)
             for words in (*recording.losses, *estimate.warnings):
                 self.get_logger().warning(f'{bag}: {words}')
             estimates.append(estimate)
         return estimates
 
-    def _publish(self, publisher: Publisher, results: Iterable[Status]) -> None:
-        message = DiagnosticArray(status=[_message_of(result) for result in results])
+    def _publish(self, publisher: Publisher, statuses: Sequence[DiagnosticStatus]) -> None:
+        message = DiagnosticArray(status=statuses)
         message.header.stamp = self.get_clock().now().to_msg()
         publisher.publish(message)
 
     # Running topics.
 
     def _on_motion(self, reading: Reading) -> None:
-        if self._live is None or self._joint not in reading.names:
+        sign, joint = self._joint
+        if self._live is None or joint not in reading.names:
             return
-        at, sign = reading.names.index(self._joint), self._joint_sign
+        at = reading.names.index(joint)
         position, velocity, _ = reading.values
         if len(position) > at:
-            speed = sign * velocity[at] if len(velocity) > at else None
-            self._live.take_motion(reading.stamp, sign * position[at], speed)
+            along = sign * velocity[at] if len(velocity) > at else None
+            self._live.take_motion(reading.stamp, sign * position[at], along)
 
     def _on_force(self, reading: Reading) -> None:
         if self._live is not None:
-            force = reading.values[0][AXES.index(self._force_axis)]
-            self._live.take_force(reading.stamp, self._force_sign * force)
+            sign, axis = self._force_axis
+            self._live.take_force(reading.stamp, sign * reading.values[0][AXES.index(axis)])
 
     def _live_statistics(self) -> list[Statistic]:
         estimates = () if self._live is None else self._live.estimate()
@@ -301,22 +344,20 @@ class IdentificationNode(BaseNode):
             name: self._calls.call(client, request) if client.service_is_ready() else None
             for name, client in self._setters.items()
         }
-        later = Future()
-        self._applications.append((Application(values, answers), response, later))
+        application = _Application(values, answers, response, Future())
+        self._applications.append(application)
         for answer in answers.values():
             if answer is not None:
                 answer.add_done_callback(lambda _answer: self._answer_applications())
         self._answer_applications()
-        return later
+        return application.later
 
     def _answer_applications(self) -> None:
         """Send the responses of those calls of ``~/apply`` that are complete."""
-        over = [one for one in self._applications if one[0].is_over]
-        for one in over:
-            self._applications.remove(one)
-            application, response, later = one
-            response.success, response.message = application.outcome()
-            later.set_result(response)
+        for application in [one for one in self._applications if one.is_over()]:
+            self._applications.remove(application)
+            response = application.outcome()
+            application.later.set_result(response)
             # Two statements: rclpy rejects a second severity from the same source line.
             if response.success:
                 self.get_logger().info(response.message)
@@ -325,11 +366,8 @@ class IdentificationNode(BaseNode):
 
 
 def _answer_later(service: Service) -> None:
-    """
-    Let the callback of a service return a future of its response.
-
-    The events executor of rclpy accepts no coroutines as callbacks and sends the returned value.
-    """
+    """Let the callback of a service return a future of its response."""
+    # The events executor of rclpy accepts no coroutines as callbacks, and sends the value.
     send = service.send_response
 
     def send_later(response: Any, header: Any) -> None:
@@ -339,20 +377,6 @@ def _answer_later(service: Service) -> None:
             send(response, header)
 
     service.send_response = send_later  # type: ignore[method-assign]
-
-
-def _message_of(result: Status) -> DiagnosticStatus:
-    return DiagnosticStatus(
-        level=DiagnosticStatus.OK if result.is_determined else DiagnosticStatus.WARN,
-        name=result.name,
-        message=result.message,
-        hardware_id=result.source,
-        values=[
-            KeyValue(key=key, value=str(value))
-            for key, value in result.values.items()
-            if value is not None
-        ],
-    )
 
 
 def main() -> int:

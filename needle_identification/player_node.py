@@ -34,8 +34,7 @@ from std_srvs.srv import SetBool, Trigger
 _TICK: Final = 1e-3
 _LONGEST_BURST: Final = 1e-3
 
-#: Time between checks for other publishers [s].
-_LOOK: Final = 0.25
+_CHECK: Final = 0.25  # time between checks for other publishers [s]
 
 #: Message by phase, before the path of the bag.
 _STATES: Final = {
@@ -44,17 +43,13 @@ _STATES: Final = {
     PlayerPhase.ENDED: 'at the end of',
 }
 
-#: Queue length of a topic that is not latched.
-_DEPTH: Final = 1000
-
-#: Shortest time between two messages on /clock [ns].
-_CLOCK_PERIOD: Final = 1_000_000
+_DEPTH: Final = 1000  # queue length of a topic that is not latched
+_CLOCK_PERIOD: Final = 1_000_000  # shortest time between two messages on /clock [ns]
 
 #: Delay that is reported on /diagnostics [s]; smaller delays are normal on a busy machine.
 _LATE: Final = 0.1
 
-#: Timeout of the acknowledgment of the last messages [s].
-_FAREWELL: Final = 2.0
+_FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
 
 #: QoS of the subscription of rclpy to /clock.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -170,7 +165,7 @@ class PlayerNode(BaseNode):
             self._clock_publisher = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        self._playback.settings = self.settings('', PlaybackSettings, changes)
+        self._playback.change(self.settings('', PlaybackSettings, changes))
 
     def activate(self) -> None:
         """Play from the start."""
@@ -181,7 +176,7 @@ class PlayerNode(BaseNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers_of_play = [
             self.create_timer(_TICK, self._on_timer, clock=steady),
-            self.create_timer(_LOOK, self._look, clock=steady),
+            self.create_timer(_CHECK, self._check_publishers, clock=steady),
         ]
 
     def about(self) -> str:
@@ -290,7 +285,7 @@ class PlayerNode(BaseNode):
 
     # Diagnostics.
 
-    def _look(self) -> None:
+    def _check_publishers(self) -> None:
         contested = {
             name
             for name in self._outputs

@@ -113,7 +113,7 @@ class RecorderNode(BaseNode):
     def diagnose(self) -> Diagnosis[RecorderStatus]:
         if self._bag is None:
             return Diagnosis(Severity.INFO, 'not recording', RecorderStatus())
-        counts, lost = self._bag.counts, self._bag.lost
+        counts, lost = dict(self._bag.counts), dict(self._bag.lost)
         status = RecorderStatus(
             path=str(self._bag.path),
             messages=sum(counts.values()),
@@ -245,7 +245,7 @@ class RecorderNode(BaseNode):
                 self._newest[topic] = number
                 # Each publisher has its own sequence numbers.
                 if missing > 0 and len(recorded.offered) == 1:
-                    bag.lose(topic, missing)
+                    bag.lost[topic] += missing
         if data and topic in self._sampled:
             with suppress(MessageError):
                 stamp = self._sampled[topic](data).stamp

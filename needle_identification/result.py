@@ -17,16 +17,11 @@ from needle_identification.stiffness.estimate import StiffnessSummary
 from needle_ros.files import write_whole
 import yaml
 
-#: Nodes that use the result.
-NODES: Final = ('plant', 'controller')
+NODES: Final = ('plant', 'controller')  #: nodes that use the result
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
-    """
-    Return identified constants of the model as parameters of plant and controller, in SI units.
-
-    A mean outside the range of its parameter, by less than its error, is set to the limit.
-    """
+    """Return identified constants of the model, within their ranges, as parameters of nodes."""
     # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters
 
@@ -48,29 +43,9 @@ def result_yaml(
     """
     Return the text of a ROS parameter file with the identified parameters.
 
-    The parameters apply to nodes named plant and controller in any namespace.
-
-    Parameters
-    ----------
-    friction : FrictionSummary or None
-        Friction over all recordings.
-    stiffness : StiffnessSummary or None
-        Stiffness over all recordings.
-
-    Returns
-    -------
-    str
-        YAML, with the errors and the recordings in comments.
-
-    Raises
-    ------
-    IdentificationError
-        If the data determine no parameter.
-
     Examples
     --------
-    >>> from needle_identification import identify_friction, read_friction_recording
-    >>> from needle_identification import result_yaml, summarize
+    >>> from needle_identification import identify_friction, read_friction_recording, summarize
     >>> estimate = identify_friction(read_friction_recording('bags/friction_01'))
     >>> text = result_yaml(summarize([estimate]))
     >>> print(text.partition('/**/controller')[2])
@@ -111,7 +86,9 @@ def write_result(
     path: Path | str, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> None:
     """
-    Write the parameters to a ROS parameter file, the text of `result_yaml`.
+    Write the parameters to a ROS parameter file, with errors and recordings in comments.
+
+    The parameters apply to nodes named plant and controller in any namespace.
 
     Parameters
     ----------
@@ -134,11 +111,8 @@ def write_result(
 
 
 def steering_yaml(found: SteeringEstimate) -> str:
-    """
-    Return a ROS parameter file for plant, controller and steering node, errors as comments.
-
-    The data determine lengths, not forces: the bending stiffness is the default.
-    """
+    """Return a ROS parameter file for plant, controller and steering node, errors as comments."""
+    # The data determine lengths, not forces: the bending stiffness is the default.
     # Imported here for the same reason.
     from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
     from needle_dynamics.steering.parameters import tissue_of

@@ -17,8 +17,7 @@ from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 
-#: Size of the buffer for sorting messages by receive time [bytes].
-_WINDOW: Final = 2**22
+_WINDOW: Final = 2**22  # size of the buffer for sorting messages by receive time [bytes]
 
 
 def _ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
@@ -33,19 +32,7 @@ _BATCHES: Final = {'.mcap': mcap_batches, '.db3': sqlite_batches, '.bag': _ros1_
 
 
 class Recorded(NamedTuple):
-    """
-    A message of a bag.
-
-    Attributes
-    ----------
-    received : int
-        Receive time [ns].
-    topic : BagTopic
-        Topic of the message.
-    data : bytes
-        Serialized message (CDR).
-
-    """
+    """A message of a bag: receive time [ns], topic, and serialized message (CDR)."""
 
     received: int
     topic: BagTopic

@@ -12,8 +12,7 @@ from needle_identification.bags.topics import BagTopic
 import numpy as np
 from numpy.typing import NDArray
 
-#: Largest number of messages in a batch.
-LARGEST_BATCH: Final = 2**14
+LARGEST_BATCH: Final = 2**14  #: largest number of messages in a batch
 
 #: Upper limit of receive times, so that their differences fit in 64 bits [ns].
 LATEST: Final = 2**62

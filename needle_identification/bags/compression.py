@@ -13,11 +13,8 @@ import lz4.frame
 from needle_identification.errors import RecordingError
 import zstandard
 
-#: File name suffixes of compressed files.
-COMPRESSED: Final = ('.zstd', '.zst', '.lz4')
-
-#: Block size of reads [bytes].
-BLOCK: Final = 2**20
+COMPRESSED: Final = ('.zstd', '.zst', '.lz4')  #: file name suffixes of compressed files
+BLOCK: Final = 2**20  #: block size of reads [bytes]
 
 #: Exceptions of the readers for damaged bytes.
 DAMAGED: Final = (
@@ -32,8 +29,7 @@ DAMAGED: Final = (
     ValueError,
 )
 
-#: Environment variable: factor of all limits of this module.
-FACTOR: Final = 'NEEDLE_BAG_FACTOR'
+FACTOR: Final = 'NEEDLE_BAG_FACTOR'  #: environment variable: factor of all limits of this module
 
 #: Largest record or chunk, and largest message that was compressed individually [bytes].
 LARGEST_RECORD: Final = 2**27
@@ -44,15 +40,15 @@ _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
 
-def open_file(file: Path) -> Any:
-    """Open a file, compressed or not, as a binary stream of its decompressed content."""
+def open_file(file: Path, budget: Budget) -> Any:
+    """Open the decompressed content of a file as a binary stream; count each byte read."""
     if file.suffix == '.lz4':
         archive = lz4.frame.LZ4FrameFile(file)
         # `read` would discard the last data of a truncated file.
         archive.read = archive.read1
-        return archive
+        return _Metered(archive, budget)
     stream = file.open('rb')
-    return _zstd_stream(stream) if file.suffix in COMPRESSED else stream
+    return _Metered(_zstd_stream(stream) if file.suffix in COMPRESSED else stream, budget)
 
 
 def read_up_to(stream: Any, length: int) -> bytes:
@@ -117,10 +113,6 @@ class Budget:
             f'a {what} of {size} bytes, at most {_bytes(self.largest)} are read; {FACTOR}=10 '
             'raises this limit tenfold'
         )
-
-    def metered(self, stream: Any) -> Any:
-        """Wrap a stream of decompressed bytes so that each byte read is counted."""
-        return _Metered(stream, self)
 
 
 class _Metered:

@@ -14,8 +14,7 @@ from needle_ros.errors import printable
 #: File of a rosbag2 folder that lists its other files; written when the bag is closed.
 METADATA: Final = 'metadata.yaml'
 
-#: Key of the metadata for the messages that the recorder lost.
-LOST: Final = 'messages lost'
+LOST: Final = 'messages lost'  #: key of the metadata for the messages that the recorder lost
 
 _FORMS: Final = ('.mcap', '.db3', '.bag')
 

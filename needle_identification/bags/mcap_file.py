@@ -1,8 +1,4 @@
-"""
-Read messages of MCAP files, also of truncated or damaged files.
-
-A file is read from its start, chunk by chunk, in bounded memory.
-"""
+"""Read messages of MCAP files chunk by chunk, also of truncated or damaged files."""
 
 from __future__ import annotations
 
@@ -35,14 +31,12 @@ from numpy.typing import NDArray
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
 
-#: Opcode and length of a record.
-_HEAD: Final = struct.Struct('<BQ')
+_HEAD: Final = struct.Struct('<BQ')  # opcode and length of a record
 
 #: Start, end, size, checksum and length of the name of the compression of a chunk.
 _CHUNK: Final = struct.Struct('<QQQII')
 
-#: The end of a file: a footer record and the magic bytes.
-_TAIL: Final = struct.Struct('<BQQQI8s')
+_TAIL: Final = struct.Struct('<BQQQI8s')  # the end of a file: a footer record and the magic bytes
 
 #: Header of a message record.
 _MESSAGE: Final = np.dtype(
@@ -50,8 +44,7 @@ _MESSAGE: Final = np.dtype(
 )
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
-#: Exceptions for damaged bytes.
-DAMAGED_MCAP: Final = (*DAMAGED, McapError)
+DAMAGED_MCAP: Final = (*DAMAGED, McapError)  #: exceptions for damaged bytes
 
 
 class _Channels:
@@ -113,7 +106,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     channels = _Channels()
     loose = bytearray()
     is_complete = False
-    with tally.budget.metered(open_file(file)) as stream:
+    with open_file(file, tally.budget) as stream:
         magic = read_up_to(stream, len(_MAGIC))
         if magic != _MAGIC:
             begin = repr(magic) if magic else 'nothing'

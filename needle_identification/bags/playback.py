@@ -41,19 +41,14 @@ class PlaybackSettings:
 
 
 class BagPlayback:
-    """
-    Iterates over the messages of a bag in the order of reception, in recorded time.
-
-    ``latched`` has the number of messages that are kept for late readers, by name of each latched
-    topic. Latched messages from before the start are played first. ``late`` and ``latest`` are the
-    delay of the last message and the largest delay [s]; ``loops`` counts restarts at the end.
-    """
+    """Iterate over the messages of a bag in recorded time, earlier latched messages first."""
 
     def __init__(
         self, bag: Bag, topics: Set[str], latched: Mapping[str, int], settings: PlaybackSettings
     ) -> None:
         self.bag = bag
-        self._topics, self._latched, self._settings = topics, latched, settings
+        #: ``latched``: number of messages that are kept for late readers, by name of the topic.
+        self._topics, self._latched, self.settings = topics, latched, settings
         #: Receive time of the first message [ns].
         self._origin = next(bag.messages(lambda _topic: True)).received
         self.start(paused=True)
@@ -62,24 +57,20 @@ class BagPlayback:
         """Play from the start; raise a RecordingError if there is no message to play."""
         self._rewind()
         self.is_paused, self.is_ended = paused, False
+        #: Delay of the last message and largest delay [s], and number of restarts at the end.
         self.late = self.latest = 0.0
         self.loops = 0
-        self._set_position(self.begin, self._settings.delay)
+        self._set_position(self.begin, self.settings.delay)
 
     @property
     def begin(self) -> int:
         """Recorded time of the start [ns]."""
-        return self._origin + round(self._settings.start * NANOSECONDS)
+        return self._origin + round(self.settings.start * NANOSECONDS)
 
-    @property
-    def settings(self) -> PlaybackSettings:
-        """Interval and rate of playback; the rate may change during playback."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: PlaybackSettings) -> None:
+    def change(self, settings: PlaybackSettings) -> None:
+        """Change the rate during playback."""
         self._set_position(self.position)
-        self._settings = settings
+        self.settings = settings
 
     def _set_position(self, position: int, delay: float = 0.0) -> None:
         """Map a recorded time [ns] to the present time plus a delay [s]."""
@@ -87,10 +78,10 @@ class BagPlayback:
 
     @property
     def position(self) -> int:
-        if self.is_paused or self.is_ended or self._settings.rate == 0.0:
+        if self.is_paused or self.is_ended or self.settings.rate == 0.0:
             return self._at
         elapsed = max(0.0, time.monotonic() - self._since)
-        return self._at + round(elapsed * self._settings.rate * NANOSECONDS)
+        return self._at + round(elapsed * self.settings.rate * NANOSECONDS)
 
     def seconds(self, position: int) -> float:
         """Convert a recorded time [ns] to the time since the begin of the recording [s]."""
@@ -102,7 +93,7 @@ class BagPlayback:
 
     def _rewind(self) -> None:
         """Return to the start: collect earlier latched messages and read the first message."""
-        settings = self._settings
+        settings = self.settings
         end = self._origin + round(settings.end * NANOSECONDS) if settings.end else None
         before: dict[str, deque[Recorded]] = {}
         messages = self.bag.messages(lambda topic: topic.name in self._topics)
@@ -147,13 +138,13 @@ class BagPlayback:
             days, name = pause / _LONGEST_PAUSE, self._next.topic.name
             raise RecordingError(
                 f'{self.bag.path} has a damaged receive time at {self.seconds(self._last):.3f} s: '
-                f'a message of {name} came {days:.3g} days later'
+                f'a message of {name} arrives {days:.3g} days later'
             )
-        if self._settings.rate > 0.0:
+        if self.settings.rate > 0.0:
             late = self.position - self._next.received
             if late < 0:
                 return False
-            self.late = late / self._settings.rate / NANOSECONDS
+            self.late = late / self.settings.rate / NANOSECONDS
             self.latest = max(self.latest, self.late)
         return True
 
@@ -164,7 +155,7 @@ class BagPlayback:
         taken = [*self._before, self._next]
         self._before = []
         self._last = self._next.received
-        if self.is_paused or self._settings.rate == 0.0:
+        if self.is_paused or self.settings.rate == 0.0:
             self._at = self._last
         self._next = next(self._messages, None)
         if self._next is not None and self._end is not None and self._next.received > self._end:

@@ -18,8 +18,7 @@ from needle_identification.errors import RecordingError
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
-#: Size of a row in addition to its data [bytes].
-_ROW: Final = 16
+_ROW: Final = 16  # size of a row in addition to its data [bytes]
 
 #: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
 #: A message takes about 20 steps and 40 bytes.
@@ -33,11 +32,11 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())
-            unfolded = tally.budget.metered(open_file(file))
-            with unfolded as stream, Path(folder, file.stem).open('wb') as copy:
+            unfolded = Path(folder, file.stem)
+            with open_file(file, tally.budget) as stream, unfolded.open('wb') as copy:
                 while part := read_up_to(stream, BLOCK):
                     copy.write(part)
-            file = Path(folder, file.stem)
+            file = unfolded
         # An unmerged journal contains the end of the recording.
         journal = file.with_name(f'{file.name}-wal').exists()
         uri = f'file:{quote(str(file.resolve()))}?{"mode=ro" if journal else "immutable=1"}'

@@ -19,49 +19,23 @@ _WORDS: Final = {
     'liveliness': {1: 'automatic', 3: 'manual_by_topic'},
 }
 
-#: Value of the middleware for no limit [ns].
-UNLIMITED: Final = 2**63 - 1
+UNLIMITED: Final = 2**63 - 1  #: value of the middleware for no limit [ns]
 
 
 class OfferedQos(NamedTuple):
-    """
-    Quality of service that a publisher offers, with the names of rosbag2.
+    """Quality of service that a publisher offers, with the names of rosbag2; times in ns."""
 
-    Attributes
-    ----------
-    reliability, durability, history : str
-        ``reliable`` or ``best_effort``, ``volatile`` or ``transient_local``, ``keep_last`` or
-        ``keep_all``.
-    depth : int
-        Number of messages that are kept.
-    deadline, lifespan : int
-        Longest time between messages, and longest lifetime of a message [ns].
-    liveliness : str
-        ``automatic`` or ``manual_by_topic``.
-    lease : int
-        Longest time without a liveliness signal of the publisher [ns].
-
-    """
-
-    reliability: str = 'reliable'
-    durability: str = 'volatile'
-    history: str = 'keep_last'
-    depth: int = 10
-    deadline: int = UNLIMITED
-    lifespan: int = UNLIMITED
-    liveliness: str = 'automatic'
-    lease: int = UNLIMITED
+    reliability: str = 'reliable'  # or best_effort
+    durability: str = 'volatile'  # or transient_local
+    history: str = 'keep_last'  # or keep_all
+    depth: int = 10  # number of messages that are kept
+    deadline: int = UNLIMITED  # longest time between messages
+    lifespan: int = UNLIMITED  # longest lifetime of a message
+    liveliness: str = 'automatic'  # or manual_by_topic
+    lease: int = UNLIMITED  # longest time without a liveliness signal of the publisher
 
     def as_mapping(self) -> dict[str, Any]:
-        """
-        Return the profile in the storage format of rosbag2.
-
-        Returns
-        -------
-        dict
-            Values by name.
-
-        """
+        """Return the profile in the storage format of rosbag2."""
         return {
             'history': self.history,
             'depth': self.depth,
@@ -90,40 +64,23 @@ def _nanoseconds(time: Mapping[str, int] | None) -> int:
 
 @dataclass(frozen=True, slots=True)
 class BagTopic:
-    """
-    A topic in a bag.
+    """A topic in a bag."""
 
-    Attributes
-    ----------
-    name, type_name : str
-        Full name, and type such as ``sensor_msgs/msg/JointState``. A message encoding other than
-        CDR (ROS 2) follows the type in brackets, which makes it an unknown type.
-    encoding, definition : str
-        Language of the definition of the type, ``ros2msg`` or ``ros2idl``, and the definition.
-    profiles : str
-        YAML of the QoS that the publishers offered, for `offered_qos`.
-
-    """
-
-    name: str
+    name: str  #: full name
+    #: Type, such as ``sensor_msgs/msg/JointState``. A message encoding other than CDR (ROS 2)
+    #: follows the type in brackets, which makes it an unknown type.
     type_name: str
+    #: Language of the definition of the type, ``ros2msg`` or ``ros2idl``, and the definition.
     encoding: str = field(default='', compare=False)
     definition: str = field(default='', compare=False, repr=False)
+    #: YAML of the QoS that the publishers offered, for `offered_qos`.
     profiles: str = field(default='', compare=False, repr=False)
 
     def __str__(self) -> str:
         return f'{self.name} ({self.type_name})'
 
     def offered_qos(self) -> tuple[OfferedQos, ...]:
-        """
-        Parse the QoS that the publishers offered.
-
-        Returns
-        -------
-        tuple of OfferedQos
-            One per publisher; empty if missing or not readable.
-
-        """
+        """Return the QoS that each publisher offered; empty if missing or not readable."""
         try:
             profiles = read_document(self.profiles) or []
             return tuple(
@@ -152,11 +109,7 @@ def make_topic(
     definition: str = '',
     profiles: str = '',
 ) -> BagTopic:
-    """
-    Build a topic; ``std_msgs/String`` (ROS 1, some writers) becomes ``std_msgs/msg/String``.
-
-    A message encoding other than ``cdr`` (ROS 2) is appended to the type.
-    """
+    """Build a topic; ``std_msgs/String`` (ROS 1, some writers) becomes ``std_msgs/msg/String``."""
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'
     # Escaped names keep error messages of damaged files on one line.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -21,8 +22,7 @@ _COMPRESSIONS: Final = {
     'none': CompressionType.NONE,
 }
 
-#: Compressions of the chunks of a bag, by name.
-COMPRESSIONS: Final = tuple(_COMPRESSIONS)
+COMPRESSIONS: Final = tuple(_COMPRESSIONS)  #: compressions of the chunks of a bag, by name
 
 
 class BagWriter:
@@ -43,6 +43,10 @@ class BagWriter:
     ----------
     path : Path
         Folder of the bag.
+    counts : dict
+        Number of written messages by topic.
+    lost : Counter
+        Number of lost messages by topic, counted by the caller; written to the metadata.
 
     Raises
     ------
@@ -86,19 +90,9 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict[str, Any]] = {}
-        self._counts: dict[str, int] = {}
-        self._lost: dict[str, int] = {}
+        self.counts: dict[str, int] = {}
+        self.lost: Counter[str] = Counter()
         self._start, self._end = 2**63 - 1, 0
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Number of written messages by topic."""
-        return dict(self._counts)
-
-    @property
-    def lost(self) -> Mapping[str, int]:
-        """Number of lost messages by topic."""
-        return dict(self._lost)
 
     @property
     def size(self) -> int:
@@ -138,7 +132,7 @@ class BagWriter:
             self._schemas[type_name],
             {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash},
         )
-        self._counts.setdefault(topic, 0)
+        self.counts.setdefault(topic, 0)
         self._topics[topic] = {
             'name': topic,
             'type': type_name,
@@ -162,23 +156,9 @@ class BagWriter:
 
         """
         self._writer.add_message(self._channels[topic], receive_ns, data, receive_ns)
-        self._counts[topic] += 1
+        self.counts[topic] += 1
         self._start = min(self._start, receive_ns)
         self._end = max(self._end, receive_ns)
-
-    def lose(self, topic: str, number: int) -> None:
-        """
-        Count lost messages, which are written to the metadata.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-        number : int
-            Number of messages.
-
-        """
-        self._lost[topic] = self._lost.get(topic, 0) + number
 
     def flush(self) -> None:
         """Pass all buffered data to the operating system."""
@@ -214,14 +194,14 @@ class BagWriter:
                 'storage_identifier': 'mcap',
                 **self._extent(),
                 'topics_with_message_count': [
-                    {'topic_metadata': metadata, 'message_count': self._counts[topic]}
+                    {'topic_metadata': metadata, 'message_count': self.counts[topic]}
                     for topic, metadata in self._topics.items()
                 ],
                 'compression_format': '',
                 'compression_mode': '',
                 'relative_file_paths': [name],
                 'files': [{'path': name, **self._extent()}],
-                'custom_data': {LOST: described(self._lost)} if self._lost else None,
+                'custom_data': {LOST: described(self.lost)} if self.lost else None,
                 'ros_distro': 'jazzy',
             }
         }
@@ -230,7 +210,7 @@ class BagWriter:
         return {
             'duration': {'nanoseconds': max(0, self._end - self._start)},
             'starting_time': {'nanoseconds_since_epoch': self._start},
-            'message_count': sum(self._counts.values()),
+            'message_count': sum(self.counts.values()),
         }
 
 

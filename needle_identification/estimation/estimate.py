@@ -15,31 +15,15 @@ from scipy.special import stdtrit
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ParameterEstimate:
-    """
-    Estimate of one parameter from one recording.
+    """Estimate of one parameter from one recording."""
 
-    Attributes
-    ----------
-    name : str
-        Name; for a model parameter, its field in `NeedleParameters`.
-    symbol, unit : str
-        Symbol in text, such as ``mu_s``, and unit; ``1`` for a pure number.
-    value, error : float
-        Estimate and its standard error; nan and inf if not determined.
-    interval : (float, float)
-        95 % confidence interval.
-    determined : bool
-        Whether the data determine the parameter.
-
-    """
-
-    name: str
-    symbol: str
-    unit: str
-    value: float = nan
-    error: float = inf
-    interval: tuple[float, float] = (-inf, inf)
-    determined: bool = False
+    name: str  #: name; for a model parameter, its field in `NeedleParameters`
+    symbol: str  #: symbol in text, such as ``mu_s``
+    unit: str  #: unit; ``1`` for a pure number
+    value: float = nan  #: estimate; nan if not determined
+    error: float = inf  #: standard error; inf if not determined
+    interval: tuple[float, float] = (-inf, inf)  #: 95 % confidence interval
+    determined: bool = False  #: whether the data determine the parameter
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.value, self.error, self.unit)}>'
@@ -47,51 +31,28 @@ class ParameterEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Statistic:
-    """
-    One parameter over several recordings.
-
-    Attributes
-    ----------
-    name, symbol, unit : str
-        As in `ParameterEstimate`.
-    mean : float
-        Mean over the recordings that determine the parameter; nan without such a recording.
-    deviation : float or None
-        Standard deviation over the recordings, as in Tables 1 and 2; None for fewer than two.
-    error : float
-        Standard error of the mean.
-    interval : (float, float)
-        95 % confidence interval of the mean.
-    count : int
-        Number of recordings that determine the parameter.
-
-    """
+    """One parameter over several recordings; name, symbol and unit as in `ParameterEstimate`."""
 
     name: str
     symbol: str
     unit: str
-    mean: float = nan
+    mean: float = nan  #: mean over the recordings that determine the parameter, nan if none
+    #: Standard deviation over the recordings, as in Tables 1 and 2; None for fewer than two.
     deviation: float | None = None
-    error: float = inf
-    interval: tuple[float, float] = (-inf, inf)
-    count: int = 0
+    error: float = inf  #: standard error of the mean
+    interval: tuple[float, float] = (-inf, inf)  #: 95 % confidence interval of the mean
+    count: int = 0  #: number of recordings that determine the parameter
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
-
-
-def with_value(
-    unknown: ParameterEstimate, value: float, error: float, low: float, high: float
-) -> ParameterEstimate:
-    """Return a determined copy with a value, its standard error and its 95 % interval."""
-    return replace(unknown, value=value, error=error, interval=(low, high), determined=True)
 
 
 def with_half_width(
     unknown: ParameterEstimate, value: float, error: float, half_width: float
 ) -> ParameterEstimate:
     """Return a determined copy, with an interval symmetric about the value."""
-    return with_value(unknown, value, error, value - half_width, value + half_width)
+    interval = (value - half_width, value + half_width)
+    return replace(unknown, value=value, error=error, interval=interval, determined=True)
 
 
 _Named = TypeVar('_Named', ParameterEstimate, Statistic)
@@ -113,23 +74,8 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     square root of their number. Its lower limit results from the errors within the recordings,
     because a few recordings may agree by chance. If the recordings differ by more than their own
     errors, the interval is from Student's t, since a standard deviation from few recordings is
-    uncertain. Otherwise it is the mean plus and minus two standard errors.
-
-    Parameters
-    ----------
-    parameters : sequence of ParameterEstimate
-        One estimate per recording. Undetermined estimates are ignored.
-
-    Returns
-    -------
-    Statistic
-        Mean, standard deviation and standard error.
-
-    Raises
-    ------
-    IdentificationError
-        If there are no estimates.
-
+    uncertain. Otherwise it is the mean plus and minus two standard errors. Undetermined estimates
+    are ignored.
     """
     if not parameters:
         raise IdentificationError('no recordings to identify from')

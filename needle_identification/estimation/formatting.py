@@ -8,8 +8,7 @@ from typing import Final
 #: Text for a parameter that the data do not determine.
 UNKNOWN: Final = 'not determined by the data'
 
-#: Smallest error that limits the digits.
-_SMALLEST_ERROR: Final = 1e-9
+_SMALLEST_ERROR: Final = 1e-9  # smallest error that limits the digits
 
 
 def measured(value: float, error: float, unit: str = '') -> str:

@@ -46,21 +46,15 @@ _LONGEST: Final = 10.0
 #: Variances of differences relative to white noise in a part.
 _DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)
 
-#: Prior probability of differences.
-_DIFFERENCED: Final = 0.1
+_DIFFERENCED: Final = 0.1  # prior probability of differences
 
 #: Prior probability of white noise. 0.5 is too large: a correlation time of a fifth of a part was
 #: not detected, and 89 % of the intervals contained the true value.
 _WHITE: Final = 0.2
 
-#: Smallest probability of a model that is included.
-_NEGLIGIBLE: Final = 1e-6
-
-#: Bisection steps, for an accuracy of an interval of 1/1000 of the widest.
-_BISECTIONS: Final = 30
-
-#: Relative size of rounding errors.
-_ROUNDING: Final = 1e-9
+_NEGLIGIBLE: Final = 1e-6  # smallest probability of a model that is included
+_BISECTIONS: Final = 30  # bisection steps, for an accuracy of an interval of 1/1000 of the widest
+_ROUNDING: Final = 1e-9  # relative size of rounding errors
 
 #: Largest number of parts for the comparison of models, and parts per run.
 _MOST_PARTS: Final = 1000
@@ -142,12 +136,9 @@ class Memory:
 def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
-    """
-    Estimate the autocorrelation of noise from the residuals (n,); white with too few parts.
-
-    `influence` (n, k) is the change of each parameter with the response of each sample. Regressors
-    and influence are zero for unused samples.
-    """
+    """Estimate the autocorrelation of noise from the residuals (n,); white with too few parts."""
+    # Influence (n, k): change of each parameter with the response of each sample. Regressors and
+    # influence are zero for unused samples.
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
     x = x[:, strengths > _ROUNDING * strengths[0]]

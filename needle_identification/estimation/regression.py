@@ -33,7 +33,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimators import check_estimator
+from needle_identification.estimation import check_estimator
 from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -48,8 +48,7 @@ LARGEST_CONDITION: Final = 20.0
 #: Largest component of a determined parameter in such a direction; its error includes it.
 _LARGEST_SHARE: Final = 0.1
 
-#: Relative size of rounding errors.
-_ROUNDING: Final = 1e-9
+_ROUNDING: Final = 1e-9  # relative size of rounding errors
 
 #: Weight of the noise of all groups in the variance of each group [correlation windows].
 _PRIOR: Final = 5.0
@@ -66,44 +65,20 @@ _MAX_ITERATIONS: Final = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Regression:
-    """
-    Solution of a linear regression with k parameters and n samples.
+    """Solution of a linear regression with k parameters and n samples."""
 
-    Attributes
-    ----------
-    values, errors : ndarray, shape (k,)
-        Parameters and their standard errors; nan and inf where not determined.
-    covariance : ndarray, shape (k, k)
-        Covariance of the parameters; nan, and inf on the diagonal, where not determined.
-    determined : ndarray of bool, shape (k,)
-        Whether the regressors distinguish the parameter from the others.
-    condition : float
-        Condition number of the regressors, each scaled to unit norm.
-    residual : ndarray, shape (n,)
-        Response minus model; zero where not used.
-    determination : float
-        Coefficient of determination R^2.
-    samples : int
-        Number of samples used.
-    effective_samples : float
-        Number of independent samples with the same information.
-    degrees_of_freedom : ndarray, shape (k,)
-        Degrees of freedom of the errors; few where few samples determine a parameter.
-    memory : Memory or None
-        Autocorrelation of the noise, included in the errors; None if not requested.
-
-    """
-
-    values: FloatArray
-    covariance: FloatArray
-    errors: FloatArray
-    determined: BoolArray
-    condition: float
-    residual: FloatArray
-    determination: float
-    samples: int
-    effective_samples: float
+    values: FloatArray  #: (k,) parameters; nan where not determined
+    covariance: FloatArray  #: (k, k) of the parameters; nan, and inf on the diagonal, likewise
+    errors: FloatArray  #: (k,) standard errors; inf likewise
+    determined: BoolArray  #: (k,) whether the regressors distinguish the parameter from the others
+    condition: float  #: condition number of the regressors, each scaled to unit norm
+    residual: FloatArray  #: (n,) response minus model; zero where not used
+    determination: float  #: coefficient of determination R^2
+    samples: int  #: number of samples used
+    effective_samples: float  #: number of independent samples with the same information
+    #: (k,) degrees of freedom of the errors; few where few samples determine a parameter.
     degrees_of_freedom: FloatArray
+    #: Autocorrelation of the noise, included in the errors; None if not requested.
     memory: Memory | None = None
 
     def __repr__(self) -> str:
@@ -117,15 +92,7 @@ class Regression:
         return 1.0 - self.determination < _ROUNDING
 
     def interval(self) -> FloatArray:
-        """
-        Return the 95 % confidence intervals of the parameters (Student's t).
-
-        Returns
-        -------
-        ndarray, shape (k, 2)
-            Lower and upper limits; infinite where not determined.
-
-        """
+        """Return the 95 % confidence intervals (k, 2); infinite where not determined."""
         half_widths = stdtrit(self.degrees_of_freedom, 0.975) * self.errors
         centers = np.where(self.determined, self.values, 0.0)
         return np.column_stack([centers - half_widths, centers + half_widths])
@@ -147,11 +114,8 @@ def wald_test(fit: Regression, at: list[int]) -> float:
 
 
 def hausman_test(part: Regression, whole: Regression, count: int) -> float:
-    """
-    Return the p-value that the first parameters agree in fits to some and to all samples.
-
-    Including the errors of ``whole`` would increase the power, but not the safety.
-    """
+    """Return the p-value that the first parameters agree in fits to some and to all samples."""
+    # Including the errors of `whole` would increase the power, but not the safety.
     at = np.flatnonzero(part.determined[:count] & whole.determined[:count])
     if not len(at) or not np.diag(part.covariance)[at].all():
         return 1.0
@@ -249,30 +213,12 @@ def regress(
         solution = _weighted(x, y, _group_weights(x, y, used, groups, span))
     elif estimator == 'huber':
         solution = _huber(x, y, used)
+    elif regressor_noise is None or len(regressor_noise) != k:
+        raise ParameterError('total needs the noise of each column')
     else:
-        if regressor_noise is None or len(regressor_noise) != k:
-            raise ParameterError('total needs the noise of each column')
         noise = np.diag(np.asarray(regressor_noise) / norms) ** 2
         solution = _total(x, y, used, basis.T @ noise @ basis)
-    return _with_errors(
-        solution, x, y, used, correlation, basis / norms[:, np.newaxis], unknown, singular, colored
-    )
-
-
-def _with_errors(
-    solution: _Solution,
-    x: FloatArray,
-    y: FloatArray,
-    used: BoolArray,
-    correlation: int,
-    back: FloatArray,
-    unknown: BoolArray,
-    singular: FloatArray,
-    colored: bool,
-) -> Regression:
-    """Add covariance and degrees of freedom, and transform back to the given columns."""
-    samples, k = int(np.count_nonzero(used)), len(unknown)
-    effective = samples / independent_span(correlation)
+    back = basis / norms[:, np.newaxis]
     residual = y - x @ solution.values
     # The fit uses one degree of freedom per parameter.
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
@@ -344,12 +290,9 @@ def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:
 def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
-    """
-    Weight each sample by the inverse of the noise variance about the mean of its group.
-
-    The noise of all groups enters with the weight of a few correlation windows, because a group of
-    few samples may have a small variance by chance.
-    """
+    """Weight each sample by the inverse of the noise variance about the mean of its group."""
+    # The noise of all groups enters with the weight of a few correlation windows, because a group
+    # of few samples may have a small variance by chance.
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
     residual = y - x @ _weighted(x, y, used.astype(np.float64)).values
@@ -400,11 +343,7 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """
-    Return a basis (k, r) of the directions that regressors determine, and unknown parameters.
-
-    Inputs are the singular values (k,) of regressors of unit norm, and directions (k, k) by row.
-    """
+    """Return a basis (k, r) of the determined directions, and unknown parameters, of an SVD."""
     null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
     unknown = (np.abs(directions[null]) > np.sqrt(_ROUNDING)).any(axis=0)

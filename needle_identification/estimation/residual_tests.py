@@ -11,8 +11,7 @@ from needle_identification.estimation.memory import Memory, Parts
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
-#: Smallest number of parts for any test.
-_FEWEST_PARTS: Final = 10
+_FEWEST_PARTS: Final = 10  # smallest number of parts for any test
 
 #: Smallest number of parts for the test of d'Agostino and Pearson; below, Shapiro and Wilk.
 _FEWEST_FOR_MOMENTS: Final = 20
@@ -43,22 +42,12 @@ _WORDS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResidualTest:
-    """
-    A test of the residuals of a fit.
+    """A test of the residuals of a fit."""
 
-    Attributes
-    ----------
-    name, words : str
-        ``normality``, ``trend``, ``speed`` or ``spread``, and the result in words.
-    statistic, p_value : float
-        Statistic and p-value of the test; a small p-value is evidence against the model.
-
-    """
-
-    name: str
+    name: str  #: ``normality``, ``trend``, ``speed`` or ``spread``
     statistic: float
-    p_value: float
-    words: str
+    p_value: float  #: a small value is evidence against the model
+    words: str  #: result in words
 
     @property
     def failed(self) -> bool:
@@ -69,21 +58,17 @@ def residual_tests(
     residual: FloatArray,
     *,
     time: FloatArray,
-    speed: FloatArray,
+    velocity: FloatArray,
     parts: Parts,
     memory: Memory,
     parameters: int,
 ) -> tuple[ResidualTest, ...]:
-    """
-    Test the means of the residual over parts, whitened by the noise model; none for too few parts.
-
-    These means are nearly independent, although the samples are correlated.
-    """
+    """Test the means of the residual over parts, whitened, hence nearly independent."""
     if len(parts.limits) < _FEWEST_PARTS:
         return ()
     means = memory.whitened(parts.means(residual), parts)
-    speeds, times = parts.means(speed), parts.means(time)
-    groups = np.array_split(np.argsort(speeds), min(10, len(means) // 5))
+    velocities, times = parts.means(velocity), parts.means(time)
+    groups = np.array_split(np.argsort(velocities), min(10, len(means) // 5))
     with np.errstate(invalid='ignore', divide='ignore'):
         found = {'normality': _normality(means), 'trend': _trend(times, means)}
         if len(groups) > parameters:

@@ -36,12 +36,7 @@ class Trial(NamedTuple):
 
 
 class Screening:
-    """
-    Least squares fit of the used samples, to which additional columns are added on trial.
-
-    ``values`` and ``errors`` (k,) are the coefficients with errors for uncorrelated noise;
-    ``misfit`` is the residual sum of squares.
-    """
+    """Least squares fit of the used samples, to which additional columns are added on trial."""
 
     def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:
         norms = _norms(regressors)
@@ -53,6 +48,7 @@ class Screening:
         values = self._inverse @ self._moment
         self._residual = response - self._x @ values
         self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
+        #: Residual sum of squares, and coefficients with errors for uncorrelated noise, (k,).
         self.misfit = float(self._residual @ self._residual)
         self.values = values / norms
         self.errors = (

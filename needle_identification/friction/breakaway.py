@@ -20,14 +20,12 @@ from needle_identification.friction.filtering import CORRELATION_LENGTH
 import numpy as np
 from scipy.special import stdtrit
 
-#: Time before the motion in which the rise of the force is measured [s].
-_RISING: Final = 0.3
+_RISING: Final = 0.3  # time before the motion in which the rise of the force is measured [s]
 
 #: Smallest rise of the force in that time, as a fraction of the force and of mu_s.
 _SMALLEST_RISE: Final = 0.05
 
-#: Smallest slope of the rise [standard errors].
-_CLEAR_RISE: Final = 5.0
+_CLEAR_RISE: Final = 5.0  # smallest slope of the rise [standard errors]
 
 #: Fraction of the usual correlation length used here, because the rise of the force is short.
 _WINDOW_PART: Final = 0.4
@@ -47,7 +45,7 @@ def breakaway_force(
     for start in starts:
         before, after = changes[changes < start], changes[changes > start]
         rest = int(before[-1]) if len(before) else 0
-        end = int(after[0]) if len(after) else len(design.speed)
+        end = int(after[0]) if len(after) else len(design.velocity)
         push = _push(design, (rest, int(start), end), least)
         if push is not None:
             found.append(push)
@@ -109,11 +107,11 @@ def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
     """Return the onset of motion [s], fitted as a step and a ramp of velocity, and its error."""
     signals = design.signals
     first, start, end = span
-    time, speed = signals.time[first:end], design.speed[first:end]
+    time, velocity = signals.time[first:end], design.velocity[first:end]
     candidates = signals.time[first : start + 1]
     misfits = np.array(
-        [_misfit(time[k:] - time[k], speed[k:]) for k in range(len(candidates))]
-    ) + np.concatenate([[0.0], np.cumsum(speed**2)[: len(candidates) - 1]])
+        [_misfit(time[k:] - time[k], velocity[k:]) for k in range(len(candidates))]
+    ) + np.concatenate([[0.0], np.cumsum(velocity**2)[: len(candidates) - 1]])
     best = int(np.argmin(misfits))
     # The length of the filter counts as one independent sample.
     independent = max(len(time) / (2 * signals.half_filter + 1) - 3.0, 1.0)

@@ -13,8 +13,7 @@ from needle_identification.friction.design import Design
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Largest lag of usual sensor filters [s].
-_UNUSUAL_LAG: Final = 0.01
+_UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
 
 #: Growth of the standard errors by autocorrelated noise above which a warning is given.
 _MUCH_LARGER: Final = 1.5
@@ -54,7 +53,7 @@ def fit_warnings(
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
     settings = design.signals.settings
     if 'stribeck' in settings.terms and not design.reaches('stribeck'):
-        slowest = float(np.abs(design.speed[design.used]).min())
+        slowest = float(np.abs(design.velocity[design.used]).min())
         yield (
             f'no sample is slow enough for the term stribeck: {slowest:.2g} m/s and more, with '
             f'stribeck_speed {settings.stribeck_speed:g} m/s; its coefficient is a guess'
@@ -106,7 +105,7 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
 
 def noise_bias(design: Design, fit: Regression) -> float:
     """Return the bias of mu_v by velocity noise [N s/m]; 0 if negligible or corrected."""
-    settings, noise = design.signals.settings, design.signals.speed_noise
+    settings, noise = design.signals.settings, design.signals.velocity_noise
     columns = columns_of(settings.terms, settings)
     names = [column.name for column in columns]
     if settings.estimator == 'total' or 'viscous_friction' not in names:
@@ -121,7 +120,7 @@ def noise_bias(design: Design, fit: Regression) -> float:
 
 def noise_words(design: Design, bias: float) -> str:
     """Describe the bias of mu_v [N s/m] by velocity noise."""
-    noise = design.signals.speed_noise
+    noise = design.signals.velocity_noise
     return f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
 
 

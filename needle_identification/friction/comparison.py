@@ -17,51 +17,31 @@ from needle_identification.friction.settings import TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Probability of a false alarm of all comparisons.
-SIGNIFICANCE: Final = 0.02
+SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
 
 
 #: Growth of the standard errors by autocorrelation that two missing terms may explain.
 _LIKE_MEMORY: Final = 1.5
 
-#: Folds of the cross-validation over strokes.
-_FOLDS: Final = 5
-
-#: Terms whose coefficient cannot be negative.
-_POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
+_FOLDS: Final = 5  # folds of the cross-validation over strokes
+_POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateFit:
-    """
-    Comparison of an alternative set of terms with the chosen set.
+    """Comparison of an alternative set of terms with the chosen set."""
 
-    Attributes
-    ----------
-    terms : tuple of str
-        Alternative set: one term more or less, or two more.
-    criterion : str
-        Criterion of the comparison: BIC, with the effective number of samples.
-    difference : float
-        BIC of the alternative set minus BIC of the chosen set; negative if the alternative is
-        better, nan if it is not determined.
-    p_value : float
-        p-value of the Wald test that the differing terms are zero, with standard errors that
-        account for autocorrelation, corrected for the number of terms tried (Holm).
-    supported : bool
-        Whether the data support the alternative set; an additional term must also improve the
-        prediction of held-out samples.
-    words : str
-        Result as a sentence.
-
-    """
-
-    terms: tuple[str, ...]
-    criterion: str = 'BIC'
+    terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
+    criterion: str = 'BIC'  #: with the effective number of samples
+    #: BIC of the alternative set minus BIC of the chosen set; nan if it is not determined.
     difference: float = nan
+    #: Of the Wald test that the differing terms are zero, with errors for autocorrelated noise,
+    #: corrected for the number of terms tried (Holm).
     p_value: float = 1.0
+    #: Whether the data support the set; an additional term must also improve the prediction of
+    #: held-out samples.
     supported: bool = False
-    words: str
+    words: str  #: result as a sentence
 
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
@@ -177,21 +157,18 @@ def _judged(
 
 
 def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
-    """
-    Test whether additional terms lower the prediction error of held-out samples.
-
-    Folds consist of consecutive strokes, so that fitting autocorrelated noise is no advantage.
-    """
+    """Test whether additional terms lower the prediction error of held-out samples."""
     used = design.used
     settings = design.signals.settings
     x, y = design.regressors((*settings.terms, *more))[used], design.signals.force[used]
     without = np.ones(x.shape[1], dtype=np.bool_)
     start = len(columns_of(settings.terms, settings))
     without[start : start + len(columns_of(more, settings))] = False
+    # Consecutive strokes in a fold: fitting autocorrelated noise is no advantage.
     fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
     misfits = np.zeros(2)
-    for held in range(int(fold.max()) + 1):
-        out = fold == held
+    for omitted in range(int(fold.max()) + 1):
+        out = fold == omitted
         for k, chosen in enumerate((without, slice(None))):
             solution = np.linalg.lstsq(x[~out][:, chosen], y[~out], rcond=None)[0]
             misfits[k] += float(np.sum((y[out] - x[out][:, chosen] @ solution) ** 2))

@@ -26,18 +26,14 @@ from scipy.ndimage import maximum_filter1d
 #: Smallest number of independent samples in motion for a meaningful standard error.
 FEWEST_SAMPLES: Final = 10.0
 
-#: Settling time of the sensor filters after a change [lags of the force].
-_SETTLING: Final = 3.0
+_SETTLING: Final = 3.0  # settling time of the sensor filters after a change [lags of the force]
 
 #: Tolerance within which the needle is at its largest insertion depth [m]: encoder counts,
 #: noise, backlash.
 _SAME_DEPTH: Final = 5e-5
 
-#: Smallest fraction of the full size of a term that counts as an effect.
-_FELT: Final = 0.05
-
-#: Largest settling time [s]; a longer lag is a clock offset.
-_LONGEST_SETTLING: Final = 0.1
+_EFFECT: Final = 0.05  # smallest fraction of the full size of a term that counts as an effect
+_LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +42,7 @@ class Design:
 
     signals: FilteredSignals
     lag: float  # of the force [s]
-    speed: FloatArray  # [m/s], delayed
+    velocity: FloatArray  # [m/s], delayed
     acceleration: FloatArray  # [m/s^2], delayed
     depth: FloatArray  # insertion depth [m], delayed
     fresh: BoolArray  # at the largest insertion depth so far
@@ -83,32 +79,29 @@ class Design:
         """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
         motion = NeedleMotion(
-            self.speed - later * self.acceleration,
+            self.velocity - later * self.acceleration,
             self.acceleration,
             signals.time - signals.time[0],
-            self.depth - later * self.speed,
+            self.depth - later * self.velocity,
             self.fresh,
         )
         return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
-        """
-        Test whether enough samples lie where a term has an effect.
-
-        At higher speeds only velocity noise would support ``stribeck``; without motion into old
-        tissue ``cutting`` is an offset.
-        """
+        """Test whether enough samples lie where a term has an effect."""
         if term == 'cutting':
-            inward = self.used & (self.speed > 0.0)
+            # Without motion into old tissue, it is an offset.
+            inward = self.used & (self.velocity > 0.0)
             few = min(
                 np.count_nonzero(inward & self.fresh), np.count_nonzero(inward & ~self.fresh)
             )
             return bool(few >= self.signals.correlation)
         if term != 'stribeck':
             return True
+        # At higher speeds, only velocity noise would support it.
         column = self.columns([term])
-        felt = np.count_nonzero(np.abs(column[self.used]) >= _FELT)
-        return bool(felt >= self.signals.correlation)
+        affected = np.count_nonzero(np.abs(column[self.used]) >= _EFFECT)
+        return bool(affected >= self.signals.correlation)
 
     def far_from_changes(self, distance: float) -> Design:
         """Leave out samples within ``distance`` [s] plus the filter of a change of regime."""
@@ -129,7 +122,7 @@ class Design:
         """Fit terms to the force; the last coefficient is the remaining lag [s], if any."""
         signals = self.signals
         noise_of = {
-            'viscous_friction': signals.speed_noise,
+            'viscous_friction': signals.velocity_noise,
             'moving_mass': signals.acceleration_noise,
         }
         noise = [noise_of.get(column.name, 0.0) for column in columns_of(terms, signals.settings)]
@@ -167,21 +160,17 @@ class Design:
 
 
 def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
-    """
-    Select samples in steady regimes, outside the filter windows around changes.
-
-    ``settling_lag`` [s] is the lag of the sensor filters, for which more samples are left out.
-    """
+    """Select samples in steady regimes, after the sensor filters with a lag [s] have settled."""
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
-    speed, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))
+    velocity, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))
     depth = np.interp(then, time, signals.depth)
-    regime = np.where(np.abs(speed) > signals.moving_speed, np.sign(speed), 0.0)
-    change = np.ones(len(speed), dtype=np.bool_)
+    regime = np.where(np.abs(velocity) > signals.moving_speed, np.sign(velocity), 0.0)
+    change = np.ones(len(velocity), dtype=np.bool_)
     change[1:-1] = signals.lost[1:-1] | (regime[1:-1] != regime[:-2])
     fresh = depth >= np.maximum.accumulate(depth) - _SAME_DEPTH
     if 'cutting' in settings.terms:
-        change[1:-1] |= (fresh[1:-1] != fresh[:-2]) & (speed[1:-1] > 0.0)
+        change[1:-1] |= (fresh[1:-1] != fresh[:-2]) & (velocity[1:-1] > 0.0)
     # Sensor and filter settle at the same time; the outer third of the window has little weight.
     settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
@@ -197,7 +186,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     return Design(
         signals=signals,
         lag=lag,
-        speed=speed,
+        velocity=velocity,
         acceleration=acceleration,
         depth=depth,
         fresh=fresh,
@@ -205,5 +194,5 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
         change=change,
         used=used,
         stroke=np.cumsum(change),
-        lag_column=np.empty((len(speed), 0)),
+        lag_column=np.empty((len(velocity), 0)),
     )

@@ -24,27 +24,13 @@ from scipy.special import chdtrc
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Fit:
-    """
-    Filtered signals and fitted force, for plots; shape (n,) each.
+    """Filtered signals and fitted force, for plots; shape (n,) each."""
 
-    Attributes
-    ----------
-    time : ndarray
-        Evenly spaced time on the clock of the recording [s].
-    speed : ndarray
-        Filtered velocity [m/s], delayed by the lag of the force.
-    force, model : ndarray
-        Filtered and fitted force [N]; the fitted force is nan for samples that were not used.
-    used : ndarray of bool
-        Whether the sample was used.
-
-    """
-
-    time: FloatArray
-    speed: FloatArray
-    force: FloatArray
-    model: FloatArray
-    used: BoolArray
+    time: FloatArray  #: evenly spaced, on the clock of the recording [s]
+    velocity: FloatArray  #: filtered [m/s], delayed by the lag of the force
+    force: FloatArray  #: filtered [N]
+    model: FloatArray  #: fitted force [N]; nan for samples that were not used
+    used: BoolArray  #: whether the sample was used
 
     def __repr__(self) -> str:
         return f'<Fit: {self.used.sum()} of {len(self.time)} samples used>'
@@ -52,64 +38,31 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class FrictionEstimate:
-    """
-    Friction estimate of a recording.
+    """Friction estimate of a recording; ``estimate[name]`` is a parameter."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the recording.
-    terms : tuple of str
-        Terms of the force.
-    estimator : str
-        Estimator, one of `ESTIMATORS`.
-    parameters : tuple of ParameterEstimate
-        Coefficients of the terms, then derived ratios: ``withdrawal_friction``
-        (friction on withdrawal over friction on insertion, at the mean speed) and
-        ``breakaway_friction`` (friction at rest over mu_s). ``estimate[name]`` is a parameter.
-    breakaway : ParameterEstimate or None
-        Force at which the needle began to move after rests with a rising force [N], without the
-        offset if that is a term; None if there is no such rest.
-    lag : ParameterEstimate or None
-        Corrected lag of the force behind the motion [s]. Not determined if the velocity changes
-        only in steps. An unmodeled mass m reduces it by m / mu_v. None if inertia is a term,
-        which resembles a lag, or if only positions were recorded.
-    punctures : tuple of Puncture
-        Drops of the force while the needle enters new tissue.
-    samples : int
-        Number of samples used.
-    residual : float
-        Root mean square of the residual of the filtered force [N].
-    determination : float
-        Coefficient of determination R^2.
-    condition : float
-        Condition number of the regressors, each scaled to unit norm.
-    tests : tuple of ResidualTest
-        Tests of the residuals.
-    comparison : tuple of CandidateFit
-        Comparisons with alternative sets of terms.
-    warnings : tuple of str
-        Warnings about the validity of the estimate.
-    fit : Fit
-        Signals for plots.
-
-    """
-
-    name: str
-    terms: tuple[str, ...]
-    estimator: str
+    name: str  #: name of the recording
+    terms: tuple[str, ...]  #: terms of the force
+    estimator: str  #: one of `ESTIMATORS`
+    #: Coefficients of the terms, then derived ratios: ``withdrawal_friction`` (friction on
+    #: withdrawal over friction on insertion, at the mean speed) and ``breakaway_friction``
+    #: (friction at rest over mu_s).
     parameters: tuple[ParameterEstimate, ...]
+    #: Force at which the needle began to move after rests with a rising force [N], without the
+    #: offset if that is a term; None if there is no such rest.
     breakaway: ParameterEstimate | None
+    #: Corrected lag of the force behind the motion [s]. Not determined if the velocity changes
+    #: only in steps. An unmodeled mass m reduces it by m / mu_v. None if inertia is a term, which
+    #: resembles a lag, or if only positions were recorded.
     lag: ParameterEstimate | None
-    punctures: tuple[Puncture, ...]
-    samples: int
-    residual: float
-    determination: float
-    condition: float
-    tests: tuple[ResidualTest, ...]
-    comparison: tuple[CandidateFit, ...]
-    warnings: tuple[str, ...]
-    fit: Fit
+    punctures: tuple[Puncture, ...]  #: drops of the force while the needle enters new tissue
+    samples: int  #: number of samples used
+    residual: float  #: root mean square of the residual of the filtered force [N]
+    determination: float  #: coefficient of determination R^2
+    condition: float  #: condition number of the regressors, each scaled to unit norm
+    tests: tuple[ResidualTest, ...]  #: tests of the residuals
+    comparison: tuple[CandidateFit, ...]  #: comparisons with alternative sets of terms
+    warnings: tuple[str, ...]  #: warnings about the validity of the estimate
+    fit: Fit  #: signals for plots
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         return named(self.parameters, name)
@@ -123,23 +76,11 @@ class FrictionEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrictionSummary:
-    """
-    Friction over several recordings.
+    """Friction over several recordings; ``summary[name]`` is a statistic."""
 
-    Attributes
-    ----------
-    statistics : tuple of Statistic
-        One per parameter; ``summary[name]`` returns a statistic.
-    estimates : tuple of FrictionEstimate
-        One per recording.
-    warnings : tuple of str
-        Warnings that only all recordings together support.
-
-    """
-
-    statistics: tuple[Statistic, ...]
-    estimates: tuple[FrictionEstimate, ...]
-    warnings: tuple[str, ...] = ()
+    statistics: tuple[Statistic, ...]  #: one per parameter
+    estimates: tuple[FrictionEstimate, ...]  #: one per recording
+    warnings: tuple[str, ...] = ()  #: warnings that only all recordings together support
 
     def __getitem__(self, name: str) -> Statistic:
         return named(self.statistics, name)

@@ -31,20 +31,14 @@ HALF_LENGTH: Final = 0.36
 #: Length over which filtered noise is correlated [periods of the cutoff].
 CORRELATION_LENGTH: Final = 3.0
 
-#: Longest step between samples that is not a gap [sampling periods].
-GAP: Final = 3.5
-
-#: Speed above which the needle moves [standard deviations of the noise].
-_CLEARLY: Final = 5.0
-
-#: Samples per period of the cutoff that are kept after the filter.
-_KEPT: Final = 8.0
+GAP: Final = 3.5  #: longest step between samples that is not a gap [sampling periods]
+_CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations of the noise]
+_KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
 
 #: Ratio of the hold time at a limit of the sensor to the longest hold time at other values.
 _LONGER: Final = 3
 
-#: Largest fraction of samples that may count as saturated.
-_MOST_CUT_OFF: Final = 0.5
+_MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
 
 #: Largest number of resampled points per sample; with more, most of the time base is gaps.
 _LARGEST_GRID: Final = 10.0
@@ -63,7 +57,7 @@ class FilteredSignals:
     lost: BoolArray  # in a gap of the recording, or saturated
     half_filter: int  # half the length of the filter [samples]
     margin: int  # reach of a change of the velocity in the force [samples]
-    speed_noise: float  # standard deviation after the filter [m/s]
+    velocity_noise: float  # standard deviation after the filter [m/s]
     acceleration_noise: float  # likewise [m/s^2]
     from_positions: bool  # velocity differentiated from the depth
     cut_off: float  # fraction of samples with a saturated force
@@ -75,7 +69,7 @@ class FilteredSignals:
 
     @property
     def moving_speed(self) -> float:
-        return max(self.settings.moving_speed, _CLEARLY * self.speed_noise)
+        return max(self.settings.moving_speed, _CLEARLY * self.velocity_noise)
 
 
 def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
@@ -104,14 +98,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     taps = filter_taps(settings.cutoff, period)
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
-    from_positions = recording.speed is None
-    measured = recording.depth if recording.speed is None else recording.speed
+    from_positions = recording.velocity is None
+    measured = recording.depth if recording.velocity is None else recording.velocity
     raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
-    motion = _filtered_speed(grid, raw, taps, step, from_positions)
+    motion = _filtered_velocity(grid, raw, taps, step, from_positions)
     impulse = np.zeros(8 * half + 8 * step + 17)
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
-    response = _filtered_speed(around, impulse, taps, 1, from_positions)
+    response = _filtered_velocity(around, impulse, taps, 1, from_positions)
     noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
     return FilteredSignals(
         settings=settings,
@@ -123,7 +117,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
         half_filter=ceil(half / step),
         margin=max(1, ceil(2 * (half - 1) / step)),
-        speed_noise=noise * float(np.linalg.norm(response(around))),
+        velocity_noise=noise * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
         from_positions=from_positions,
         cut_off=float(cut.mean()),
@@ -131,11 +125,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
 
 
 def cut_off(force: FloatArray) -> BoolArray:
-    """
-    Mark samples, (n,), at which the force sensor is saturated.
-
-    The largest or smallest value is a limit if it is held for much longer than any other value.
-    """
+    """Mark samples, (n,), at the largest or smallest force, if it lasts longer than others."""
     limits = force.max(), force.min()
     found = np.zeros(force.shape, dtype=np.bool_)
     if limits[0] == limits[1]:
@@ -175,7 +165,7 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
     return np.asarray(parts[:, :step].ravel()[overlap : len(padded)])
 
 
-def _filtered_speed(
+def _filtered_velocity(
     time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, from_depth: bool
 ) -> BSpline:
     """Return the filtered velocity as a spline of time, from velocity or from depth."""
@@ -191,13 +181,13 @@ def _filtered_speed(
     return spline
 
 
-def _white_noise(raw: FloatArray, speed: FloatArray, acceleration: FloatArray) -> float:
+def _white_noise(raw: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> float:
     """Return a robust estimate of the white noise standard deviation from fourth differences."""
     size = np.abs(acceleration)
     # Large noise dominates the acceleration most of the time.
     unsteady = size > max(0.1 * float(size.max()), 3.0 * float(np.median(size)))
     steady = maximum_filter1d(unsteady.astype(np.uint8), 9) == 0
-    steady &= np.abs(speed) > 0.1 * np.max(np.abs(speed))
+    steady &= np.abs(velocity) > 0.1 * np.max(np.abs(velocity))
     differences = np.abs(np.diff(raw, 4))[steady[2:-2]]
     # 80th percentile: encoder counts at constant velocity may show no noise in half the strokes.
     # The fourth difference of white noise has 70 times its variance.

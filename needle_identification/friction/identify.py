@@ -32,8 +32,7 @@ from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
-#: Largest velocity noise threshold, as a fraction of the median speed.
-_HIDDEN: Final = 0.2
+_HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
 
 #: Positions replace velocities if their velocity noise is below this fraction.
 _CLEANER: Final = 0.5
@@ -81,10 +80,10 @@ def identify_friction(
 
     >>> import numpy as np
     >>> time = np.arange(0.0, 20.0, 0.004)
-    >>> speed = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    >>> velocity = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
     >>> noise = np.random.default_rng(0).normal(scale=0.01, size=len(time))
-    >>> force = 0.56 * np.sign(speed) + 300.0 * speed + noise
-    >>> recording = Recording(time=time, speed=speed, force=force)
+    >>> force = 0.56 * np.sign(velocity) + 300.0 * velocity + noise
+    >>> recording = Recording(time=time, velocity=velocity, force=force)
     >>> estimate = identify_friction(recording)
     >>> low, high = estimate['viscous_friction'].interval
     >>> low < 300.0 < high
@@ -114,7 +113,7 @@ class _Candidate(NamedTuple):
     remarks: tuple[str, ...] = ()
 
 
-#: Returns a better candidate than the chosen one, with a remark; None if there is none.
+#: Returns a better candidate with an additional remark, or None.
 _Alternative = Callable[[Recording, _Candidate], _Candidate | None]
 
 
@@ -140,14 +139,14 @@ def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
 def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Differentiate the positions if noise of the velocity matters, and they have less of it."""
     remark = _noise_remark(chosen)
-    if not remark or recording.speed is None:
+    if not remark or recording.velocity is None:
         return None
-    speeds = chosen.design.signals
-    positions = filter_signals(replace(recording, speed=None), speeds.settings)
+    velocities = chosen.design.signals
+    positions = filter_signals(replace(recording, velocity=None), velocities.settings)
     # Integrated velocities are no other source.
-    apart = float(np.std(positions.motion(speeds.time) - speeds.motion(speeds.time)))
-    noise = _CLEANER * speeds.speed_noise
-    if not (positions.speed_noise < noise and apart > noise):
+    apart = float(np.std(positions.motion(velocities.time) - velocities.motion(velocities.time)))
+    noise = _CLEANER * velocities.velocity_noise
+    if not (positions.velocity_noise < noise and apart > noise):
         return None
     return _fitted(positions, f'{remark}: took the speed from the positions')
 
@@ -157,11 +156,11 @@ def _noise_remark(chosen: _Candidate) -> str:
     design = chosen.design
     if bias := checks.noise_bias(design, chosen.fit):
         return checks.noise_words(design, bias)
-    signals, usual = design.signals, float(np.median(np.abs(design.speed[design.used])))
+    signals, usual = design.signals, float(np.median(np.abs(design.velocity[design.used])))
     if signals.moving_speed < _HIDDEN * usual:
         return ''
     return (
-        f'noise of {signals.speed_noise:.2g} m/s in the speed hides motion below '
+        f'noise of {signals.velocity_noise:.2g} m/s in the speed hides motion below '
         f'{signals.moving_speed:.2g} m/s'
     )
 
@@ -183,7 +182,11 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
     settings, whole = chosen.design.signals.settings, chosen.fit
     count = len(columns_of(settings.terms, settings))
     design = chosen.design.far_from_changes(_TRANSITION)
-    if whole.is_exact or not design.is_enough or _agree(design, whole, count):
+    if whole.is_exact or not design.is_enough:
+        return None
+    few = design.screening()
+    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
+    if (close | ~whole.determined)[:count].all():
         return None
     try:
         if design.estimates_lag:
@@ -201,18 +204,11 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
     return _Candidate(design, fit, chosen.coarse, (*chosen.remarks, remark))
 
 
-def _agree(design: Design, whole: Regression, count: int) -> bool:
-    """Whether a subset of samples gives the same parameters within small standard errors."""
-    few = design.screening()
-    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
-    return bool((close | ~whole.determined)[:count].all())
-
-
 def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     """Test the chosen fit, compare it with other terms, and assemble the result."""
     design, fit, signals = chosen.design, chosen.fit, chosen.design.signals
     settings, used = signals.settings, design.used
-    mean_speed = float(np.mean(np.abs(design.speed[used])))
+    mean_speed = float(np.mean(np.abs(design.velocity[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     checks.check_friction(parameters)
     lag = lag_estimate(design, fit)
@@ -222,7 +218,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
         tests = residual_tests(
             fit.residual,
             time=signals.time,
-            speed=design.speed,
+            velocity=design.velocity,
             parts=design.parts,
             memory=fit.memory,
             parameters=len(fit.values),
@@ -249,7 +245,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
         warnings=(*chosen.remarks, *warnings, *doubts),
         fit=Fit(
             time=signals.time,
-            speed=design.speed,
+            velocity=design.velocity,
             force=signals.force,
             model=np.where(used, signals.force - fit.residual, nan),
             used=used,

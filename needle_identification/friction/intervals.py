@@ -7,14 +7,11 @@ Student's t. Ratios have intervals by the delta method.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import hypot, sqrt
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import (
-    ParameterEstimate,
-    with_half_width,
-    with_value,
-)
+from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of
@@ -25,12 +22,7 @@ from scipy.special import stdtrit
 def parameter_estimates(
     fit: Regression, settings: FrictionSettings, mean_speed: float, period: float
 ) -> tuple[ParameterEstimate, ...]:
-    """
-    Return the coefficients of the terms, then derived ratios.
-
-    ``mean_speed`` [m/s] is the speed for the ratio of withdrawal to insertion; ``period`` [s] is
-    the largest difference between the stamps of force and motion.
-    """
+    """Return the coefficients of the terms, then derived ratios, at the mean speed [m/s]."""
     columns = columns_of(settings.terms, settings)
     at = {column.name: k for k, column in enumerate(columns)}
     intervals = fit.interval()
@@ -38,14 +30,24 @@ def parameter_estimates(
     for k, column in enumerate(columns):
         parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
         if fit.determined[k]:
-            low, high = intervals[k].tolist()
-            value, error = float(fit.values[k]), float(fit.errors[k])
-            parameter = with_value(parameter, value, error, low, high)
+            parameter = replace(
+                parameter,
+                value=float(fit.values[k]),
+                error=float(fit.errors[k]),
+                interval=(float(intervals[k, 0]), float(intervals[k, 1])),
+                determined=True,
+            )
         found.append(parameter)
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:
-            found[at['moving_mass']] = _widened(mass, viscous.value * period)
+            # The stamps of force and motion differ by up to a period: the lag resembles a mass,
+            # uniform within +- ``largest`` [kg].
+            largest = viscous.value * period
+            error = hypot(mass.error, largest / sqrt(3.0))
+            low, high = mass.interval
+            half_width = hypot(0.5 * (high - low), 0.95 * largest)
+            found[at['moving_mass']] = with_half_width(mass, mass.value, error, half_width)
     rows = np.zeros((2, len(fit.values)))
     if 'withdrawal_coulomb' in at:
         rows[0, [at['coulomb_friction'], at['viscous_friction']]] = 1.0, mean_speed
@@ -56,17 +58,6 @@ def parameter_estimates(
         rows[[0, 1], [at['coulomb_friction'], at['stribeck_friction']]] = 1.0
         found.append(_ratio(fit, rows, 'breakaway_friction', 'mu_b / mu_s'))
     return tuple(found)
-
-
-def _widened(mass: ParameterEstimate, largest: float) -> ParameterEstimate:
-    """Add the error by a lag that resembles a mass, uniform within +- ``largest`` [kg]."""
-    low, high = mass.interval
-    return with_half_width(
-        mass,
-        mass.value,
-        hypot(mass.error, largest / sqrt(3.0)),
-        hypot(0.5 * (high - low), 0.95 * largest),
-    )
 
 
 def _ratio(fit: Regression, rows: FloatArray, name: str, symbol: str) -> ParameterEstimate:

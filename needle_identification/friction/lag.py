@@ -19,14 +19,9 @@ from needle_identification.friction.terms import NeedleMotion, regressors
 import numpy as np
 from scipy.special import ndtri
 
-#: Largest lag of the coarse search [s].
-_LARGEST_LAG: Final = 0.25
-
-#: Largest fraction of the misfit that remains with an accepted coarse lag.
-_BETTER: Final = 0.5
-
-#: Largest number of samples for the coarse search.
-_MAX_SAMPLES: Final = 1000
+_LARGEST_LAG: Final = 0.25  # largest lag of the coarse search [s]
+_BETTER: Final = 0.5  # largest fraction of the misfit that remains with an accepted coarse lag
+_MAX_SAMPLES: Final = 1000  # largest number of samples for the coarse search
 
 _MAX_ITERATIONS: Final = 10
 
@@ -46,14 +41,10 @@ _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 
 def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
-    """
-    Search for the lag of the force, except with the term inertia, which resembles a lag.
-
-    Returns the coarse lag [s], or 0 if no lag fits much better; and the lag of least misfit [s],
-    or None if the motion does not determine it.
-    """
+    """Return the coarse lag [s] (0: none), and the lag of least misfit [s] (None: unknown)."""
     terms = signals.settings.terms
     if 'inertia' in terms:
+        # It resembles a lag.
         return 0.0, None
     lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):
@@ -94,12 +85,12 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     """Return the mean squared misfit at a lag of every n-th sample; nan if too few move."""
     settings, time, force = signals.settings, signals.time[::every], signals.force[::every]
     then = np.clip(time - lag, time[0], time[-1])
-    speed, acceleration = signals.motion(then), signals.motion(then, 1)
-    moving = np.abs(speed) > signals.moving_speed
+    velocity, acceleration = signals.motion(then), signals.motion(then, 1)
+    moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
     motion = NeedleMotion(
-        speed[moving],
+        velocity[moving],
         acceleration[moving],
         time[moving] - time[0],
         np.interp(then[moving], signals.time, signals.depth),

@@ -23,8 +23,7 @@ from scipy.special import ndtri
 #: Smallest drop of a puncture [standard deviations of other changes of the force].
 _CLEAR: Final = 8.0
 
-#: Model error of a change of friction, as a fraction.
-_UNKNOWN_FRICTION: Final = 0.5
+_UNKNOWN_FRICTION: Final = 0.5  # model error of a change of friction, as a fraction
 
 _DEPTH: Final = ParameterEstimate(name='puncture_depth', symbol='s_p', unit='m')
 _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
@@ -32,21 +31,11 @@ _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Puncture:
-    """
-    Puncture of a tissue boundary.
+    """Puncture of a tissue boundary."""
 
-    Attributes
-    ----------
-    time : float
-        Time on the clock of the recording [s].
-    depth, drop : ParameterEstimate
-        Insertion depth [m] and drop of the force [N].
-
-    """
-
-    time: float
-    depth: ParameterEstimate
-    drop: ParameterEstimate
+    time: float  #: on the clock of the recording [s]
+    depth: ParameterEstimate  #: insertion depth [m]
+    drop: ParameterEstimate  #: drop of the force [N]
 
 
 def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
@@ -61,8 +50,6 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     drops, others = np.full(len(force), np.nan), np.zeros(len(force))
     inner = stretches(inward) + np.array([signals.margin, -signals.margin])
     for start, end in inner:
-        if start >= end:
-            continue
         middle = np.arange(start + width + reach, end - width - reach)
         if not len(middle):
             continue
@@ -102,7 +89,7 @@ def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Pun
     half_width = float(ndtri(0.975))
     # Variance of two means, with extrapolation by half a window and half the filter.
     error = noise * sqrt(1.0 + 1.5 * (1.0 + 2.0 * reach / width) ** 2)
-    place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
+    place = hypot(reach * signals.period * float(design.velocity[at]), 1e-6) / sqrt(3.0)
     return Puncture(
         time=float(signals.time[at]),
         depth=with_half_width(_DEPTH, float(design.depth[at]), place, half_width * place),

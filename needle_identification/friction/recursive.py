@@ -11,7 +11,6 @@ of the force.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
 from itertools import pairwise
 from math import ceil, exp, inf, isfinite, nan
 from statistics import median
@@ -33,8 +32,7 @@ _OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 #: Smallest number of independent blocks for a meaningful standard error.
 _FEWEST_PARTS: Final = 10.0
 
-#: Length of a block [correlation lengths of filtered noise].
-_PART_LENGTH: Final = 2.0
+_PART_LENGTH: Final = 2.0  # length of a block [correlation lengths of filtered noise]
 
 #: Age at which a block is discarded [forgetting times]; its weight is then below 4e-4.
 _REMEMBERED: Final = 8.0
@@ -42,11 +40,8 @@ _REMEMBERED: Final = 8.0
 #: Relative threshold below which singular values of the information are rounding errors.
 _ROUNDING: Final = 1e-7
 
-#: Number of pairs that determine the sampling rate.
-_FIRST: Final = 50
-
-#: Largest step for interpolation of the motion [s].
-_LARGEST_STEP: Final = 0.1
+_FIRST: Final = 50  # number of pairs that determine the sampling rate
+_LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
 
 #: Backward step of a stamp above which the clock was set back [s]; after a smaller step, the
 #: message arrived late.
@@ -55,8 +50,7 @@ _SET_BACK: Final = 1.0
 #: Largest plausible values: forces [N]; depths [m] or velocities [m/s].
 _LARGEST: Final = {'force': 1e4, 'motion': 100.0}
 
-#: Largest number of samples that wait for the other topic.
-_MAX_WAITING: Final = 20_000
+_MAX_WAITING: Final = 20_000  # largest number of samples that wait for the other topic
 
 
 class RecursiveFriction:
@@ -84,8 +78,8 @@ class RecursiveFriction:
     >>> from needle_identification import FrictionSettings, RecursiveFriction
     >>> live = RecursiveFriction(FrictionSettings(), rate=250.0, forgetting=30.0)
     >>> for time in np.arange(0.0, 20.0, 0.004):
-    ...     speed = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
-    ...     live.update(time, speed, force=0.56 * np.sign(speed) + 300.0 * speed)
+    ...     velocity = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    ...     live.update(time, velocity, force=0.56 * np.sign(velocity) + 300.0 * velocity)
     >>> {found.name: round(found.value, 3) for found in live.estimate()}
     {'coulomb_friction': 0.56, 'viscous_friction': 300.0}
 
@@ -106,25 +100,23 @@ class RecursiveFriction:
         self._taps = filter_taps(settings.cutoff, self._period)
         # The filtered acceleration needs a neighbor on either side, the lag another neighbor.
         self._margin = len(self._taps) // 2 + 2
-        self._decay = exp(-self._period / forgetting)
-        self._length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
-        self._parts: deque[tuple[FloatArray, int]] = deque(
-            maxlen=ceil(_REMEMBERED * forgetting * rate / self._length)
-        )
         self._raw: deque[tuple[float, float]] = deque(maxlen=len(self._taps))
         self._smooth: deque[tuple[float, float]] = deque(maxlen=3)
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
-        k = len(columns_of(settings.terms, settings)) + self._estimates_lag
-        #: Information A and, in the last column, b: of all samples, and of the current block.
-        self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
-        self._count = 0
+        length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
+        self._information = _Information(
+            len(columns_of(settings.terms, settings)) + self._estimates_lag,
+            exp(-self._period / forgetting),
+            length,
+            ceil(_REMEMBERED * forgetting * rate / length),
+        )
         self._speed_sum = self._weight = 0.0
         self._time = -inf
         self._regime = 0.0
         self._since_change = 0
 
-    def update(self, time: float, speed: float, force: float) -> None:
+    def update(self, time: float, velocity: float, force: float) -> None:
         """
         Add one sample.
 
@@ -132,12 +124,12 @@ class RecursiveFriction:
         ----------
         time : float
             Time [s]. After a gap or a backward step, the filter restarts.
-        speed, force : float
+        velocity, force : float
             Insertion velocity [m/s] and force of the base on the needle [N], positive into the
             tissue. A sample that is not finite counts as a gap.
 
         """
-        if not abs(speed) + abs(force) < inf:
+        if not abs(velocity) + abs(force) < inf:
             self._time = -inf
             return
         if not 0.0 < time - self._time < GAP * self._period:
@@ -145,7 +137,7 @@ class RecursiveFriction:
             self._smooth.clear()
             self._drop_pending()
         self._time = time
-        self._raw.append((speed, force))
+        self._raw.append((velocity, force))
         if len(self._raw) < len(self._taps):
             return
         smooth = self._taps @ np.array(self._raw)
@@ -159,10 +151,10 @@ class RecursiveFriction:
         self._pending.clear()
         self._since_change = 0
 
-    def _select(self, speed: float, acceleration: float, force: float) -> None:
+    def _select(self, velocity: float, acceleration: float, force: float) -> None:
         """Use samples in steady motion, after the motion has remained steady for the margin."""
         settings = self._settings
-        regime = float(np.sign(speed)) if abs(speed) > settings.moving_speed else 0.0
+        regime = float(np.sign(velocity)) if abs(velocity) > settings.moving_speed else 0.0
         if self._estimates_lag and abs(acceleration) > settings.largest_acceleration:
             regime = nan
         if regime != self._regime:
@@ -171,40 +163,52 @@ class RecursiveFriction:
         self._since_change += 1
         if self._since_change <= self._margin or abs(regime) != 1.0:
             return
-        self._pending.append((speed, acceleration, force))
+        self._pending.append((velocity, acceleration, force))
         if len(self._pending) > self._margin:
             self._learn(*self._pending.popleft())
 
-    def _learn(self, speed: float, acceleration: float, force: float) -> None:
+    def _learn(self, velocity: float, acceleration: float, force: float) -> None:
         none = np.zeros(1)
-        motion = NeedleMotion(np.array([speed]), np.array([acceleration]), none, none, none > 0.0)
+        motion = NeedleMotion(
+            np.array([velocity]), np.array([acceleration]), none, none, none > 0.0
+        )
         row = regressors(motion, self._settings.terms, self._settings)[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)
+        self._information.add(row, force)
+        decay = self._information.decay
+        self._speed_sum = decay * self._speed_sum + abs(velocity)
+        self._weight = decay * self._weight + 1.0
+
+    def estimate(self) -> tuple[ParameterEstimate, ...]:
+        """Return the parameters of `identify_friction`; undetermined until the motion suffices."""
+        mean_speed = self._speed_sum / max(self._weight, 1.0)
+        fit = self._information.regression()
+        return parameter_estimates(fit, self._settings, mean_speed, self._period)
+
+
+class _Information:
+    """Information of k parameters with exponential forgetting, of all samples and by block."""
+
+    def __init__(self, k: int, decay: float, length: int, blocks: int) -> None:
+        """Start empty; decay per sample, length of a block, and number of blocks."""
+        self.decay, self._length = decay, length
+        #: A and, in the last column, b: of all samples, and of the current block.
+        self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
+        self._count = 0
+        self._parts: deque[tuple[FloatArray, int]] = deque(maxlen=blocks)
+
+    def add(self, row: FloatArray, force: float) -> None:
+        """Add the regressors (k,) and the force of a sample."""
         products = np.outer(row, np.append(row, force))
-        self._known = self._decay * self._known + products
-        self._part = self._decay * self._part + products
-        self._speed_sum = self._decay * self._speed_sum + abs(speed)
-        self._weight = self._decay * self._weight + 1.0
+        self._known = self.decay * self._known + products
+        self._part = self.decay * self._part + products
         self._count += 1
         if self._count % self._length == 0:
             self._parts.append((self._part, self._count))
             self._part = np.zeros_like(self._part)
 
-    def estimate(self) -> tuple[ParameterEstimate, ...]:
-        """
-        Return the current parameters of the terms.
-
-        Returns
-        -------
-        tuple of ParameterEstimate
-            Parameters named as by `identify_friction`; undetermined until the motion suffices.
-
-        """
-        mean_speed = self._speed_sum / max(self._weight, 1.0)
-        return parameter_estimates(self._regression(), self._settings, mean_speed, self._period)
-
-    def _regression(self) -> Regression:
+    def regression(self) -> Regression:
         """Solve; standard errors use the scores of blocks longer than the noise correlation."""
         known, moment = self._known[:, :-1], self._known[:, -1]
         k = len(moment)
@@ -243,7 +247,7 @@ class RecursiveFriction:
         """Return score covariance, effective blocks per parameter, and their total number."""
         now = self._count
         parts = [*self._parts, (self._part, now)]
-        ages = np.array([self._decay ** (now - count) for _, count in parts])
+        ages = np.array([self.decay ** (now - count) for _, count in parts])
         weighed = ages[:, np.newaxis, np.newaxis] * np.array([part for part, _ in parts])
         information = weighed[:, :, :-1]
         scores = weighed[:, :, -1] - information @ values
@@ -270,7 +274,8 @@ class LiveFriction:
         # Checks the arguments except the sampling rate, which is determined later.
         RecursiveFriction(settings, 1.0, forgetting)
         self._settings, self._forgetting = settings, forgetting
-        self._dropped: Counter[str] = Counter()
+        #: Number of discarded samples by reason.
+        self.dropped: Counter[str] = Counter()
         self._restart()
 
     def _restart(self) -> None:
@@ -283,24 +288,19 @@ class LiveFriction:
         self._estimator: RecursiveFriction | None = None
         self.samples = 0
 
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """Number of discarded samples by reason."""
-        return dict(self._dropped)
-
-    def take_motion(self, stamp: int, depth: float, speed: float | None) -> None:
+    def take_motion(self, stamp: int, depth: float, velocity: float | None) -> None:
         """Add depth [m] and velocity [m/s], or depth to differentiate, at a stamp [ns]."""
-        time = self._time('motion', stamp, depth if speed is None else speed)
+        time = self._time('motion', stamp, depth if velocity is None else velocity)
         if time is None:
             return
-        if speed is None:
+        if velocity is None:
             before, self._last_depth = self._last_depth, (time, depth)
             if before is None:
                 return
             # The difference quotient is the velocity at the midpoint.
-            speed = (depth - before[1]) / (time - before[0])
+            velocity = (depth - before[1]) / (time - before[0])
             time = (time + before[0]) / 2.0
-        self._motion.append((time, speed))
+        self._motion.append((time, velocity))
         self._pair()
 
     def take_force(self, stamp: int, force: float) -> None:
@@ -317,17 +317,17 @@ class LiveFriction:
     def _time(self, topic: str, stamp: int, value: float) -> float | None:
         """Return the time since the start [s], or None if the sample is discarded."""
         if not abs(value) <= _LARGEST[topic]:
-            self._dropped['absurd' if isfinite(value) else 'not finite'] += 1
+            self.dropped['implausible' if isfinite(value) else 'not finite'] += 1
             return None
         if self._start is None:
             self._start = stamp
         time = 1e-9 * (stamp - self._start)
         if time < self._last[topic] - _SET_BACK:
             self._restart()
-            self._dropped['clock set back'] += 1
+            self.dropped['clock set back'] += 1
             return None
         if time <= self._last[topic]:
-            self._dropped['out of order'] += 1
+            self.dropped['out of order'] += 1
             return None
         self._last[topic] = time
         return time
@@ -339,18 +339,18 @@ class LiveFriction:
             time, force = self._force.popleft()
             while len(motion) > 1 and motion[1][0] <= time:
                 motion.popleft()
-            speed = _interpolated(motion, time)
-            if isfinite(speed):
-                self._pass_on(time, speed, force)
+            velocity = _interpolated(motion, time)
+            if isfinite(velocity):
+                self._pass_on(time, velocity, force)
             else:
-                self._dropped['no motion at their time'] += 1
+                self.dropped['no motion at their time'] += 1
 
-    def _pass_on(self, time: float, speed: float, force: float) -> None:
+    def _pass_on(self, time: float, velocity: float, force: float) -> None:
         self.samples += 1
         if self._estimator is not None:
-            self._estimator.update(time, speed, force)
+            self._estimator.update(time, velocity, force)
             return
-        self._first.append((time, speed, force))
+        self._first.append((time, velocity, force))
         if len(self._first) == _FIRST:
             period = median(after[0] - before[0] for before, after in pairwise(self._first))
             self._estimator = RecursiveFriction(self._settings, 1.0 / period, self._forgetting)
@@ -359,10 +359,10 @@ class LiveFriction:
 
 
 def _interpolated(motion: deque[tuple[float, float]], time: float) -> float:
-    before, speed = motion[0]
+    before, velocity = motion[0]
     if before == time:
-        return speed
+        return velocity
     if before > time or motion[1][0] - before > _LARGEST_STEP:
         return nan
     after, later = motion[1]
-    return speed + (later - speed) * (time - before) / (after - before)
+    return velocity + (later - velocity) * (time - before) / (after - before)

@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import isfinite
 from typing import Final
 
-from needle_identification.estimation.estimators import check_estimator, ESTIMATORS
+from needle_identification.estimation import check_estimator, ESTIMATORS
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
@@ -17,8 +17,7 @@ TERMS: Final = (
     'layers', 'cutting',
 )  # fmt: skip
 
-#: Automatic choice of the estimator.
-AUTO: Final = 'auto'
+AUTO: Final = 'auto'  #: automatic choice of the estimator
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,14 +25,9 @@ class FrictionSettings:
     """
     Settings of `identify_friction` and `RecursiveFriction`; fields describe meaning and unit.
 
-    Attributes
-    ----------
-    terms : tuple of str
-        Terms of the friction force, of `TERMS`; the default is equation (15).
-    estimator : str
-        ``auto`` or one of `ESTIMATORS`. ``weighted`` estimates the noise in each stroke, ``total``
-        accounts for velocity noise; ``auto`` is ``total`` if velocity noise is relevant,
-        otherwise ``ordinary``.
+    The default terms are equation (15). The estimator ``weighted`` estimates the noise in each
+    stroke, ``total`` accounts for velocity noise; ``auto`` is ``total`` if velocity noise is
+    relevant, otherwise ``ordinary``.
 
     Raises
     ------

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from itertools import pairwise
 from math import inf
 from typing import Final, NamedTuple
 
@@ -30,11 +30,15 @@ import numpy as np
 class NeedleMotion(NamedTuple):
     """Motion of the needle, (n,) each, positive into the tissue."""
 
-    speed: FloatArray  # [m/s]
+    velocity: FloatArray  # [m/s]
     acceleration: FloatArray  # [m/s^2]
     time: FloatArray  # since the start of the recording [s]
     depth: FloatArray  # insertion depth [m]
     fresh: BoolArray  # at the largest insertion depth so far
+
+    @property
+    def sign(self) -> FloatArray:
+        return np.asarray(np.sign(self.velocity))
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,35 +52,29 @@ class Regressor:
 
 
 _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
-    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
-    'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
-    'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
+    'coulomb': (Regressor('coulomb_friction', 'mu_s', 'N', lambda x, _: x.sign),),
+    'viscous': (Regressor('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.velocity),),
+    'offset': (Regressor('offset', 'b', 'N', lambda x, _: np.ones_like(x.velocity)),),
     # Drift of sensor or tissue since the start of the recording.
     'drift': (Regressor('force_drift', 'c', 'N/s', lambda x, _: x.time),),
     'inertia': (Regressor('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
     # Additional Coulomb and viscous friction on withdrawal.
     'direction': (
-        Regressor(
-            'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.speed), 0)
-        ),
-        Regressor('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
+        Regressor('withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(x.sign, 0)),
+        Regressor('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.velocity, 0)),
     ),
     # Excess of the breakaway friction over mu_s.
     'stribeck': (
         Regressor(
-            'stribeck_friction',
-            'mu_b - mu_s',
-            'N',
-            lambda x, s: np.sign(x.speed) * np.exp(-((x.speed / s.stribeck_speed) ** 2)),
+            'stribeck_friction', 'mu_b - mu_s', 'N',
+            lambda x, s: x.sign * np.exp(-((x.velocity / s.stribeck_speed) ** 2)),
         ),
     ),
-    'length': (
-        Regressor('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.speed) * x.depth),
-    ),
+    'length': (Regressor('length_friction', 'c', 'N/m', lambda x, _: x.sign * x.depth),),
     'cutting': (
         Regressor(
             'cutting_force', 'f_c', 'N',
-            lambda x, _: np.where(x.fresh & (x.speed > 0.0), 1.0, 0.0),
+            lambda x, _: np.where(x.fresh & (x.velocity > 0.0), 1.0, 0.0),
         ),
     ),
 }  # fmt: skip
@@ -84,20 +82,14 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
 
 def _layers(boundaries: Sequence[float]) -> list[Regressor]:
     """Return a column per layer; the last layer is unbounded."""
-    ends = [*boundaries[1:], inf]
-    return [
-        Regressor(
-            f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low)
-        )
-        for k, (low, end) in enumerate(zip(boundaries, ends, strict=True))
-    ]
 
+    def column(number: int, low: float, end: float) -> Regressor:
+        return Regressor(
+            f'layer_{number}_friction', f'c_{number}', 'N/m',
+            lambda x, _: x.sign * np.clip(x.depth - low, 0.0, end - low),
+        )  # fmt: skip
 
-def _in_layer(
-    begin: float, thickness: float, motion: NeedleMotion, _: FrictionSettings
-) -> FloatArray:
-    inside = np.clip(motion.depth - begin, 0.0, thickness)
-    return np.asarray(np.sign(motion.speed) * inside)
+    return [column(k, *span) for k, span in enumerate(pairwise([*boundaries, inf]), 1)]
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 import shlex
@@ -20,8 +20,6 @@ from needle_identification.recordings.samples import (
     AXES,
     EachJoint,
     Gathering,
-    Samples,
-    SignalSource,
     source_of,
 )
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
@@ -34,34 +32,18 @@ import numpy as np
 _MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
 _FORCE: Final = (wire.WRENCH,)
 
-#: Message types of velocities.
-_SPEEDS: Final = (wire.TWIST,)
-
-#: Smallest speed in motion, as a fraction of the largest speed.
-_MOVING: Final = 0.05
+_VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
+_MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
 
 #: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
 _EXPLAINED: Final = 0.3
 
-#: Largest number of joints of a topic that are inspected.
-_MAX_JOINTS: Final = 64
-
-#: Largest number of samples on which a pair of force and motion is fitted.
-_TRIED: Final = 20_000
+_MAX_JOINTS: Final = 64  # largest number of joints of a topic that are inspected
+_TRIED: Final = 20_000  # largest number of samples on which a pair of force and motion is fitted
 
 
 class ColumnSummary(NamedTuple):
-    """
-    One component of a topic, or one column of a table.
-
-    Attributes
-    ----------
-    name : str
-        Axis, joint, or name of the column.
-    low, high : float
-        Range of its values.
-
-    """
+    """One component of a topic or one column of a table, with the range of its values."""
 
     name: str
     low: float
@@ -70,57 +52,25 @@ class ColumnSummary(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Content:
-    """
-    One topic of a bag, or a whole table.
+    """One topic of a bag, or a whole table."""
 
-    Attributes
-    ----------
-    name, type_name : str
-        Name and type of the topic, or file name and ``table``.
-    count : int
-        Number of messages or rows.
-    rate : float
-        Messages per second, from the median step; nan if not inspected.
-    gaps : int
-        Number of pauses of more than ten steps.
-    columns : tuple of ColumnSummary
-        Components with their ranges; none if the type is not supported.
-
-    """
-
-    name: str
-    type_name: str
-    count: int
-    rate: float = float('nan')
-    gaps: int = 0
-    columns: tuple[ColumnSummary, ...] = ()
+    name: str  #: of the topic, or of the file
+    type_name: str  #: of the messages, or ``table``
+    count: int  #: number of messages or rows
+    rate: float = float('nan')  #: messages per second, from the median step; nan if not inspected
+    gaps: int = 0  #: number of pauses of more than ten steps
+    columns: tuple[ColumnSummary, ...] = ()  #: components; none if the type is not supported
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inspection:
-    """
-    Content of a recording, and a command to identify from it.
+    """Content of a recording, and a command to identify from it."""
 
-    Attributes
-    ----------
-    path : str
-        Path of the recording.
-    contents : tuple of Content
-        Topics, or the table.
-    losses : tuple of str
-        Missing or damaged parts.
-    words : tuple of str
-        Probable force and motion, with the reason.
-    command : str
-        Command for identification; '' if no force and motion were found.
-
-    """
-
-    path: str
-    contents: tuple[Content, ...]
-    losses: tuple[str, ...]
-    words: tuple[str, ...]
-    command: str
+    path: str  #: of the recording
+    contents: tuple[Content, ...]  #: topics, or the table
+    losses: tuple[str, ...]  #: missing or damaged parts
+    words: tuple[str, ...]  #: probable force and motion, with the reason
+    command: str  #: for identification; '' if no force and motion were found
 
 
 def inspect_recording(path: Path | str) -> Inspection:
@@ -198,12 +148,16 @@ class _Signal(NamedTuple):
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
     topics = [topic for topic in bag.topics() if topic.type_name in (*_MOTION, *_FORCE)]
-    names = _joints(bag, topics)
-    read = {topic: tuple(names.get(topic, AXES)) for topic in topics if names.get(topic, AXES)}
-    gathered = {
-        topic: Gathering(topic, _source(topic, axes), by_header=True)
-        for topic, axes in read.items()
-    }
+    read: dict[BagTopic, list[str]] = {}
+    gathered: dict[BagTopic, Gathering] = {}
+    for topic in topics:
+        axes, source = list(AXES), source_of(topic.type_name, AXES)
+        if topic.type_name == wire.JOINT_STATE:
+            names = dict.fromkeys(chain.from_iterable(first_names(bag, topic)))
+            axes = list(names)[:_MAX_JOINTS]
+            source = EachJoint(*axes)
+        if axes:
+            read[topic], gathered[topic] = axes, Gathering(topic, source, by_header=True)
     for batch in bag.batches(lambda topic: topic in gathered):
         gathered[batch.topic].add(batch)
     contents, signals = [], []
@@ -218,56 +172,30 @@ def _bag(path: Path) -> Inspection:
                 losses.append(str(error))
             else:
                 losses += bag.losses
-                content = _content(topic, count, read[topic], samples)
-                signals += list(_signals(topic, read[topic], samples))
+                columns = dict(zip(read[topic], samples.values.T, strict=True))
+                steps = np.diff(samples.stamps)
+                content = replace(
+                    content,
+                    rate=float(1e9 / np.median(steps)),
+                    gaps=int(np.count_nonzero(are_gaps(steps))),
+                    columns=tuple(_column(axis, values) for axis, values in columns.items()),
+                )
+                signals += [
+                    _Signal(topic, axis, samples.stamps, values)
+                    for axis, values in columns.items()
+                    if np.isfinite(values).all() and np.ptp(values) > 0.0
+                ]
         contents.append(content)
     words, command = _suggestion(path, signals)
-    if not command and _presses(path):
-        words = ['presses at several places and forces: stiffness can be identified']
-        command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
+    if not command:
+        with suppress(NeedleError):
+            identify_stiffness(read_indentation_recording(path))
+            words = ['presses at several places and forces: stiffness can be identified']
+            command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
     return Inspection(
         path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
         command=command,
     )  # fmt: skip
-
-
-def _presses(path: Path) -> bool:
-    with suppress(NeedleError):
-        return bool(identify_stiffness(read_indentation_recording(path)).levels)
-    return False
-
-
-def _joints(bag: Bag, topics: Sequence[BagTopic]) -> Mapping[BagTopic, list[str]]:
-    """Return the joint names of each JointState topic, from its first messages."""
-    return {
-        topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
-        for topic in topics
-        if topic.type_name == wire.JOINT_STATE
-    }
-
-
-def _source(topic: BagTopic, axes: Sequence[str]) -> SignalSource:
-    is_joint = topic.type_name == wire.JOINT_STATE
-    return EachJoint(*axes) if is_joint else source_of(topic.type_name, axes)
-
-
-def _content(topic: BagTopic, count: int, axes: Sequence[str], samples: Samples) -> Content:
-    steps = np.diff(samples.stamps)
-    return Content(
-        name=topic.name,
-        type_name=topic.type_name,
-        count=count,
-        rate=float(1e9 / np.median(steps)),
-        gaps=int(np.count_nonzero(are_gaps(steps))),
-        columns=tuple(_column(axis, samples.values[:, k]) for k, axis in enumerate(axes)),
-    )
-
-
-def _signals(topic: BagTopic, axes: Sequence[str], samples: Samples) -> Iterator[_Signal]:
-    for k, axis in enumerate(axes):
-        values = samples.values[:, k]
-        if np.isfinite(values).all() and np.ptp(values) > 0.0:
-            yield _Signal(topic, axis, samples.stamps, values)
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
@@ -320,13 +248,13 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     every = max(1, len(motion.stamps) // _TRIED)
     time = 1e-9 * (motion.stamps[::every] - start)
     values = motion.values[::every]
-    speed = values if motion.topic.type_name in _SPEEDS else np.gradient(values, time)
+    velocity = values if motion.topic.type_name in _VELOCITIES else np.gradient(values, time)
     read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
-    moving = np.abs(speed) > _MOVING * np.quantile(np.abs(speed), 0.99)
+    moving = np.abs(velocity) > _MOVING * np.quantile(np.abs(velocity), 0.99)
     moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))
     if np.count_nonzero(moving) < 10:
         return 0.0, 0.0
-    x = np.column_stack([np.sign(speed), speed, np.ones_like(speed)])[moving]
+    x = np.column_stack([np.sign(velocity), velocity, np.ones_like(velocity)])[moving]
     y = read[moving]
     solution = np.linalg.lstsq(x, y, rcond=None)[0]
     variance = float(np.var(y))
@@ -336,5 +264,5 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     along = float(np.var(x[:, :2] @ solution[:2]))
     left = float(np.var(y - x @ solution))
     return max(0.0, min(along, variance - left) / variance), float(
-        np.mean((x[:, :2] @ solution[:2]) * np.sign(speed[moving]))
+        np.mean((x[:, :2] @ solution[:2]) * np.sign(velocity[moving]))
     )

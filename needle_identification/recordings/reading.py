@@ -23,7 +23,7 @@ from needle_identification.recordings.recording import IndentationRecording, Rec
 from needle_identification.recordings.samples import (
     AXES,
     Gathering,
-    position_and_speed,
+    position_and_velocity,
     SignalSource,
     source_of,
 )
@@ -33,8 +33,7 @@ from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
 
-#: Number of messages that are read for joint names.
-_FIRST: Final = 50
+_FIRST: Final = 50  # number of messages that are read for joint names
 
 
 class Wanted(NamedTuple):
@@ -138,7 +137,7 @@ def read_friction_recording(
     force = gathered[wrench].samples(bag)
     moved = gathered[motion].samples(bag)
     if motion.type_name in (wire.TWIST, wire.JOINT_STATE, wire.ODOMETRY):
-        moved = position_and_speed(moved, bag)
+        moved = position_and_velocity(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
     moved = moved._replace(values=direction * moved.values)
@@ -147,7 +146,7 @@ def read_friction_recording(
         name=str(path),
         time=times,
         depth=motions[:, 0],
-        speed=motions[:, 1] if motions.shape[1] > 1 else None,
+        velocity=motions[:, 1] if motions.shape[1] > 1 else None,
         force=sign * forces[:, 0],
         losses=tuple(bag.losses),
         configuration=configuration,

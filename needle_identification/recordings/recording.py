@@ -14,12 +14,7 @@ import numpy as np
 
 
 def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | None) -> None:
-    """
-    Replace arrays (n,) or (n, columns) by validated read-only copies.
-
-    The field ``first`` determines n; only the field ``missing`` may have values that are not
-    finite.
-    """
+    """Replace arrays (n,) or (n, columns) by finite read-only copies; ``missing`` may be nan."""
     object.__setattr__(recording, 'name', shown(recording.name))
     object.__setattr__(recording, 'losses', tuple(map(shown, recording.losses)))
     length = np.shape(getattr(recording, first))
@@ -39,12 +34,16 @@ def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | No
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class _AnyRecording:
-    name: str = 'recording'
-    time: FloatArray
+class BaseRecording:
+    """Force of one experiment over time, and its source."""
+
+    name: str = 'recording'  #: for messages
+    time: FloatArray  #: (n,) time [s], strictly increasing
     force: FloatArray
-    losses: tuple[str, ...] = ()
-    configuration: str = ''
+    losses: tuple[str, ...] = ()  #: lost, discarded or repaired data, one sentence each
+    configuration: str = ''  #: parameter file of the recorded plant; empty if not recorded
+    #: Clock of the force minus clock of the motion [s], estimated from the receive times and
+    #: already corrected; 0 if equal.
     clock_offset: float = 0.0
 
     @property
@@ -77,39 +76,20 @@ class _AnyRecording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class Recording(_AnyRecording):
+class Recording(BaseRecording):
     """
     Force and motion of the needle base during one experiment.
-
-    Attributes
-    ----------
-    name : str
-        Name of the recording, for messages.
-    time : ndarray, shape (n,)
-        Time [s], strictly increasing.
-    force : ndarray, shape (n,)
-        Force of the base on the needle f_y [N], positive into the tissue.
-    speed : ndarray, shape (n,), or None
-        Insertion velocity [m/s], positive into the tissue; None if only positions were recorded.
-    depth : ndarray, shape (n,)
-        Insertion depth s [m]; default: integral of the velocity from zero.
-    losses : tuple of str
-        Lost, discarded or repaired data, one sentence each.
-    configuration : str
-        Parameter file of the recorded plant; empty if not recorded.
-    clock_offset : float
-        Clock of the force minus clock of the motion [s], estimated from the receive times and
-        already corrected; 0 if equal.
 
     Raises
     ------
     ShapeError
-        If the arrays differ in length or are not finite, time does not increase, or both speed
-        and depth are missing.
+        If the arrays differ in length or are not finite, time does not increase, or both
+        velocity and depth are missing.
 
     Examples
     --------
-    >>> recording = Recording(time=[0.0, 0.1, 0.2], speed=[0.0, 0.01, 0.01], force=[0.0, 3.5, 3.6])
+    >>> velocity = [0.0, 0.01, 0.01]
+    >>> recording = Recording(time=[0.0, 0.1, 0.2], velocity=velocity, force=[0.0, 3.5, 3.6])
     >>> recording
     <Recording recording: 3 samples in 0.2 s>
     >>> recording.depth.tolist()
@@ -117,35 +97,26 @@ class Recording(_AnyRecording):
 
     """
 
-    force: FloatArray
-    speed: FloatArray | None = None
+    force: FloatArray  #: (n,) force of the base on the needle f_y [N], positive into the tissue
+    #: (n,) insertion velocity [m/s], positive into the tissue; None for positions only.
+    velocity: FloatArray | None = None
+    #: (n,) insertion depth s [m]; default: integral of the velocity from zero.
     depth: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        if self.speed is not None:
-            self._freeze(speed=None)
+        if self.velocity is not None:
+            self._freeze(velocity=None)
             if self.depth is None:
-                object.__setattr__(self, 'depth', integrated(self.time, self.speed))
+                object.__setattr__(self, 'depth', integrated(self.time, self.velocity))
         elif self.depth is None:
-            raise ShapeError(f'{self.name}: speed or depth must be given')
+            raise ShapeError(f'{self.name}: velocity or depth must be given')
         self._freeze(depth=None, force=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class IndentationRecording(_AnyRecording):
+class IndentationRecording(BaseRecording):
     """
     Force and motion of an end-effector that presses a tissue in the plane.
-
-    Attributes
-    ----------
-    name, time, losses, configuration, clock_offset
-        As in `Recording`.
-    force : ndarray, shape (n, 2)
-        Force of the end-effector on the tissue, x and z [N].
-    position : ndarray, shape (n, 2)
-        Position of the end-effector in the plane, x and z [m].
-    off_plane : ndarray, shape (n,)
-        Position of the end-effector along the third axis [m]; default zero.
 
     Raises
     ------
@@ -154,8 +125,9 @@ class IndentationRecording(_AnyRecording):
 
     """
 
-    force: FloatArray
-    position: FloatArray
+    force: FloatArray  #: (n, 2) force of the end-effector on the tissue, x and z [N]
+    position: FloatArray  #: (n, 2) position of the end-effector in the plane, x and z [m]
+    #: (n,) position of the end-effector along the third axis [m]; default zero.
     off_plane: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -164,7 +136,7 @@ class IndentationRecording(_AnyRecording):
         self._freeze(position=2, off_plane=None, force=2)
 
 
-def integrated(time: FloatArray, speed: FloatArray) -> FloatArray:
+def integrated(time: FloatArray, velocity: FloatArray) -> FloatArray:
     """Integrate a velocity [m/s], (n,), from zero over time [s] (trapezoidal rule)."""
-    steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2.0
+    steps = np.diff(time) * (velocity[1:] + velocity[:-1]) / 2.0
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -18,23 +18,12 @@ from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
 
-#: Axes of a frame, in the order of message fields.
-AXES: Final = ('x', 'y', 'z')
-
-#: Upper limit of a plausible measurement [SI].
-_LARGEST: Final = 1e100
-
-#: Largest number of joint names kept for error messages.
-_MAX_NAMES: Final = 100
-
-#: Shortest gap between samples [sampling periods].
-_GAP: Final = 10.0
-
-#: Smaller fractions of messages with other joint names are reported as faults.
-_STRAY: Final = 0.1
-
-#: Largest number of latencies kept of a batch, and of a topic.
-_LATENCIES: Final = (64, 2**16)
+AXES: Final = ('x', 'y', 'z')  #: axes of a frame, in the order of message fields
+_LARGEST: Final = 1e100  # upper limit of a plausible measurement [SI]
+_MAX_NAMES: Final = 100  # largest number of joint names kept for error messages
+_GAP: Final = 10.0  # shortest gap between samples [sampling periods]
+_STRAY: Final = 0.1  # smaller fractions of messages with other joint names are reported as faults
+_LATENCIES: Final = (64, 2**16)  # largest number of latencies kept of a batch, and of a topic
 
 
 class SignalSource(ABC):
@@ -87,7 +76,7 @@ class _Odometry(SignalSource):
         imaginary, real, body = numbers[:, 3:6], numbers[:, 6:7], numbers[:, 7:]
         twice = 2.0 * np.cross(imaginary, body)
         velocity = body + real * twice + np.cross(imaginary, twice)
-        return _position_and_speed(numbers[:, self._axis], velocity[:, self._axis])
+        return _position_and_velocity(numbers[:, self._axis], velocity[:, self._axis])
 
 
 class _Joint(SignalSource):
@@ -97,33 +86,35 @@ class _Joint(SignalSource):
 
     def __init__(self, joint: str | None) -> None:
         self._joint = joint
-        self._seen: set[str] = set()
+        self._names: set[str] = set()
         self._is_used = False
-        self._has_position = self._has_speed = False
+        self._has_position = self._has_velocity = False
 
     def __call__(self, template: wire.Template) -> list[int] | None:
-        if len(self._seen) < _MAX_NAMES:
-            self._seen.update(template.names)
+        if len(self._names) < _MAX_NAMES:
+            self._names.update(template.names)
         joint = self._joint or INSERTION
         if joint not in template.names:
             return None
         self._is_used = True
         index = template.names.index(joint)
-        position, speed = (_element(array, index) for array in template.arrays[:2])
+        position, velocity = (_element(array, index) for array in template.arrays[:2])
         self._has_position |= position >= 0
-        self._has_speed |= speed >= 0
-        return [position, speed]
+        self._has_velocity |= velocity >= 0
+        return [position, velocity]
 
     def _measured(self, numbers: FloatArray) -> FloatArray:
-        position, speed = numbers.T
-        return _position_and_speed(position if self._has_position else 0.0 * speed, speed)
+        position, velocity = numbers.T
+        return _position_and_velocity(position if self._has_position else 0.0 * velocity, velocity)
 
     def _complaint(self) -> str:
         joint = self._joint or INSERTION
         if not self._is_used:
-            names = f'motion_axis (--motion-axis) must name one of {_listing(self._seen)}'
-            return f'has no joint {joint!r}; {names}' if self._seen else 'has joints without names'
-        if not (self._has_position or self._has_speed):
+            names = f'motion_axis (--motion-axis) must name one of {_listing(self._names)}'
+            return (
+                f'has no joint {joint!r}; {names}' if self._names else 'has joints without names'
+            )
+        if not (self._has_position or self._has_velocity):
             return f'has neither position nor velocity of {joint}'
         return ''
 
@@ -148,12 +139,12 @@ class _PlaneJoints(EachJoint):
 
     def __init__(self, *joints: str) -> None:
         super().__init__(*joints)
-        self._seen: set[str] = set()
+        self._names: set[str] = set()
         self._is_used = self._is_flat = False
 
     def __call__(self, template: wire.Template) -> list[int] | None:
-        if len(self._seen) < _MAX_NAMES:
-            self._seen.update(template.names)
+        if len(self._names) < _MAX_NAMES:
+            self._names.update(template.names)
         if not set(self._joints[:2]) <= set(template.names):
             return None
         self._is_used = True
@@ -169,7 +160,7 @@ class _PlaneJoints(EachJoint):
         if self._is_used:
             return ''
         wanted = ' and '.join(self._joints[:2])
-        return f'must have the joints {wanted}, has {_listing(self._seen)}'
+        return f'must have the joints {wanted}, has {_listing(self._names)}'
 
     def _losses(self) -> list[str]:
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
@@ -185,19 +176,13 @@ def _element(array: tuple[int, int], index: int) -> int:
     return begin + 8 * index if index < length else -1
 
 
-def _position_and_speed(position: FloatArray, speed: FloatArray) -> FloatArray:
-    known = np.abs(speed) < _LARGEST
-    return np.column_stack([position, np.where(known, speed, 0.0), known])
+def _position_and_velocity(position: FloatArray, velocity: FloatArray) -> FloatArray:
+    known = np.abs(velocity) < _LARGEST
+    return np.column_stack([position, np.where(known, velocity, 0.0), known])
 
 
 def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> SignalSource:
-    """
-    Return the source for messages of a type.
-
-    `axes` has one axis of motion, or two axes of a plane and the off-plane axis. `joint` is the
-    moving joint of a JointState. The motion along one axis has position, velocity, and whether it
-    is valid.
-    """
+    """Return the source of an axis, of a plane (two axes and the third), or of a joint."""
     if type_name == wire.JOINT_STATE:
         return _PlaneJoints(*axes) if len(axes) == 3 else _Joint(joint)
     if type_name == wire.ODOMETRY and len(axes) == 1:
@@ -298,31 +283,31 @@ def are_gaps(steps: NDArray[np.int64]) -> BoolArray:
     return np.asarray(steps > _GAP * np.median(steps))
 
 
-def position_and_speed(samples: Samples, bag: Bag) -> Samples:
+def position_and_velocity(samples: Samples, bag: Bag) -> Samples:
     """Return the position and, if measured, the velocity; a velocity alone is integrated."""
     topic, _, values, _ = samples
     if values.shape[1] == 1:
-        return _from_speed(samples, bag)
-    position, speed, share = values.T
+        return _from_velocity(samples, bag)
+    position, velocity, share = values.T
     known = share > 0.0
-    if speed.any() and not position.any():
-        alone = (speed[known] / share[known])[:, np.newaxis]
-        return _from_speed(samples._replace(stamps=samples.stamps[known], values=alone), bag)
+    if velocity.any() and not position.any():
+        alone = (velocity[known] / share[known])[:, np.newaxis]
+        return _from_velocity(samples._replace(stamps=samples.stamps[known], values=alone), bag)
     if np.count_nonzero(known) < max(2.0, 0.5 * len(known)):
         bag.losses.append(f'{topic} has no velocity')
-    elif not speed.any() and np.ptp(position) > 0.0:
+    elif not velocity.any() and np.ptp(position) > 0.0:
         bag.losses.append(f'{topic} moves with the velocity 0, which is left out')
     else:
         if not known.all():
             bag.losses.append(f'{np.count_nonzero(~known)} of {topic} without velocity, left out')
         # A bin may contain samples with and without velocity.
-        both = np.column_stack([position[known], speed[known] / share[known]])
+        both = np.column_stack([position[known], velocity[known] / share[known]])
         return samples._replace(stamps=samples.stamps[known], values=both)
     return samples._replace(values=values[:, :1])
 
 
-def _from_speed(samples: Samples, bag: Bag) -> Samples:
+def _from_velocity(samples: Samples, bag: Bag) -> Samples:
     bag.losses.append(f'{samples.topic} has no position: depth is the integral of speed from 0')
     time = (samples.stamps - samples.stamps[0]) * 1e-9
-    speed = samples.values[:, 0]
-    return samples._replace(values=np.column_stack([integrated(time, speed), speed]))
+    velocity = samples.values[:, 0]
+    return samples._replace(values=np.column_stack([integrated(time, velocity), velocity]))

@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 #: Finest bin [ns]: 400 Hz, well above the cutoff frequency of the friction filter.
 FINEST: Final = 2_500_000
 
-#: Largest number of samples that are kept.
-LARGEST: Final = 2**20
-
-#: Smallest number of added samples that is sorted.
-_GATHERED: Final = 2**16
+LARGEST: Final = 2**20  #: largest number of samples that are kept
+_GATHERED: Final = 2**16  # smallest number of added samples that is sorted
 
 
 class Series:

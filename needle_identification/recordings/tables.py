@@ -71,11 +71,8 @@ _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 _MATLAB_HEAD: Final = 128
 _COMPRESSED: Final = 15
 
-#: Number of lines searched for the first line of numbers.
-_HEAD: Final = 200
-
-#: Longest plausible line of a sample [characters].
-_LONGEST_LINE: Final = 2**16
+_HEAD: Final = 200  # number of lines searched for the first line of numbers
+_LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
 
 #: Ranges above which a depth or speed without unit is probably not in SI units.
 _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
@@ -282,7 +279,7 @@ def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) 
         name=str(path),
         time=times,
         depth=found['depth'],
-        speed=found.get('speed'),
+        velocity=found.get('speed'),
         force=found['force'],
         losses=tuple(losses),
     )
@@ -308,17 +305,13 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
-    if not _ends_with_a_line(path):
-        losses.append('the last line has no end: the file may be cut off')
+    with path.open('rb') as stream:
+        stream.seek(-1, os.SEEK_END)
+        if stream.read(1) not in b'\r\n':
+            losses.append('the last line has no end: the file may be cut off')
     known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
-
-
-def _ends_with_a_line(path: Path) -> bool:
-    with path.open('rb') as stream:
-        stream.seek(-1, os.SEEK_END)
-        return stream.read(1) in b'\r\n'
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
@@ -387,10 +380,10 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    seen: set[str] = set()
+    used: set[str] = set()
     for k, name in enumerate(names):
-        unique = name if name and name not in seen else f'{name}{k + 1}'
-        seen.add(unique)
+        unique = name if name and name not in used else f'{name}{k + 1}'
+        used.add(unique)
         yield unique
 
 

@@ -23,22 +23,14 @@ from numpy.typing import NDArray
 #: have up to 0.2 s; unsynchronized clocks differ by more.
 LARGEST_LATENCY: Final = 0.25
 
-#: Smallest difference of latencies that is reported [s].
-_NOTABLE_LATENCY: Final = 0.05
-
-#: Smallest clock offset, as a multiple of the variation of the latencies.
-_CERTAINTY: Final = 3.0
+_NOTABLE_LATENCY: Final = 0.05  # smallest difference of latencies that is reported [s]
+_CERTAINTY: Final = 3.0  # smallest clock offset, as a multiple of the variation of the latencies
 
 
 def merge(
     bag: Bag, force: Samples, motion: Samples
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """
-    Interpolate the motion at the stamps of the force, where both are available.
-
-    Returns time from the first sample [s], (n,), force (n, k), motion (n, m) and the clock of the
-    force minus the clock of the motion [s].
-    """
+    """Return time [s], force, motion at the stamps of the force, and its clock offset [s]."""
     offset = _clock_offset(bag, force, motion)
     stamps = force.stamps - offset
     covered = _covered(stamps, motion.stamps)

@@ -26,27 +26,13 @@ CONSTANTS: Mapping[str, tuple[str, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MediumEstimate:
-    """
-    Constants of the needle in a medium.
+    """Constants of the needle in a medium; ``estimate[name]`` is a parameter."""
 
-    Attributes
-    ----------
-    medium : str
-        Name of the medium.
-    parameters : tuple of ParameterEstimate
-        Bending length, skin, and drift constants.
-    rms : float
-        Root mean square of the residuals, per axis [m].
-    samples, recordings : int
-        Number of samples and of recordings.
-
-    """
-
-    medium: str
-    parameters: tuple[ParameterEstimate, ...]
-    rms: float
-    samples: int
-    recordings: int
+    medium: str  #: name of the medium
+    parameters: tuple[ParameterEstimate, ...]  #: bending length, skin, and drift constants
+    rms: float  #: root mean square of the residuals, per axis [m]
+    samples: int  #: number of samples
+    recordings: int  #: number of recordings
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         return named(self.parameters, name)
@@ -54,36 +40,18 @@ class MediumEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SteeringEstimate:
-    """
-    Joint fit of several recordings.
+    """Joint fit of several recordings; ``estimate[name]`` is a medium."""
 
-    Attributes
-    ----------
-    free_length : ParameterEstimate
-        Free length, common to all recordings.
-    media : tuple of MediumEstimate
-        Constants by medium; ``estimate[name]`` returns a medium.
-    terms : tuple of str
-        Terms of the fit.
-    order : str
-        Order of guide motion and insertion between samples.
-    alternatives : mapping of tuple of str to float
-        Root mean square of the residuals by set of terms, per axis [m].
-    residuals : tuple of ndarray
-        Measured minus fitted tip positions of each recording, without missing measurements,
-        shape (samples, 2) [m].
-    warnings : tuple of str
-        Warnings about the validity of the values.
-
-    """
-
-    free_length: ParameterEstimate
-    media: tuple[MediumEstimate, ...]
-    terms: tuple[str, ...]
-    order: str
+    free_length: ParameterEstimate  #: common to all recordings
+    media: tuple[MediumEstimate, ...]  #: constants by medium
+    terms: tuple[str, ...]  #: terms of the fit
+    order: str  #: order of guide motion and insertion between samples
+    #: Root mean square of the residuals by set of terms, per axis [m].
     alternatives: Mapping[tuple[str, ...], float]
+    #: Measured minus fitted tip positions of each recording, without missing measurements,
+    #: shape (samples, 2) [m].
     residuals: tuple[FloatArray, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  #: warnings about the validity of the values
 
     def __getitem__(self, medium: str) -> MediumEstimate:
         for one in self.media:

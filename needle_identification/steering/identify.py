@@ -32,7 +32,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate, with_value
+from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
@@ -41,30 +41,15 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import stdtrit
 
-#: Smallest number of recordings of a medium whose spread determines the errors.
-_SEVERAL: Final = 8
-
-#: Relative difference of residuals below which fits are equivalent.
-_AS_GOOD: Final = 0.02
-
-#: Number of nonlinear constants of a medium.
-_LENGTHS: Final = 2
+_SEVERAL: Final = 8  # smallest number of recordings of a medium whose spread determines the errors
+_AS_GOOD: Final = 0.02  # relative difference of residuals below which fits are equivalent
+_LENGTHS: Final = 2  # number of nonlinear constants of a medium
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringSettings:
     """
     Settings of the steering identification.
-
-    Attributes
-    ----------
-    terms : tuple of str or None
-        Drift terms, of `TERMS`; None selects the term with the smallest residual.
-    order : str or None
-        Whether guide and needle move ``together`` between samples, or the ``guide first``; None
-        selects the order with the smaller residual.
-    free_length : float or None
-        Known free length [m]; None to estimate it.
 
     Raises
     ------
@@ -73,9 +58,12 @@ class SteeringSettings:
 
     """
 
+    #: Drift terms, of `TERMS`; None selects the term with the smallest residual.
     terms: tuple[str, ...] | None = None
+    #: Whether guide and needle move ``together`` between samples, or the ``guide first``; None
+    #: selects the order with the smaller residual.
     order: str | None = None
-    free_length: float | None = None
+    free_length: float | None = None  #: known free length [m]; None to estimate it
 
     def __post_init__(self) -> None:
         for term in self.terms or ():
@@ -285,9 +273,12 @@ def _constant(
 ) -> ParameterEstimate:
     """Return a constant; it is undetermined if its interval is unbounded."""
     symbol, unit = CONSTANTS[name]
-    unknown = ParameterEstimate(name=name, symbol=symbol, unit=unit)
-    is_bounded = isfinite(low) and isfinite(high)
-    return with_value(unknown, value, error, low, high) if is_bounded else unknown
+    if not (isfinite(low) and isfinite(high)):
+        return ParameterEstimate(name=name, symbol=symbol, unit=unit)
+    return ParameterEstimate(
+        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=(low, high),
+        determined=True,
+    )  # fmt: skip
 
 
 def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> Iterator[str]:

@@ -50,8 +50,7 @@ _JOINTS: Final = {
 _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
-#: Largest change of a constant tilt [rad].
-_MOVED: Final = 1e-4
+_MOVED: Final = 1e-4  # largest change of a constant tilt [rad]
 
 #: Largest number of tip samples; denser samples are averaged. The spacing over a path of 100 mm
 #: is then 0.2 mm.
@@ -124,17 +123,17 @@ def read_steering_recording(
     topics = bag.topics()
     tip = chosen_topic(bag, topics, _TIP, tip_topic)
     motion = chosen_topic(bag, topics, _MOTION, motion_topic)
-    seen = {name for names in first_names(bag, motion) for name in names}
+    present = {name for names in first_names(bag, motion) for name in names}
     joints = {role: signed(columns.get(role, name)) for role, name in _JOINTS.items()}
-    if 'roll' not in columns and contract.ROLL not in seen:
+    if 'roll' not in columns and contract.ROLL not in present:
         del joints['roll']
-    if missing := {name for _, name in joints.values()} - seen:
+    if missing := {name for _, name in joints.values()} - present:
         raise RecordingError(
             f'{path}: {motion.name} has no joint {" nor ".join(sorted(missing))}, it has '
-            f'{", ".join(sorted(seen)) or "none"}: use --columns guide_x=JOINT,...'
+            f'{", ".join(sorted(present)) or "none"}: use --columns guide_x=JOINT,...'
         )
     axes = {role: signed_axis(columns.get(role, axis), role) for role, axis in _TIPS.items()}
-    tilts = [name for name in _TILTS if name in seen]
+    tilts = [name for name in _TILTS if name in present]
     sources = {
         tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
         motion: EachJoint(*(name for _, name in joints.values()), *tilts),

@@ -13,17 +13,13 @@ from needle_identification.recordings.recording import freeze
 from needle_ros.errors import ShapeError
 import numpy as np
 
-#: Number of equal consecutive tip measurements that indicate a frozen sensor.
-_FROZEN: Final = 3
+_FROZEN: Final = 3  # number of equal consecutive tip measurements that indicate a frozen sensor
 
 #: Change of depth over these measurements [m]; above the position noise of robots.
 _GONE: Final = 5e-4
 
-#: Largest first depth that is measured from the skin [m].
-_AT_THE_SKIN: Final = 0.03
-
-#: Largest height above the skin of a robot at rest on it [m].
-_JITTER: Final = 1e-3
+_AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
+_JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
 
 #: Largest plausible lateral tip position, in addition to the guide and half the depth [m].
 _ASIDE: Final = 0.03
@@ -34,23 +30,6 @@ class SteeringRecording:
     """
     Recorded insertion: depth, guide, roll and tip position.
 
-    Attributes
-    ----------
-    name : str
-        Name of the recording, for messages.
-    medium : str
-        Name of the tissue; recordings in one tissue share its constants.
-    depth : ndarray, shape (n,)
-        Depth of the tip below the skin [m]; the path up to the first depth is straight.
-    guide : ndarray, shape (n, 2)
-        Position of the guide in x and z [m], with any origin.
-    roll : ndarray, shape (n,)
-        Roll of the base, right-handed about y [rad].
-    tip : ndarray, shape (n, 2)
-        Position of the tip in x and z [m], with any origin; NaN if missing.
-    losses : tuple of str
-        Discarded and corrected data.
-
     Raises
     ------
     ShapeError
@@ -58,13 +37,14 @@ class SteeringRecording:
 
     """
 
-    name: str = 'recording'
-    medium: str = ''
+    name: str = 'recording'  #: for messages
+    medium: str = ''  #: name of the tissue; recordings in one tissue share its constants
+    #: (n,) depth of the tip below the skin [m]; the path up to the first depth is straight.
     depth: FloatArray
-    guide: FloatArray
-    roll: FloatArray
-    tip: FloatArray
-    losses: tuple[str, ...] = ()
+    guide: FloatArray  #: (n, 2) position of the guide in x and z [m], with any origin
+    roll: FloatArray  #: (n,) roll of the base, right-handed about y [rad]
+    tip: FloatArray  #: (n, 2) position of the tip in x and z [m], any origin; NaN if missing
+    losses: tuple[str, ...] = ()  #: discarded and corrected data
 
     def __post_init__(self) -> None:
         freeze(self, 'depth', 'tip', guide=2, roll=None, tip=2)
@@ -87,11 +67,8 @@ class SteeringRecording:
 
 
 def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
-    """
-    Return a mask (n,) of tip samples that are neither frozen nor implausible, and messages.
-
-    ``guide`` and ``tip`` (n, 2) are x and z [m] relative to their start, NaN if missing.
-    """
+    """Return which tip samples (n,) are neither frozen nor implausible, and messages."""
+    # Guide and tip (n, 2) are x and z [m] relative to their start, NaN if missing.
     there = np.isfinite(tip).all(axis=1)
     same = np.zeros(len(depth), dtype=np.bool_)
     same[1:] = (tip[1:] == tip[:-1]).all(axis=1)

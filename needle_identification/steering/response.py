@@ -11,8 +11,7 @@ from needle_dynamics.steering.needle import empty_cut
 from needle_identification.steering.recording import SteeringRecording
 import numpy as np
 
-#: Order of guide motion and insertion between samples.
-ORDERS: Final = ('together', 'guide first')
+ORDERS: Final = ('together', 'guide first')  #: order of guide motion and insertion between samples
 
 #: Drift terms and their constants.
 TERMS: Final = {
@@ -37,11 +36,7 @@ class TipResponses(NamedTuple):
 def responses(
     recording: SteeringRecording, free: float, length: float, skin: float, order: str
 ) -> TipResponses:
-    """
-    Simulate a recorded insertion for each cause, with free and bending length [m].
-
-    ``skin`` is the stiffness of the skin over tissue stiffness per length [m].
-    """
+    """Simulate a recorded insertion for each cause; lengths in m, skin over tissue stiffness."""
     depth, guide = recording.depth, recording.guide - recording.guide[0]
     poses = np.zeros((3, len(depth), 6))
     poses[:, :, 0] = depth

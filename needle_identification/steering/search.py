@@ -22,11 +22,8 @@ SKIN: Final = (0.0, 0.5)
 _STARTS: Final = (0.018, 0.035, 0.07)
 _START_FREE, _START_SKIN = 0.03, 0.1
 
-#: The scale of the skin in the search [m].
-SKIN_SCALE: Final = 0.02
-
-#: Unit of the residuals in the search [m], for values of order 1.
-_UNIT: Final = 1e-4
+SKIN_SCALE: Final = 0.02  #: the scale of the skin in the search [m]
+_UNIT: Final = 1e-4  # unit of the residuals in the search [m], for values of order 1
 
 #: Finite difference step [search variables]; the responses are exact to rounding.
 _STEP: Final = 1e-5
@@ -34,8 +31,7 @@ _STEP: Final = 1e-5
 #: Largest number of iterations for an end of an interval, and relative tolerance.
 _TRIALS, _NEAR = 12, 0.01
 
-#: Size of the cache of media at given lengths.
-_KEPT: Final = 256
+_KEPT: Final = 256  # size of the cache of media at given lengths
 
 
 class Search:

@@ -21,57 +21,28 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class LevelEstimate:
-    """
-    Stiffness at a force level.
+    """Stiffness at a force level; ``level[name]`` is a parameter."""
 
-    Attributes
-    ----------
-    force : float
-        Mean magnitude of the force [N].
-    parameters : tuple of ParameterEstimate
-        k_xx, k_xz, k_zx, k_zz [N/m].
-    curl : ParameterEstimate
-        k_zx - k_xz [N/m], the curl of the force of the tissue -K d.
-    spring : ParameterEstimate
-        Frobenius norm of the antisymmetric part of K over the norm of the symmetric part [1]. It
-        is nonnegative and biased upward near zero. Its interval has the nominal coverage and
-        contains zero if the interval of the curl does.
-    is_spring : bool
-        Whether the whole interval of ``spring`` is within the setting ``largest_asymmetry``.
-    words : str
-        Whether the tissue is a spring, and why.
-    principal : (ParameterEstimate, ParameterEstimate)
-        Larger and smaller principal stiffness, of the symmetric part [N/m].
-    angle : ParameterEstimate
-        Direction of the larger stiffness, from x toward z, in (-pi/2, pi/2] [rad]; not
-        determined if the two agree within their errors.
-    tissue_stiffness : ParameterEstimate
-        k_a = k_zz / contact length [N/m^2].
-    presses, directions : int
-        Number of used presses and of directions.
-    residual : float
-        Root mean square of force minus K d [N].
-    determination : float
-        Coefficient of determination R^2.
-    condition : float
-        Condition number of the displacements; large for a single direction.
-
-    """
-
-    force: float
-    parameters: tuple[ParameterEstimate, ...]
-    curl: ParameterEstimate
+    force: float  #: mean magnitude [N]
+    parameters: tuple[ParameterEstimate, ...]  #: k_xx, k_xz, k_zx, k_zz [N/m]
+    curl: ParameterEstimate  #: k_zx - k_xz [N/m], the curl of the force of the tissue -K d
+    #: Frobenius norm of the antisymmetric part of K over the norm of the symmetric part [1]. It is
+    #: nonnegative and biased upward near zero. Its interval has the nominal coverage and contains
+    #: zero if the interval of the curl does.
     spring: ParameterEstimate
-    is_spring: bool
-    words: str
+    is_spring: bool  #: whether the interval of ``spring`` is within ``largest_asymmetry``
+    words: str  #: whether the tissue is a spring, and why
+    #: Larger and smaller principal stiffness, of the symmetric part [N/m].
     principal: tuple[ParameterEstimate, ParameterEstimate]
+    #: Direction of the larger stiffness, from x toward z, in (-pi/2, pi/2] [rad]; not determined
+    #: if the two agree within their errors.
     angle: ParameterEstimate
-    tissue_stiffness: ParameterEstimate
-    presses: int
-    directions: int
-    residual: float
-    determination: float
-    condition: float
+    tissue_stiffness: ParameterEstimate  #: k_a = k_zz / contact length [N/m^2]
+    presses: int  #: number of used presses
+    directions: int  #: number of directions
+    residual: float  #: root mean square of force minus K d [N]
+    determination: float  #: coefficient of determination R^2
+    condition: float  #: of the displacements; large for a single direction
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         others = (self.curl, self.spring, *self.principal, self.angle, self.tissue_stiffness)
@@ -90,29 +61,13 @@ class LevelEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class StiffnessEstimate:
-    """
-    Tissue stiffness at a place.
+    """Tissue stiffness at a place."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the recording.
-    levels : tuple of LevelEstimate
-        By force, in ascending order.
-    off_plane : float
-        Largest ratio of displacement out of the plane to displacement in the plane.
-    warnings : tuple of str
-        Warnings about the validity of the estimate.
-    presses : Presses
-        Fitted presses.
-
-    """
-
-    name: str
-    levels: tuple[LevelEstimate, ...]
-    off_plane: float
-    warnings: tuple[str, ...]
-    presses: Presses
+    name: str  #: name of the recording
+    levels: tuple[LevelEstimate, ...]  #: by force, in ascending order
+    off_plane: float  #: largest ratio of displacement out of the plane to displacement in it
+    warnings: tuple[str, ...]  #: warnings about the validity of the estimate
+    presses: Presses  #: fitted presses
 
     def __repr__(self) -> str:
         forces = ', '.join(f'{level.force:.3g}' for level in self.levels)
@@ -121,20 +76,10 @@ class StiffnessEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelSummary:
-    """
-    Force level over several places: a column of Table 2.
+    """Force level over several places, a column of Table 2; ``level[name]`` is a statistic."""
 
-    Attributes
-    ----------
-    force : float
-        Mean magnitude of the force [N].
-    statistics : tuple of Statistic
-        k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness; ``level[name]`` returns a statistic.
-
-    """
-
-    force: float
-    statistics: tuple[Statistic, ...]
+    force: float  #: mean magnitude [N]
+    statistics: tuple[Statistic, ...]  #: k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness
 
     def __getitem__(self, name: str) -> Statistic:
         return named(self.statistics, name)
@@ -142,26 +87,12 @@ class LevelSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StiffnessSummary:
-    """
-    Stiffness over several places, as in Table 2.
+    """Stiffness over several places, as in Table 2."""
 
-    Attributes
-    ----------
-    levels : tuple of LevelSummary
-        By force, in ascending order.
-    tissue_stiffness : Statistic
-        k_a [N/m^2] at the chosen level.
-    estimates : tuple of StiffnessEstimate
-        One per place.
-    warnings : tuple of str
-        Warnings about all places.
-
-    """
-
-    levels: tuple[LevelSummary, ...]
-    tissue_stiffness: Statistic
-    estimates: tuple[StiffnessEstimate, ...]
-    warnings: tuple[str, ...] = ()
+    levels: tuple[LevelSummary, ...]  #: by force, in ascending order
+    tissue_stiffness: Statistic  #: k_a [N/m^2] at the chosen level
+    estimates: tuple[StiffnessEstimate, ...]  #: one per place
+    warnings: tuple[str, ...] = ()  #: warnings about all places
 
 
 def summarize_stiffness(

@@ -21,24 +21,17 @@ from needle_identification.stiffness.matrix import (
     fit_matrix,
     MatrixFit,
     principal_estimates,
+    spring_estimates,
 )
 from needle_identification.stiffness.plateaus import find_plateaus
 from needle_identification.stiffness.presses import find_presses, Presses
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.spring import spring_estimates
 import numpy as np
 
-#: Relative deviation above which a warning is given.
-_WORTH_WARNING: Final = 0.1
-
-#: Largest ratio of scatter to noise for presses that follow a matrix.
-_LARGEST_SCATTER: Final = 2.0
-
-#: Significant change [standard errors].
-_CLEARLY: Final = 3.0
-
-#: Smallest number of directions without a warning.
-_FEWEST_DIRECTIONS: Final = 4
+_WORTH_WARNING: Final = 0.1  # relative deviation above which a warning is given
+_LARGEST_SCATTER: Final = 2.0  # largest ratio of scatter to noise for presses that follow a matrix
+_CLEARLY: Final = 3.0  # significant change [standard errors]
+_FEWEST_DIRECTIONS: Final = 4  # smallest number of directions without a warning
 
 
 def identify_stiffness(
@@ -86,21 +79,19 @@ def identify_stiffness(
     """
     settings = settings or StiffnessSettings()
     try:
-        return _identify(recording, settings)
+        plateaus = find_plateaus(recording, settings)
+        presses, noise, warnings = find_presses(recording, plateaus, settings)
+        members = [presses.level == index for index in range(int(presses.level.max()) + 1)]
+        fits = [
+            fit_matrix(presses, noise, np.flatnonzero(chosen), settings.estimator)
+            for chosen in members
+        ]
     except IdentificationError as error:
         raise IdentificationError(f'{recording.name}: {error}') from None
-
-
-def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> StiffnessEstimate:
-    plateaus = find_plateaus(recording, settings)
-    presses, noise, warnings = find_presses(recording, plateaus, settings)
     levels = []
     by_doubt: dict[str, list[str]] = {}
-    for index in range(int(presses.level.max()) + 1):
-        fit = fit_matrix(
-            presses, noise, np.flatnonzero(presses.level == index), settings.estimator
-        )
-        level = _level(presses, presses.level == index, fit, settings)
+    for chosen, fit in zip(members, fits, strict=True):
+        level = _level(presses, chosen, fit, settings)
         levels.append(level)
         for doubt, detail in _doubts(level, fit):
             by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')

@@ -1,10 +1,16 @@
 r"""
-Fit the stiffness matrix of a force level by least squares over its presses; principal directions.
+Fit the stiffness matrix of a force level, and test whether the tissue is a spring.
 
 .. math:: F = K d, \qquad K = \begin{bmatrix} k_{xx} & k_{xz} \\ k_{zx} & k_{zz} \end{bmatrix}
 
 F is the force on the tissue and d the displacement of the end-effector, section 3.2.2.3 of
-the paper.
+the paper. The force of the tissue is -K d. The tissue is a spring if the curl
+
+.. math:: \frac{\partial F_x}{\partial z} - \frac{\partial F_z}{\partial x} = k_{zx} - k_{xz}
+
+is zero, that is, if K is symmetric. The dimensionless measure is the Frobenius norm of the
+antisymmetric part of K over the norm of its symmetric part. Its largest value for a spring is
+`StiffnessSettings.largest_asymmetry`.
 """
 
 from __future__ import annotations
@@ -20,14 +26,13 @@ from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise
 import numpy as np
 from numpy.linalg import norm
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
-from scipy.special import fdtri, stdtrit
+from scipy.optimize import brentq
+from scipy.special import fdtri, stdtr, stdtrit
 
-#: Entries of the matrix, by row.
-ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')
-
-#: Smallest number of presses of a level.
-_FEWEST_PRESSES: Final = 3
+ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')  #: entries of the matrix, by row
+_FEWEST_PRESSES: Final = 3  # smallest number of presses of a level
 
 #: Smallest ratio of scatter and error of the displacements that determines the matrix:
 #: attenuation by the noise of the displacements is then below 1 %.
@@ -35,6 +40,9 @@ _SMALLEST_SPREAD: Final = 10.0
 
 #: Ratio of column norm to error below which a column contains only noise.
 _LARGEST_NOISE: Final = 3.0
+
+#: Gradient of the curl k_zx - k_xz with respect to the entries of K.
+_CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 class MatrixFit(NamedTuple):
@@ -84,11 +92,7 @@ _UNKNOWN: Final = MatrixFit(
 
 
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
-    """
-    Solve F = K d over the presses with indices ``chosen`` (m,), by row of K.
-
-    Standard errors are computed from the scatter of the presses about K.
-    """
+    """Solve F = K d over the presses ``chosen`` (m,), with errors from their scatter."""
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
     if len(chosen) < _FEWEST_PRESSES:
@@ -144,12 +148,9 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
 def _deviation(
     residual: FloatArray, freedom: float, estimator: str
 ) -> tuple[float, float, FloatArray]:
-    """
-    Return standard deviation, degrees of freedom, and used values of residuals.
-
-    For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
-    reduces the degrees of freedom by 1.
-    """
+    """Return standard deviation, degrees of freedom, and used values of residuals."""
+    # For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
+    # reduces the degrees of freedom by 1.
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual
     limit = 1.345 * 1.4826 * float(np.median(np.abs(residual)))
@@ -164,12 +165,9 @@ def _deviation(
 def principal_estimates(
     fit: MatrixFit,
 ) -> tuple[ParameterEstimate, ParameterEstimate, ParameterEstimate]:
-    """
-    Return larger and smaller principal stiffness [N/m], and direction of the larger [rad].
-
-    If both agree within their errors, they are biased apart: their intervals then include the
-    interval of their mean, and the direction (from x toward z) is undetermined.
-    """
+    """Return larger and smaller principal stiffness [N/m], and direction of the larger [rad]."""
+    # If both agree within their errors, they are biased apart: their intervals then include the
+    # interval of their mean, and the direction (from x toward z) is undetermined.
     k = fit.matrix
     half, shear = (k[0, 0] - k[1, 1]) / 2.0, (k[0, 1] + k[1, 0]) / 2.0
     mean, radius = (k[0, 0] + k[1, 1]) / 2.0, hypot(half, shear)
@@ -206,5 +204,70 @@ def _differ(fit: MatrixFit, found: FloatArray, stretch: FloatArray, slide: Float
     (a, _), (b, _), (c, freedom) = (fit.variance_of(g) for g in (stretch, slide, stretch + slide))
     covariance = np.array([[a, (c - a - b) / 2.0], [(c - a - b) / 2.0, b]])
     if np.linalg.det(covariance) <= 0.0:
-        return bool(np.linalg.norm(found) > ROUNDING * np.linalg.norm(fit.matrix))
+        return bool(norm(found) > ROUNDING * norm(fit.matrix))
     return bool(found @ np.linalg.solve(covariance, found) / 2.0 > fdtri(2, freedom, 0.99))
+
+
+def asymmetry(matrix: ArrayLike) -> float:
+    """
+    Return the ratio of the antisymmetric to the symmetric part of a stiffness matrix.
+
+    Parameters
+    ----------
+    matrix : array_like, shape (2, 2)
+        Stiffness matrix [N/m].
+
+    Returns
+    -------
+    float
+        Ratio of the Frobenius norms [1]; nan if the symmetric part is zero.
+
+    """
+    k = np.asarray(matrix, dtype=np.float64)
+    symmetric = float(norm(k + k.T))
+    return float(norm(k - k.T)) / symmetric if symmetric else nan
+
+
+def spring_estimates(
+    fit: MatrixFit, limit: float
+) -> tuple[ParameterEstimate, ParameterEstimate, bool, str]:
+    """Return curl, asymmetry, whether its interval is within ``limit`` [1], and a sentence."""
+    k = fit.matrix
+    curl = fit.derived('curl', 'curl F', 'N/m', float(k[1, 0] - k[0, 1]), _CURL)
+    symmetric = (k + k.T) / 2.0
+    size = sqrt(2.0) * float(norm(symmetric)) or nan
+    gradient = (_CURL - 2.0 * (k[1, 0] - k[0, 1]) / size**2 * symmetric) / size
+    value = float(k[1, 0] - k[0, 1]) / size
+    spring = fit.derived('spring', '|K_a|/|K_s|', '1', value, gradient)
+    if not spring.determined:
+        return curl, spring, False, 'undetermined: the presses do not determine the whole matrix'
+    _, freedom = fit.variance_of(gradient)
+    low, high = _unsigned_interval(abs(value), spring.error, freedom)
+    spring = replace(spring, value=abs(value), interval=(low, high))
+    is_spring = high <= limit
+    verdict = 'a spring' if is_spring else 'not a spring' if low > limit else 'undecided'
+    words = (
+        f'{verdict}: antisymmetric part {spring.value:.2%} of the symmetric, 95 % interval '
+        f'{low:.2%} to {high:.2%}, limit {limit:.0%}; curl '
+        + ('zero within its error' if low == 0.0 else f'{curl.value:.3g} N/m')
+    )
+    return curl, spring, is_spring, words
+
+
+def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[float, float]:
+    """Return the 95 % interval of the magnitude of a signed quantity."""
+    # It contains each magnitude for which the measured value is among the nearest 95 % of values.
+    if error <= ROUNDING * value:
+        return value, value
+    found = value / error
+    farthest = float(stdtrit(freedom, 0.975))
+
+    def excess(size: float) -> float:
+        """Probability that a value is nearer to this size than the measurement, minus 95 %."""
+        off = abs(size - found)
+        near = [off, max(-off, -size), min(-size, off - 2.0 * size), -off - 2.0 * size]
+        above, below, mirrored, lowest = stdtr(freedom, near)
+        return float(above - below + mirrored - lowest) - 0.95
+
+    low = brentq(excess, 0.0, found) if found > farthest else 0.0
+    return low * error, brentq(excess, found, found + 1.01 * farthest) * error

@@ -18,11 +18,8 @@ from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 from numpy.linalg import norm
 
-#: Number of bins in the shortest plateau; steadiness is tested on bin means.
-_BINS: Final = 10.0
-
-#: Largest step between bins within a plateau [bins].
-_GAP: Final = 4
+_BINS: Final = 10.0  # number of bins in the shortest plateau; steadiness is tested on bin means
+_GAP: Final = 4  # largest step between bins within a plateau [bins]
 
 #: Largest range of positions in a plateau, as a fraction of their whole range.
 _STEADY_MOTION: Final = 0.05
@@ -31,17 +28,13 @@ _STEADY_MOTION: Final = 0.05
 #: extends over the whole tolerance.
 _STEADY_TREND: Final = 1.0 / 3.0
 
-#: Width of the band that contains noise [standard deviations].
-_BAND: Final = 12.0
+_BAND: Final = 12.0  # width of the band that contains noise [standard deviations]
 
 #: Deviation from the middle half of a plateau that indicates a ramp [standard deviations].
 _RAMP: Final = 3.0
 
-#: Smallest number of samples of a plateau.
-_FEWEST_SAMPLES: Final = 4
-
-#: Relative noise below which values differ by rounding.
-ROUNDING: Final = 1e-8
+_FEWEST_SAMPLES: Final = 4  # smallest number of samples of a plateau
+ROUNDING: Final = 1e-8  #: relative noise below which values differ by rounding
 
 
 class Plateaus(NamedTuple):
@@ -83,13 +76,13 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     zero = np.column_stack([np.interp(time[first], middle[rest], c) for c in mean[rest, :2].T])
     size = np.hypot(*(means[:, :2] - zero).T)
     pressed = size > settings.rest_force
-    held = np.zeros(len(means), dtype=np.bool_)
+    in_hold = np.zeros(len(means), dtype=np.bool_)
     for (start, length), is_rest in zip(runs, rest, strict=True):
-        held[start : start + length] = not is_rest
+        in_hold[start : start + length] = not is_rest
     edges = np.flatnonzero(np.diff(np.pad(pressed.astype(np.int8), 1))).reshape(-1, 2)
     # Noise may cross the limit of a rest repeatedly, but not twice the limit.
     high = size > 2.0 * settings.rest_force
-    missed = sum(high[up:down].any() and not held[up:down].any() for up, down in edges)
+    missed = sum(high[up:down].any() and not in_hold[up:down].any() for up, down in edges)
     return Plateaus(middle, mean, _variances(channels, parts), rest, missed)
 
 
@@ -175,12 +168,9 @@ def _rests(force: FloatArray, rest_force: float) -> BoolArray:
 
 
 def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray:
-    """
-    Return the variance of the mean of each part, with a common autocorrelation.
-
-    The sum of autocorrelations ends at a lag of five correlation times (A. Sokal, "Monte Carlo
-    methods in statistical mechanics", 1997).
-    """
+    """Return the variance of the mean of each part, with a common autocorrelation."""
+    # The sum of autocorrelations ends at a lag of five correlation times (A. Sokal, "Monte Carlo
+    # methods in statistical mechanics", 1997).
     rows, shapes = [], []
     for begin, end in parts:
         line = np.linspace(-1.0, 1.0, end - begin)

@@ -15,41 +15,22 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
-#: Largest angle between forces of the same direction [rad].
-_SAME_DIRECTION: Final = pi / 18.0
-
-#: Relative drift of the zero above which a warning is given.
-_WORTH_WARNING: Final = 0.1
+_SAME_DIRECTION: Final = pi / 18.0  # largest angle between forces of the same direction [rad]
+_WORTH_WARNING: Final = 0.1  # relative drift of the zero above which a warning is given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Presses:
-    """
-    Presses of a recording, relative to the adjacent rests.
+    """Presses of a recording, relative to the adjacent rests; x and z in columns."""
 
-    Attributes
-    ----------
-    time : ndarray, shape (m,)
-        Center of the hold [s].
-    displacement, force : ndarray, shape (m, 2)
-        Mean displacement [m] and force on the tissue [N] along x and z.
-    displacement_error, force_error : ndarray, shape (m, 2)
-        Their standard errors, which account for the autocorrelation of the samples.
-    off_plane : ndarray, shape (m,)
-        Displacement out of the plane [m].
-    level, direction : ndarray of int, shape (m,)
-        Index of the force level and of the direction.
-
-    """
-
-    time: FloatArray
-    displacement: FloatArray
-    force: FloatArray
-    displacement_error: FloatArray
-    force_error: FloatArray
-    off_plane: FloatArray
-    level: IntArray
-    direction: IntArray
+    time: FloatArray  #: (m,) center of the hold [s]
+    displacement: FloatArray  #: (m, 2) mean displacement [m]
+    force: FloatArray  #: (m, 2) mean force on the tissue [N]
+    displacement_error: FloatArray  #: (m, 2) standard error, for autocorrelated samples
+    force_error: FloatArray  #: (m, 2) likewise
+    off_plane: FloatArray  #: (m,) displacement out of the plane [m]
+    level: IntArray  #: (m,) index of the force level
+    direction: IntArray  #: (m,) index of the direction
 
     def __repr__(self) -> str:
         levels, directions = int(self.level.max()) + 1, int(self.direction.max()) + 1
@@ -73,7 +54,10 @@ class PressNoise(NamedTuple):
                 np.full_like(a, a.mean()) for a in (force, displacement, squares)
             )
         else:
-            force, displacement = _bounded(force), _bounded(displacement)
+            # Rounding may give a hold too small a variance.
+            force, displacement = (
+                np.maximum(a, 0.1 * a.mean(axis=0)) for a in (force, displacement)
+            )
         among = np.ix_(chosen, chosen)
         return np.array(
             [
@@ -83,11 +67,6 @@ class PressNoise(NamedTuple):
                 for row in range(2)
             ]
         )
-
-
-def _bounded(variance: FloatArray) -> FloatArray:
-    """Bound variances from below: rounding may give a hold too small a variance."""
-    return np.asarray(np.maximum(variance, 0.1 * variance.mean(axis=0)))
 
 
 def find_presses(
@@ -176,22 +155,19 @@ def _directions(force: FloatArray) -> IntArray:
 def _follow_zero(
     times: FloatArray, rests: FloatArray, variance: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """
-    Estimate the zero between rests (r, c) as a random walk with measurement noise.
-
-    Returns the zeros ``at`` other times, (m, c), and their covariance in each channel, (m, m).
-    """
+    """Return the zero ``at`` times between rests (r, c), (m, c), and its covariance (m, m)."""
+    # A random walk with measurement noise.
     mean: FloatArray = rests.mean(axis=0)
     knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)
-    seen, asked = place[: len(times)], place[len(times) :]
+    measured, asked = place[: len(times)], place[len(times) :]
     precision = np.zeros((len(knots), len(knots)))
-    precision[seen, seen] = 1.0 / variance
+    precision[measured, measured] = 1.0 / variance
     rate = _drift_rate(times, rests, variance) if len(times) > 1 else variance[0]
     if len(knots) > 1:
         difference = np.diff(np.eye(len(knots)), axis=0)
         precision += difference.T @ (difference / (rate * np.diff(knots))[:, np.newaxis])
     covariance = np.linalg.inv(precision)
-    gain = covariance[np.ix_(asked, seen)] / variance
+    gain = covariance[np.ix_(asked, measured)] / variance
     zero: FloatArray = mean + gain @ (rests - mean)
     return zero, np.asarray(covariance[np.ix_(asked, asked)])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_identification.estimation.estimators import check_estimator
+from needle_identification.estimation import check_estimator
 from needle_ros.settings import check_constants, constant
 
 

@@ -37,8 +37,8 @@ _GREEK: Final = {'mu': r'\mu'}
 
 def _sides(fit: Fit) -> Iterator[tuple[BoolArray, str, str, str]]:
     """Yield used samples, label, color and marker of each direction of motion."""
-    yield fit.used & (fit.speed > 0.0), 'insertion', _IN, 'o'
-    yield fit.used & (fit.speed < 0.0), 'withdrawal', _OUT, '^'
+    yield fit.used & (fit.velocity > 0.0), 'insertion', _IN, 'o'
+    yield fit.used & (fit.velocity < 0.0), 'withdrawal', _OUT, '^'
 
 
 def friction_data(estimate: FrictionEstimate) -> Figure:
@@ -53,10 +53,10 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
     _label(above, 'time [s]', 'force on the needle [N]')
     _legend_above(above)
     for side, words, color, mark in _sides(fit):
-        speed, force = _thinned(1e3 * fit.speed[side], fit.force[side])
+        speed, force = _thinned(1e3 * fit.velocity[side], fit.force[side])
         below.plot(speed, force, mark, color=color, markersize=2.5, alpha=0.4, label=words)
-        order = np.argsort(fit.speed[side])
-        line = _thinned(1e3 * fit.speed[side][order], fit.model[side][order])
+        order = np.argsort(fit.velocity[side])
+        line = _thinned(1e3 * fit.velocity[side][order], fit.model[side][order])
         label = 'fit' if words == 'withdrawal' else None
         below.plot(*line, color=_FIT, linewidth=1.2, label=label)
     below.axhline(0.0, color=_FIT, linewidth=0.6)
@@ -76,7 +76,7 @@ def friction_residuals(estimate: FrictionEstimate) -> Figure:
     edges = np.linspace(-reach, reach, 41).tolist()
     for side, words, color, mark in _sides(fit):
         time, speed, left = _thinned(
-            fit.time[side] - fit.time[0], 1e3 * fit.speed[side], residual[side]
+            fit.time[side] - fit.time[0], 1e3 * fit.velocity[side], residual[side]
         )
         style: dict[str, Any] = {'color': color, 'markersize': 2.0, 'alpha': 0.5}
         over.plot(time, left, mark, label=words, **style)
@@ -102,10 +102,10 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
     for axes, estimate in zip(panels, estimates, strict=True):
         fit = estimate.fit
         for side, words, color, mark in _sides(fit):
-            order = np.argsort(fit.speed[side])
+            order = np.argsort(fit.velocity[side])
             speed, force, model = (
                 _thinned(values[side][order], most=_MOST_SMALL)[0]
-                for values in (1e3 * fit.speed, fit.force, fit.model)
+                for values in (1e3 * fit.velocity, fit.force, fit.model)
             )
             axes.plot(speed, force, mark, color=color, markersize=1.5, alpha=0.5, label=words)
             axes.plot(speed, model, color=_FIT, linewidth=0.9)

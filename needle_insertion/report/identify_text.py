@@ -16,9 +16,9 @@ from needle_identification import (
     ParameterEstimate,
     Presses,
     Statistic,
-    statistic,
     StiffnessSummary,
 )
+from needle_identification.estimation.estimate import statistic
 from needle_identification.estimation.formatting import between, measured, spread
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.text import table

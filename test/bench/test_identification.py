@@ -26,7 +26,7 @@ def test_bag_contains_friction_of_its_generator(bag: Path) -> None:
     assert_allclose(np.diff(recording.time), 1.0 / 250.0, rtol=1e-6)
     # The velocity is the derivative of the insertion depth, to second order of the step.
     slope = np.gradient(recording.depth, recording.time)[1:-1]
-    assert_allclose(slope, recording.speed[1:-1], atol=2e-5)
+    assert_allclose(slope, recording.velocity[1:-1], atol=2e-5)
     estimate = bench_identification.ours(bag)
     for name, true in (('coulomb_friction', 0.56), ('viscous_friction', 300.0)):
         # Five standard errors.
@@ -47,7 +47,7 @@ def test_rosbags_reads_same_numbers(bag: Path, monkeypatch: pytest.MonkeyPatch) 
     force = np.array(taken['/base_wrench'])
     motion = np.array(taken['/joint_states'])
     assert_allclose(force[:, 1], recording.force, rtol=0.0, atol=0.0)
-    assert_allclose(motion[:, 1:].T, [recording.depth, recording.speed], rtol=1e-12)
+    assert_allclose(motion[:, 1:].T, [recording.depth, recording.velocity], rtol=1e-12)
 
 
 def test_mcap_ros2_support_reads_same_numbers(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,12 +16,12 @@ import pytest
 def test_force_without_noise_equals_ground_truth() -> None:
     kind = NoiseKind(white=0.0, position_counts=0.0)
     recording, truth = recorded(kind, np.random.default_rng(0))
-    moving = np.abs(recording.speed) > 0.0
-    expected = truth['coulomb_friction'] * np.sign(recording.speed)
-    expected += truth['viscous_friction'] * recording.speed
+    moving = np.abs(recording.velocity) > 0.0
+    expected = truth['coulomb_friction'] * np.sign(recording.velocity)
+    expected += truth['viscous_friction'] * recording.velocity
     assert_allclose(recording.force[moving], expected[moving], rtol=1e-12)
     # The trapezoidal rule is exact for piecewise linear velocity, except at its corners.
-    assert_allclose(np.gradient(recording.depth, recording.time), recording.speed, atol=1e-3)
+    assert_allclose(np.gradient(recording.depth, recording.time), recording.velocity, atol=1e-3)
 
 
 @pytest.mark.parametrize('name', ['AR(1), 20 ms', 'AR(1), 0.2 s', 'AR(1), 1 s'])

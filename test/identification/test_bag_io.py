@@ -65,16 +65,16 @@ def small_bag(
     motions: list[tuple[int, float, float]] | tuple[()] = (),
     joint_names: tuple[str, ...] = ('insertion',),
 ) -> Path:
-    """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
+    """Write (stamp, value) wrenches and (stamp, depth, velocity) motions, in ms of Unix time."""
     with BagWriter(path) as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
         for stamp, force in wrenches:
             at = EPOCH + stamp * MILLISECOND
             writer.write('/ft', wrench(at, force), at)
-        for stamp, depth, speed in motions:
+        for stamp, depth, velocity in motions:
             at = EPOCH + stamp * MILLISECOND
-            writer.write('/joints', joint_states(at, depth, speed, joint_names), at)
+            writer.write('/joints', joint_states(at, depth, velocity, joint_names), at)
     return path
 
 
@@ -160,7 +160,7 @@ def test_a_recording_written_to_a_bag_is_read_back_unchanged(
     assert_allclose(read.time, recording.time, rtol=0.0, atol=2e-9)
     assert_array_equal(read.force, recording.force)
     # Rounding of the interpolation at equal stamps.
-    assert_allclose(read.speed, recording.speed, rtol=1e-12, atol=1e-12)
+    assert_allclose(read.velocity, recording.velocity, rtol=1e-12, atol=1e-12)
     assert_allclose(read.depth, recording.depth, rtol=1e-12)
     assert read.losses == ()
     assert read.truth == {'model.coulomb_friction': 0.56}

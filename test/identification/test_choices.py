@@ -40,7 +40,7 @@ def insertion(
     """
     rng = np.random.default_rng(seed)
     step, lasts = 1.0 / 250.0, 60.0
-    corners, speeds, depth, sign = [0.0, 0.5], [0.0, 0.0], 0.0, 1.0
+    corners, velocities, depth, sign = [0.0, 0.5], [0.0, 0.0], 0.0, 1.0
     while corners[-1] < lasts:
         speed = exp(rng.uniform(log(4e-3), log(12e-3)))
         way = rng.uniform(0.02, 0.04) if sign > 0.0 else rng.uniform(0.01, 0.025)
@@ -49,24 +49,24 @@ def insertion(
             continue
         ramp, begin = speed / 0.08, corners[-1]
         corners += [begin + ramp, begin + way / speed, begin + ramp + way / speed]
-        speeds += [sign * speed, sign * speed, 0.0]
+        velocities += [sign * speed, sign * speed, 0.0]
         depth, sign = depth + sign * way, -sign
     time = np.arange(0.0, lasts, step)
-    speed = np.interp(time, corners, speeds)
-    s = np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
-    sliding = np.sign(speed)
+    velocity = np.interp(time, corners, velocities)
+    s = np.concatenate([[0.0], np.cumsum(0.5 * step * (velocity[1:] + velocity[:-1]))])
+    sliding = np.sign(velocity)
     if presliding:
         # Asperities bend before they slide (Dahl).
         state = 0.0
-        for k, v in enumerate(speed):
+        for k, v in enumerate(velocity):
             kept = exp(-abs(v) * step / presliding)
             state = np.sign(v) + (state - np.sign(v)) * kept
             sliding[k] = state
-    force = MU_S * sliding + MU_V * speed
+    force = MU_S * sliding + MU_V * velocity
     ends = [*(depth for depth, _ in layers[1:]), np.inf]
     for (begin, density), end in zip(layers, ends, strict=bool(layers)):
-        force += np.sign(speed) * density * np.clip(s - begin, 0.0, end - begin)
-    fresh = (s >= np.maximum.accumulate(s) - 1e-9) & (speed > 0.0)
+        force += np.sign(velocity) * density * np.clip(s - begin, 0.0, end - begin)
+    fresh = (s >= np.maximum.accumulate(s) - 1e-9) & (velocity > 0.0)
     force += cutting * fresh
     for where, drop, load in punctures:
         loading = (s - (where - load)) / load
@@ -75,7 +75,7 @@ def insertion(
         name=f'insertion {seed}',
         time=time,
         depth=np.round(s, 6),
-        speed=speed,
+        velocity=velocity,
         force=force + NOISE * rng.standard_normal(len(time)),
     )
 
@@ -115,7 +115,7 @@ def test_friction_along_the_needle_is_identified(
     truth: dict[str, float],
 ) -> None:
     """The suggested terms are the missing terms; with them the estimates are correct."""
-    right, held, count = 0, 0, 0
+    right, covered, count = 0, 0, 0
     for seed in range(8):
         recording = insertion(seed, **made)
         ends = followed(recording)
@@ -127,11 +127,11 @@ def test_friction_along_the_needle_is_identified(
             if found[name].determined:
                 count += 1
                 low, high = found[name].interval
-                held += low <= value <= high
+                covered += low <= value <= high
     assert right >= 7
     # 95 % of 16 or more, with three standard deviations.
     assert count >= 16
-    assert held >= 0.79 * count
+    assert covered >= 0.79 * count
 
 
 @pytest.mark.parametrize(

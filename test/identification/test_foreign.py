@@ -36,10 +36,10 @@ LATENCY, JITTER = 2_000_000, 300_000
 
 @lru_cache(maxsize=1)
 def samples() -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-    """Return stamps [ns], depth, speed and force of strokes, at 125 Hz."""
+    """Return stamps [ns], depth, velocity and force of strokes, at 125 Hz."""
     made = strokes(seed=7, speeds=(2e-3, 10e-3, 20e-3), push=0.0)
     stamps = EPOCH + np.rint(made.time * 1e9).astype(np.int64)
-    return stamps[::2], made.depth[::2], made.speed[::2], made.force[::2]
+    return stamps[::2], made.depth[::2], made.velocity[::2], made.force[::2]
 
 
 def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
@@ -51,21 +51,21 @@ def triple(kind: str, **given: float) -> Any | Any:
 
 
 def joints(
-    stamp: int, position: float | None, speed: float | None, names: tuple[str, ...] = ('slide',)
+    stamp: int, position: float | None, velocity: float | None, names: tuple[str, ...] = ('slide',)
 ) -> bytes:
     """Serialize a JointState of joints with equal values; None leaves an array empty."""
     arrays = [
         np.array([] if value is None else [value] * len(names))
-        for value in (position, speed, None)
+        for value in (position, velocity, None)
     ]
     return serialized(JOINTS, stamp, list(names), *arrays)
 
 
-def motion(type_name: str, stamp: int, speed: float, **place: float) -> bytes:
+def motion(type_name: str, stamp: int, velocity: float, **place: float) -> bytes:
     """Serialize a motion in any type; the velocity is along the axes of the frame."""
     kinds = STORE.types
     where = triple('Point', **place)
-    velocity = triple('Vector3', **dict.fromkeys(place, speed))
+    velocity = triple('Vector3', **dict.fromkeys(place, velocity))
     pose = kinds['geometry_msgs/msg/Pose'](
         where, kinds['geometry_msgs/msg/Quaternion'](0, 0, 0, 1)
     )
@@ -99,10 +99,12 @@ def recorded(
     """
     rng = np.random.default_rng(0)
     rows = []
-    for stamp, depth, speed, force in zip(*(column.tolist() for column in samples()), strict=True):
+    for stamp, depth, velocity, force in zip(
+        *(column.tolist() for column in samples()), strict=True
+    ):
         stamped = stamp + round(ahead * SECOND)
         rows.append((topics[0], WRENCH, stamp, wrench(stamped, sign * force)))
-        rows.append((topics[1], type_name, stamp, make(stamp, depth, speed)))
+        rows.append((topics[1], type_name, stamp, make(stamp, depth, velocity)))
     late = LATENCY + rng.integers(0, JITTER, len(rows))
     return sorted(
         ((topic, kind, stamp + int(delay), data)
@@ -248,32 +250,32 @@ def test_a_missing_part_of_a_split_recording_is_reported(
 # Messages.
 
 
-def without_speed(stamp: int, depth: float, _speed: float) -> bytes:
+def without_velocity(stamp: int, depth: float, _velocity: float) -> bytes:
     return joints(stamp, depth, None)
 
 
-def at_speed_zero(stamp: int, depth: float, _speed: float) -> bytes:
+def at_velocity_zero(stamp: int, depth: float, _velocity: float) -> bytes:
     return joints(stamp, depth, 0.0)
 
 
-def at_speed_nan(stamp: int, depth: float, _speed: float) -> bytes:
+def at_velocity_nan(stamp: int, depth: float, _velocity: float) -> bytes:
     return joints(stamp, depth, np.nan)
 
 
-def without_position(stamp: int, _depth: float, speed: float) -> bytes:
-    return joints(stamp, None, speed)
+def without_position(stamp: int, _depth: float, velocity: float) -> bytes:
+    return joints(stamp, None, velocity)
 
 
-def at_position_zero(stamp: int, _depth: float, speed: float) -> bytes:
-    return joints(stamp, 0.0, speed)
+def at_position_zero(stamp: int, _depth: float, velocity: float) -> bytes:
+    return joints(stamp, 0.0, velocity)
 
 
 @pytest.mark.parametrize(
     ('make', 'said'),
     [
-        (without_speed, 'has no velocity'),
-        (at_speed_zero, 'moves with the velocity 0'),
-        (at_speed_nan, 'has no velocity'),
+        (without_velocity, 'has no velocity'),
+        (at_velocity_zero, 'moves with the velocity 0'),
+        (at_velocity_nan, 'has no velocity'),
         (without_position, 'has no position'),
         (at_position_zero, 'has no position'),
     ],
@@ -328,8 +330,8 @@ def test_all_motion_types_are_read_along_any_axis(
     axis: str,
     sign: float,
 ) -> None:
-    def make(stamp: int, depth: float, speed: float) -> bytes:
-        return motion(type_name, stamp, sign * speed, **{axis[-1]: sign * depth})
+    def make(stamp: int, depth: float, velocity: float) -> bytes:
+        return motion(type_name, stamp, sign * velocity, **{axis[-1]: sign * depth})
 
     path = write_mcap(tmp_path / 'run.mcap', recorded(type_name, make))
     assert said in identified(path, '--motion-axis', axis)
@@ -491,11 +493,11 @@ def test_control_characters_in_names_are_escaped(
     evil = '\x1b[31m\x9b2J\u202eevil\u2066\x07\r\n'
     bag, wrenches, motion = tmp_path / f'bag{evil}', f'/w{evil}', f'/j{evil}'
     names = (f'slide{evil}', f'other{evil}')
-    stamps, depth, speed, force = samples()
+    stamps, depth, velocity, force = samples()
     with BagWriter(bag) as writer:
         writer.add_topic(wrenches, WRENCH)
         writer.add_topic(motion, JOINTS)
-        for at, d, v, f in zip(stamps.tolist(), depth, speed, force, strict=True):
+        for at, d, v, f in zip(stamps.tolist(), depth, velocity, force, strict=True):
             writer.write(wrenches, wrench(at, f), at)
             writer.write(motion, joints(at, d, v, names), at)
     # With two joints, their names are listed.

@@ -36,10 +36,10 @@ def law(
     """Build a recording of equation (15) with absolute speed [m/s] over time [s]."""
     time = np.arange(round(duration * 250)) / 250.0
     way = np.where(time < duration / 2.0, 1.0, -1.0) if both_ways else np.ones_like(time)
-    speed = way * size(time)
-    force = COULOMB * np.sign(speed) + VISCOUS * speed + offset
+    velocity = way * size(time)
+    force = COULOMB * np.sign(velocity) + VISCOUS * velocity + offset
     return Recording(
-        name='law', time=time, depth=np.cumsum(speed) / 250.0, speed=speed, force=force
+        name='law', time=time, depth=np.cumsum(velocity) / 250.0, velocity=velocity, force=force
     )
 
 
@@ -102,9 +102,9 @@ def test_confidence_intervals_have_their_coverage(recorded: dict[str, float]) ->
     for name, truth in truths.items():
         found = [run.breakaway if name == 'breakaway_force' else run[name] for run in runs]
         values, errors = np.array([(p.value, p.error) for p in found]).T
-        held = [p.interval[0] <= truth <= p.interval[1] for p in found]
+        covered = [p.interval[0] <= truth <= p.interval[1] for p in found]
         # Three standard deviations of a binomial of 100 trials at 95 % are 6.5 %.
-        assert np.mean(held) >= 0.885
+        assert np.mean(covered) >= 0.885
         # A standard deviation from 100 values has an error of 7 %: three of these.
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.21)
 
@@ -124,7 +124,7 @@ def test_friction_scales_with_the_force() -> None:
 def test_reversed_axes_give_the_same_friction() -> None:
     recording = strokes(seed=2, offset=0.1)
     mirrored = replace(
-        recording, force=-recording.force, speed=-recording.speed, depth=-recording.depth
+        recording, force=-recording.force, velocity=-recording.velocity, depth=-recording.depth
     )
     one = identify_friction(recording, settings('offset'))
     other = identify_friction(mirrored, settings('offset'))
@@ -196,7 +196,7 @@ def test_drift_and_direction_are_distinguished(drift: float, withdrawal: float, 
             name='drifting',
             time=made.time,
             depth=made.depth,
-            speed=made.speed,
+            velocity=made.velocity,
             force=made.force + drift * (made.time - made.time[0]),
         )
         found = identify_friction(recording)
@@ -235,10 +235,12 @@ def test_false_alarms_are_rare() -> None:
 
 def test_the_error_of_the_mass_allows_for_wrong_stamps() -> None:
     time = np.arange(5000) / 250.0
-    speed = 8e-3 * np.sin(2.0 * np.pi * 0.5 * time) + 6e-3 * np.sin(2.0 * np.pi * 0.31 * time)
-    force = COULOMB * np.sign(speed) + 20.0 * np.gradient(speed, time) + 5.0 * speed
+    velocity = 8e-3 * np.sin(2.0 * np.pi * 0.5 * time) + 6e-3 * np.sin(2.0 * np.pi * 0.31 * time)
+    force = COULOMB * np.sign(velocity) + 20.0 * np.gradient(velocity, time) + 5.0 * velocity
     force = force + np.random.default_rng(0).normal(scale=0.01, size=5000)
-    recording = Recording(name='shaken', time=time, depth=0.0 * time, speed=speed, force=force)
+    recording = Recording(
+        name='shaken', time=time, depth=0.0 * time, velocity=velocity, force=force
+    )
     found = identify_friction(recording, settings('inertia', largest_acceleration=1.0))
     assert within(found['moving_mass'], 20.0)
     # A sampling period of 4 ms, uniformly distributed, times mu_v.
@@ -250,11 +252,11 @@ def test_the_error_of_the_mass_allows_for_wrong_stamps() -> None:
 @pytest.mark.parametrize('lag', [0.008, -0.05, 0.1])
 def test_a_lag_is_estimated_and_corrected(lag: float) -> None:
     time = np.arange(4000) / 250.0
-    speed = 8e-3 * np.sin(2.0 * np.pi * 0.3 * time) + 5e-3 * np.sin(2.0 * np.pi * 0.47 * time)
-    shown = np.interp(time - lag, time, speed)
+    velocity = 8e-3 * np.sin(2.0 * np.pi * 0.3 * time) + 5e-3 * np.sin(2.0 * np.pi * 0.47 * time)
+    shown = np.interp(time - lag, time, velocity)
     force = COULOMB * np.sign(shown) + VISCOUS * shown
     force = force + np.random.default_rng(0).normal(scale=0.01, size=4000)
-    recording = Recording(name='late', time=time, depth=0.0 * time, speed=speed, force=force)
+    recording = Recording(name='late', time=time, depth=0.0 * time, velocity=velocity, force=force)
     found = identify_friction(recording)
     assert within(found.lag, lag)
     assert found.lag.error < 2e-4
@@ -264,16 +266,16 @@ def test_a_lag_is_estimated_and_corrected(lag: float) -> None:
 
 
 def steps(rate: float, lag: float) -> Recording:
-    """Build strokes of constant speed, without acceleration, with a delayed force."""
+    """Build strokes of constant velocity, without acceleration, with a delayed force."""
     legs = [leg for v in SPEEDS for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))]
-    speed = np.repeat([v for v, _ in legs], [round(rate * duration) for _, duration in legs])
-    shown = np.roll(speed, round(lag * rate))
-    noise = np.random.default_rng(0).normal(scale=0.01, size=len(speed))
+    velocity = np.repeat([v for v, _ in legs], [round(rate * duration) for _, duration in legs])
+    shown = np.roll(velocity, round(lag * rate))
+    noise = np.random.default_rng(0).normal(scale=0.01, size=len(velocity))
     return Recording(
         name='steps',
-        time=np.arange(len(speed)) / rate,
-        depth=np.cumsum(speed) / rate,
-        speed=speed,
+        time=np.arange(len(velocity)) / rate,
+        depth=np.cumsum(velocity) / rate,
+        velocity=velocity,
         force=COULOMB * np.sign(shown) + VISCOUS * shown + noise,
     )
 
@@ -293,27 +295,27 @@ def test_a_large_lag_of_steady_strokes_is_corrected(rate: float, lag: float) -> 
 def eased(rate: float, lag: float, seed: int) -> Recording:
     """Build strokes with velocity ramps of 0.05 s, sampled at arbitrary times."""
     corners = [(0.0, 0.0)]
-    for speed in (way * v for v in SPEEDS for way in (1.0, -1.0)):
+    for velocity in (way * v for v in SPEEDS for way in (1.0, -1.0)):
         start = corners[-1][0]
         corners += [
-            (start + at, v) for at, v in ((0.15, 0), (0.2, speed), (0.85, speed), (0.9, 0))
+            (start + at, v) for at, v in ((0.15, 0), (0.2, velocity), (0.85, velocity), (0.9, 0))
         ]
-    times, speeds = np.array(corners).T
+    times, velocities = np.array(corners).T
     rng = np.random.default_rng(seed)
     time = rng.uniform(0.0, 1.0 / rate) + np.arange(round(times[-1] * rate)) / rate
-    speed, shown = (np.interp(at, times, speeds) for at in (time, time - lag))
+    velocity, shown = (np.interp(at, times, velocities) for at in (time, time - lag))
     force = COULOMB * np.sign(shown) + VISCOUS * shown + rng.normal(scale=0.01, size=len(time))
     return Recording(
-        name='eased', time=time, depth=np.cumsum(speed) / rate, speed=speed, force=force
+        name='eased', time=time, depth=np.cumsum(velocity) / rate, velocity=velocity, force=force
     )
 
 
 @pytest.mark.parametrize(('rate', 'surest'), [(250.0, 0.0), (100.0, 5e-4)])
 def test_the_error_of_the_lag_includes_the_sampling_period(rate: float, surest: float) -> None:
     found = [identify_friction(eased(rate, 2.24e-3, seed)).lag for seed in range(60)]
-    held = [lag.interval[0] <= 2.24e-3 <= lag.interval[1] for lag in found]
+    covered = [lag.interval[0] <= 2.24e-3 <= lag.interval[1] for lag in found]
     # Three standard deviations of a binomial of 60 trials at 95 % are 8.4 %.
-    assert np.mean(held) >= 0.866
+    assert np.mean(covered) >= 0.866
     assert all(surest < lag.error < 2e-3 for lag in found)
 
 
@@ -325,16 +327,16 @@ def test_velocity_steps_do_not_determine_the_lag() -> None:
 
 def test_the_lag_is_not_determined_by_positions_only() -> None:
     recording = strokes(seed=14, lag=0.02)
-    found = identify_friction(replace(recording, speed=None))
+    found = identify_friction(replace(recording, velocity=None))
     assert found.lag is None
     # The lag is corrected and reported.
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     assert any(' behind the motion' in words for words in found.warnings)
 
 
-def test_a_force_independent_of_the_speed_does_not_determine_the_lag() -> None:
+def test_a_force_independent_of_the_velocity_does_not_determine_the_lag() -> None:
     recording = strokes(seed=14, speeds=SPEEDS[:3], push=0.0)
-    dry = replace(recording, force=recording.force - (VISCOUS - 0.3) * recording.speed)
+    dry = replace(recording, force=recording.force - (VISCOUS - 0.3) * recording.velocity)
     found = identify_friction(dry)
     assert not found.lag.determined
     assert found.lag.interval == (-np.inf, np.inf)
@@ -345,7 +347,7 @@ def test_positions_only_give_the_same_friction() -> None:
     recording = strokes(seed=5)
     both = identify_friction(recording)
     counted = 1e-6 * np.round(recording.depth / 1e-6)
-    alone = identify_friction(replace(recording, speed=None, depth=counted))
+    alone = identify_friction(replace(recording, velocity=None, depth=counted))
     for name in TRUTH:
         # The noise of the force is the same.
         assert abs(alone[name].value - both[name].value) < both[name].error
@@ -356,11 +358,11 @@ def test_total_least_squares_corrects_for_velocity_noise() -> None:
     """Speeds with small differences, so that noise is a large fraction of their variation."""
     rng = np.random.default_rng(1)
     recording = law(lambda time: 3e-3 + varied(time), duration=80.0)
-    speed = recording.speed + 1e-3 * rng.normal(size=20_000)
+    velocity = recording.velocity + 1e-3 * rng.normal(size=20_000)
     noisy = replace(
         recording,
-        depth=np.cumsum(speed) / 250.0,
-        speed=speed,
+        depth=np.cumsum(velocity) / 250.0,
+        velocity=velocity,
         force=recording.force + 0.01 * rng.normal(size=20_000),
     )
     ordinary = identify_friction(noisy, FrictionSettings(estimator='ordinary'))
@@ -465,13 +467,13 @@ def test_lost_samples_and_start_time_do_not_change_the_result() -> None:
             name='part',
             time=recording.time[kept] + 100.0,
             depth=recording.depth[kept],
-            speed=recording.speed[kept],
+            velocity=recording.velocity[kept],
             force=recording.force[kept],
         )
     )
     assert part.samples < whole.samples
     for name, truth in TRUTH.items():
-        # Interpolated samples add misfit where the speed changes.
+        # Interpolated samples add misfit where the velocity changes.
         assert abs(part[name].value - truth) < 5.0 * whole[name].error
 
 
@@ -485,7 +487,7 @@ def test_friction_is_independent_of_the_sampling_rate(rate: float) -> None:
         time=time,
         **{
             name: np.interp(time, recording.time, getattr(recording, name))
-            for name in ('depth', 'speed', 'force')
+            for name in ('depth', 'velocity', 'force')
         },
     )
     found = identify_friction(changed)

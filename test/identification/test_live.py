@@ -16,7 +16,7 @@ LEGS = tuple(
 RECORDING = simulated(LEGS, sensor=IDEAL)
 STAMPS = np.round(RECORDING.time * 1e9).astype(int) + 1_700_000_000_000_000_000
 SAMPLES = list(
-    zip(STAMPS.tolist(), RECORDING.depth, RECORDING.speed, RECORDING.force, strict=True)
+    zip(STAMPS.tolist(), RECORDING.depth, RECORDING.velocity, RECORDING.force, strict=True)
 )
 
 
@@ -24,12 +24,12 @@ def feed(
     live: LiveFriction,
     samples: list[tuple[int, float, float, float]] = SAMPLES,
     shift: int = 0,
-    speeds: bool = True,
+    velocities: bool = True,
 ) -> None:
     """Feed a recording as two topics, with a small delay of the motion."""
-    for stamp, depth, speed, force in samples:
+    for stamp, depth, velocity, force in samples:
         live.take_force(stamp, force)
-        live.take_motion(stamp + shift, depth, speed if speeds else None)
+        live.take_motion(stamp + shift, depth, velocity if velocities else None)
 
 
 def make() -> LiveFriction:
@@ -65,35 +65,35 @@ def test_motion_between_the_stamps_of_the_force_is_interpolated() -> None:
     live = make()
     feed(live, shift=-1_300_000)
     assert live.samples >= len(SAMPLES) - 2
-    # The interpolated speed is wrong only in the ramps, where no sample is used.
+    # The interpolated velocity is wrong only in the ramps, where no sample is used.
     check(live, 0.02)
 
 
 def test_positions_without_velocity_are_differentiated() -> None:
     """The velocity at the middle of two positions is their slope."""
     live = make()
-    feed(live, speeds=False)
+    feed(live, velocities=False)
     check(live, 0.02)
 
 
 @pytest.mark.parametrize(
     ('value', 'kind'),
-    [(nan, 'not finite'), (inf, 'not finite'), (-1e300, 'absurd'), (2e4, 'absurd')],
+    [(nan, 'not finite'), (inf, 'not finite'), (-1e300, 'implausible'), (2e4, 'implausible')],
 )
 def test_implausible_values_are_discarded_and_counted(value: float, kind: str) -> None:
     """A temporary failure of a sensor does not change the estimate."""
     live = make()
-    for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
+    for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
         live.take_force(stamp, value if k % 50 == 0 else force)
-        live.take_motion(stamp, depth, value if k % 75 == 0 else speed)
+        live.take_motion(stamp, depth, value if k % 75 == 0 else velocity)
     assert live.dropped[kind] == -(-len(SAMPLES) // 50) - (-len(SAMPLES) // 75)
     check(live, 0.02)
 
 
 def test_late_and_repeated_stamps_are_discarded() -> None:
     live = make()
-    for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
-        live.take_motion(stamp, depth, speed)
+    for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
+        live.take_motion(stamp, depth, velocity)
         live.take_force(stamp, force)
         if k % 10 == 0:
             live.take_force(stamp, 1e3)
@@ -118,10 +118,10 @@ def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
     """The motion is unknown during a gap of the encoder."""
     live = make()
     gap = range(400, 500)
-    for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
+    for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
         live.take_force(stamp, force)
         if k not in gap:
-            live.take_motion(stamp, depth, speed)
+            live.take_motion(stamp, depth, velocity)
     assert live.dropped == {'no motion at their time': len(gap)}
     check(live, 0.02)
 

@@ -31,11 +31,11 @@ def test_parts_contain_each_used_sample_exactly_once(used: list[bool], length: i
     if not chosen.any():
         return
     parts = divided(chosen, length)
-    held = np.zeros(len(chosen), dtype=int)
+    counts = np.zeros(len(chosen), dtype=int)
     for start, end in parts.limits:
         assert start < end
-        held[start:end] += 1
-    assert_array_equal(held, chosen.astype(int))
+        counts[start:end] += 1
+    assert_array_equal(counts, chosen.astype(int))
     assert_allclose(parts.sums(np.ones(len(chosen))), parts.sizes)
     # The longest part is half as long again, rounded up.
     assert parts.sizes.max() <= np.ceil(1.5 * length)
@@ -173,18 +173,18 @@ def test_intervals_have_their_coverage_for_any_correlation_time(length: float) -
     # Equal motion in both directions, as required for friction: excludes an offset.
     x = np.column_stack([slow, slow * (1.0 + np.arange(n) % 200 / 200.0)])
     truth = np.array([0.5, 2.0])
-    held = {False: np.zeros(2), True: np.zeros(2)}
+    covered = {False: np.zeros(2), True: np.zeros(2)}
     for seed in range(trials):
         rng = np.random.default_rng(seed)
         noise = 0.1 * rng.standard_normal(n) + (colored(rng, n, length) if length else 0.0)
         y = x @ truth + noise
-        for allowed in held:
+        for allowed in covered:
             low, high = regress(x, y, correlation=LENGTH, colored=allowed).interval().T
-            held[allowed] += (low <= truth) & (truth <= high)
+            covered[allowed] += (low <= truth) & (truth <= high)
     # 95 % of 200, with three standard deviations (1.5 % each), too wide for a random walk.
-    assert (held[True] / trials >= 0.9).all()
+    assert (covered[True] / trials >= 0.9).all()
     if length == 100.0:
-        assert (held[False] / trials < 0.85).all()
+        assert (covered[False] / trials < 0.85).all()
 
 
 def test_exact_data_and_few_data_give_white_noise() -> None:

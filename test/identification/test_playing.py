@@ -107,7 +107,7 @@ def test_a_damaged_receive_time_ends_the_playback(tmp_path: Path, damaged: int) 
         assert len(play.take()) == 1
     with pytest.raises(RecordingError, match='has a damaged receive time') as caught:
         play.is_due()
-    assert 'a message of /a came 1.16e+04 days later' in str(caught.value)
+    assert 'a message of /a arrives 1.16e+04 days later' in str(caught.value)
 
 
 def test_offered_qos_is_stored(tmp_path: Path) -> None:

@@ -70,14 +70,14 @@ def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
     return bytes(STORE.serialize_cdr(message_type(type_name)(header(stamp), *parts), type_name))
 
 
-def moving(type_name: str, stamp: int, depth: float, speed: float) -> bytes:
+def moving(type_name: str, stamp: int, depth: float, velocity: float) -> bytes:
     """Serialize a motion along y in each type of message."""
     if type_name == MOTION:
-        return joint_states(stamp, depth, speed)
+        return joint_states(stamp, depth, velocity)
     if type_name == ODOMETRY:
-        return odometry(stamp, (0.0, depth, 0.0), (0.0, speed, 0.0))
+        return odometry(stamp, (0.0, depth, 0.0), (0.0, velocity, 0.0))
     if type_name == TWIST:
-        return serialized(TWIST, stamp, twist((0.0, speed, 0.0)))
+        return serialized(TWIST, stamp, twist((0.0, velocity, 0.0)))
     if type_name == POSE:
         return serialized(POSE, stamp, pose((0.0, depth, 0.0)))
     return serialized(POINT, stamp, message_type('geometry_msgs/msg/Point')(0.0, depth, 0.0))
@@ -103,7 +103,7 @@ def small_bag(
     motions: Sequence[tuple[int, float, float]] = (),
     joint_names: tuple[str, ...] = ('insertion',),
 ) -> Path:
-    """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
+    """Write (stamp, value) wrenches and (stamp, depth, velocity) motions, in ms of Unix time."""
     return write(
         path,
         {
@@ -151,7 +151,7 @@ def test_the_joint_can_be_chosen(tmp_path: Path) -> None:
         read_friction_recording(path)
     one, other = (read_friction_recording(path, motion_axis=axis) for axis in ('slide', '-slide'))
     assert_array_equal(one.depth, -other.depth)
-    assert_array_equal(one.speed, -other.speed)
+    assert_array_equal(one.velocity, -other.velocity)
     alone = small_bag(tmp_path / 'alone', *grid(), joint_names=('slide',))
     assert_array_equal(read_friction_recording(alone).depth, one.depth)
 
@@ -163,16 +163,16 @@ def test_motion_is_interpolated_to_the_stamps_of_the_force(tmp_path: Path) -> No
     assert_allclose(read.depth, 0.1005 + 0.001 * np.arange(10), rtol=1e-12)
 
 
-def test_a_missing_speed_is_reported(tmp_path: Path) -> None:
+def test_a_missing_velocity_is_reported(tmp_path: Path) -> None:
     wrenches, motions = grid()
     for name, value in (('empty', None), ('nan', float('nan'))):
         path = small_bag(tmp_path / name, wrenches, [(t, d, value) for t, d, _ in motions])
         read = read_friction_recording(path)
-        assert read.speed is None
+        assert read.velocity is None
         assert read.losses == ('/joints has no velocity',)
     path = small_bag(tmp_path / 'zero', wrenches, [(t, d, 0.0) for t, d, _ in motions])
     read = read_friction_recording(path)
-    assert read.speed is None
+    assert read.velocity is None
     assert read.losses == ('/joints moves with the velocity 0, which is left out',)
 
 
@@ -180,7 +180,7 @@ def test_samples_without_velocity_are_discarded_if_most_have_a_velocity(tmp_path
     wrenches, motions = grid()
     motions[4] = (40, 0.104, None)
     read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
-    assert_array_equal(read.speed, 0.1)
+    assert_array_equal(read.velocity, 0.1)
     assert read.losses == ('1 of /joints without velocity, left out',)
 
 
@@ -251,9 +251,9 @@ def test_motion_is_independent_of_the_message_type(tmp_path: Path, type_name: st
         # 1e-12: rounding of sums and differences near 0.1.
         assert_allclose(read.depth, sign * (begin + 0.001 * np.arange(11)), atol=1e-12)
         if type_name in (POSE, POINT):
-            assert read.speed is None
+            assert read.velocity is None
         else:
-            assert_allclose(read.speed, sign * 0.1, rtol=1e-12)
+            assert_allclose(read.velocity, sign * 0.1, rtol=1e-12)
     said = {
         POSE: ('/robot has no velocity',),
         POINT: ('/robot has no velocity',),
@@ -269,7 +269,7 @@ def test_the_velocity_of_an_odometry_is_rotated_from_the_body_frame(tmp_path: Pa
     ]
     path = write(tmp_path / 'bag', {'/ft': forces(), '/odom': (ODOMETRY, motions)})
     # 1e-12: rounding of the quaternion.
-    assert_allclose(read_friction_recording(path).speed, 0.1, rtol=1e-12)
+    assert_allclose(read_friction_recording(path).velocity, 0.1, rtol=1e-12)
 
 
 def test_joints_may_change_order_and_publisher(tmp_path: Path) -> None:
@@ -396,9 +396,9 @@ def test_the_last_configuration_of_the_plant_is_read(tmp_path: Path) -> None:
             writer.add_topic(topic, kind)
         for data in (text('old'), text('new')):
             writer.write('/plant/configuration', data, EPOCH)
-        for (t, force), (_, depth, speed) in zip(wrenches, motions, strict=True):
+        for (t, force), (_, depth, velocity) in zip(wrenches, motions, strict=True):
             writer.write('/ft', wrench(at(t), force), at(t))
-            writer.write('/joints', joint_states(at(t), depth, speed), at(t))
+            writer.write('/joints', joint_states(at(t), depth, velocity), at(t))
     assert read_friction_recording(tmp_path / 'bag').configuration == 'new'
 
 
@@ -450,9 +450,9 @@ def test_invalid_receive_times_do_not_change_stamps(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
-        for (t, force), (_, depth, speed) in zip(wrenches[5:], motions[:-1], strict=False):
+        for (t, force), (_, depth, velocity) in zip(wrenches[5:], motions[:-1], strict=False):
             writer.write('/ft', wrench(at(100 * t), force), 0)
-            writer.write('/joints', joint_states(at(100 * t - 3000), depth, speed), 0)
+            writer.write('/joints', joint_states(at(100 * t - 3000), depth, velocity), 0)
     assert read_friction_recording(tmp_path / 'bag').clock_offset == 0.0
 
 

@@ -9,7 +9,7 @@ import pytest
 
 
 def recording(**changes: Any) -> Recording:
-    names = ('time', 'depth', 'speed', 'force')
+    names = ('time', 'depth', 'velocity', 'force')
     fields: dict[str, Any] = {name: np.array([0.0, 1.0, 2.0]) for name in names}
     return Recording(name='it', **{**fields, **changes})
 
@@ -19,7 +19,7 @@ def recording(**changes: Any) -> Recording:
     [
         ({'force': np.zeros(2)}, r'force must have the shape \(n,\) .*, got \(2,\) and \(3,\)'),
         ({'depth': np.zeros((3, 1))}, r'depth must have the shape'),
-        ({'speed': np.array([0.0, np.nan, 0.0])}, 'speed must be finite'),
+        ({'velocity': np.array([0.0, np.nan, 0.0])}, 'velocity must be finite'),
         ({'time': np.array([0.0, 1.0, 1.0])}, 'time must increase strictly'),
     ],
 )
@@ -48,15 +48,15 @@ def test_true_values_are_read_from_the_plant_configuration() -> None:
 
 
 def test_only_the_velocity_may_be_missing() -> None:
-    assert recording(speed=None).speed is None
+    assert recording(velocity=None).velocity is None
     with pytest.raises(ShapeError, match='force must have the shape'):
         recording(force=None)
 
 
-def test_without_depth_the_speed_is_integrated() -> None:
-    made = Recording(time=[0.0, 1.0, 3.0], speed=[0.0, 1.0, 1.0], force=[0.0, 0.0, 0.0])  # type: ignore[arg-type]
+def test_without_depth_the_velocity_is_integrated() -> None:
+    made = Recording(time=[0.0, 1.0, 3.0], velocity=[0.0, 1.0, 1.0], force=[0.0, 0.0, 0.0])  # type: ignore[arg-type]
     assert made.depth.tolist() == [0.0, 0.5, 2.5]
-    with pytest.raises(ShapeError, match='speed or depth must be given'):
+    with pytest.raises(ShapeError, match='velocity or depth must be given'):
         Recording(time=np.arange(3.0), force=np.zeros(3))
 
 

@@ -17,7 +17,7 @@ def fed(
     recording: Recording, forgetting: float = 8.0, settings: FrictionSettings | None = None
 ) -> RecursiveFriction:
     running = RecursiveFriction(settings or FrictionSettings(), RATE, forgetting)
-    for row in zip(recording.time, recording.speed, recording.force, strict=True):
+    for row in zip(recording.time, recording.velocity, recording.force, strict=True):
         running.update(*row)
     return running
 
@@ -27,7 +27,7 @@ def joined(*recordings: Recording) -> Recording:
     time = np.arange(sum(len(r.time) for r in recordings)) / RATE
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(r, name) for r in recordings])
-        for name in ('depth', 'speed', 'force')
+        for name in ('depth', 'velocity', 'force')
     }
     return replace(recordings[0], time=time, **columns)
 
@@ -39,15 +39,15 @@ class Weighed(RecursiveFriction):
         super().__init__(*args)
         self.rows: list[tuple[float, float, float, float]] = []
 
-    def _learn(self, speed: float, acceleration: float, force: float) -> None:
-        self.rows.append((np.sign(speed), speed, acceleration, force))
-        super()._learn(speed, acceleration, force)
+    def _learn(self, velocity: float, acceleration: float, force: float) -> None:
+        self.rows.append((np.sign(velocity), velocity, acceleration, force))
+        super()._learn(velocity, acceleration, force)
 
 
 def test_recursive_estimates_equal_weighted_least_squares() -> None:
     recording = strokes(seed=1)
     running = Weighed(FrictionSettings(), RATE, 3.0)
-    for row in zip(recording.time, recording.speed, recording.force, strict=True):
+    for row in zip(recording.time, recording.velocity, recording.force, strict=True):
         running.update(*row)
     rows = np.array(running.rows)
     root = np.exp(-0.5 * np.arange(len(rows))[::-1] / RATE / 3.0)[:, np.newaxis]
@@ -69,7 +69,7 @@ def test_exact_friction_is_recovered_recursively(lag: float) -> None:
 def test_a_step_is_tracked_within_the_forgetting_time() -> None:
     slippery = strokes(seed=2, push=0.0)
     rough = strokes(seed=3, push=0.0)
-    rough = replace(rough, force=rough.force + 0.2 * np.sign(rough.speed))
+    rough = replace(rough, force=rough.force + 0.2 * np.sign(rough.velocity))
     forgetting = 2.0
     before = fed(slippery, forgetting).estimate()[0]
     after = fed(joined(slippery, rough), forgetting).estimate()[0]
@@ -84,9 +84,9 @@ def test_intervals_have_their_coverage() -> None:
     estimates = [fed(strokes(seed=seed)).estimate() for seed in range(40)]
     for k, truth in enumerate((COULOMB, VISCOUS)):
         values, errors = np.array([(e[k].value, e[k].error) for e in estimates]).T
-        held = [e[k].interval[0] <= truth <= e[k].interval[1] for e in estimates]
+        covered = [e[k].interval[0] <= truth <= e[k].interval[1] for e in estimates]
         # Three standard deviations of a binomial of 40 trials at 95 % are 10.3 %.
-        assert np.mean(held) >= 0.847
+        assert np.mean(covered) >= 0.847
         # A standard deviation from 40 values has an error of 11 %: three of these.
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.34)
 
@@ -96,14 +96,14 @@ def test_parameters_are_determined_only_after_sufficient_motion() -> None:
     running = RecursiveFriction(FrictionSettings(), RATE, 8.0)
     assert not any(p.determined for p in running.estimate())
     known = []
-    for row in zip(recording.time, recording.speed, recording.force, strict=True):
+    for row in zip(recording.time, recording.velocity, recording.force, strict=True):
         running.update(*row)
         known.append(
             all(p.determined for p in running.estimate()) if row[0] % 0.2 < 4e-3 else None
         )
-    seen = [k for k in known if k is not None]
-    assert not seen[0]
-    assert seen[-1]
+    determined = [k for k in known if k is not None]
+    assert not determined[0]
+    assert determined[-1]
     one_speed = fed(strokes(seed=1, push=0.0, speeds=(5e-3,) * 5)).estimate()
     assert not any(p.determined for p in one_speed)
     assert all(p.interval == (-np.inf, np.inf) for p in one_speed)
@@ -112,7 +112,7 @@ def test_parameters_are_determined_only_after_sufficient_motion() -> None:
 def test_there_is_no_forgetting_at_rest() -> None:
     recording = strokes(seed=4)
     rest = replace(
-        recording, speed=np.zeros_like(recording.speed), force=np.zeros_like(recording.force)
+        recording, velocity=np.zeros_like(recording.velocity), force=np.zeros_like(recording.force)
     )
     one, other = fed(recording, 2.0).estimate(), fed(joined(recording, rest), 2.0).estimate()
     assert_allclose([p.value for p in other], [p.value for p in one], rtol=1e-9)
@@ -125,7 +125,7 @@ def test_gaps_and_nonfinite_values_are_ignored() -> None:
     running = RecursiveFriction(FrictionSettings(), RATE, 8.0)
     for k in np.flatnonzero(kept):
         force = np.nan if k == 1000 else recording.force[k]
-        running.update(recording.time[k], recording.speed[k], force)
+        running.update(recording.time[k], recording.velocity[k], force)
     for found, truth in zip(running.estimate(), (COULOMB, VISCOUS), strict=True):
         assert abs(found.value - truth) < 4.0 * found.error
 

@@ -5,13 +5,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, ParameterError, ShapeError
-from needle_identification import (
-    ESTIMATORS,
-    IdentificationError,
-    ParameterEstimate,
-    regress,
-    statistic,
-)
+from needle_identification import ESTIMATORS, IdentificationError, ParameterEstimate, regress
+from needle_identification.estimation.estimate import statistic
 from needle_identification.estimation.regression import Regression, wald_test
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -176,8 +171,8 @@ def test_only_collinear_parameters_are_not_determined(estimator: str) -> None:
 @pytest.mark.parametrize(('spread', 'determined'), [(0.05, False), (0.3, True)])
 def test_nearly_collinear_parameters_are_not_determined(spread: float, determined: bool) -> None:
     rng = np.random.default_rng(0)
-    speed = 5e-3 * (1.0 + spread * rng.normal(size=1000))
-    x = np.column_stack([np.ones(1000), speed])
+    velocity = 5e-3 * (1.0 + spread * rng.normal(size=1000))
+    x = np.column_stack([np.ones(1000), velocity])
     found = regress(x, x @ [0.56, 300.0])
     assert (found.determined == determined).all()
 

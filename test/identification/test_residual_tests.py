@@ -16,13 +16,13 @@ COUNT, LENGTH = 200, 25
 WHITE = Memory(inflation=np.ones(2), far=np.ones(2), length=0.0, ratio=0.0)
 
 
-def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]:
+def results_of(means: FloatArray, velocities: FloatArray) -> dict[str, ResidualTest]:
     """Test a residual with constant values per part."""
-    residual, speed = (np.repeat(values, LENGTH) for values in (means, speeds))
+    residual, velocity = (np.repeat(values, LENGTH) for values in (means, velocities))
     found = residual_tests(
         residual,
         time=np.arange(len(residual), dtype=np.float64),
-        speed=speed,
+        velocity=velocity,
         parts=divided(np.ones(len(residual), dtype=np.bool_), LENGTH),
         memory=WHITE,
         parameters=2,
@@ -34,10 +34,10 @@ def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]
 @pytest.mark.parametrize('power', [1, 3])
 def test_statistics_and_p_values_equal_scipy(seed: int, power: int) -> None:
     rng = np.random.default_rng(seed)
-    means, speeds = rng.normal(size=(2, COUNT))
+    means, velocities = rng.normal(size=(2, COUNT))
     means = means**power
-    found = results_of(means, speeds)
-    groups = [means[group] for group in np.array_split(np.argsort(speeds), 10)]
+    found = results_of(means, velocities)
+    groups = [means[group] for group in np.array_split(np.argsort(velocities), 10)]
     expected = {
         'normality': stats.normaltest(means),
         'trend': stats.spearmanr(np.arange(COUNT), means),
@@ -55,25 +55,25 @@ def test_equal_values_share_their_rank() -> None:
 
 
 def test_few_parts_are_tested_for_normality_by_shapiro_and_wilk() -> None:
-    means, speeds = np.random.default_rng(0).normal(size=(2, 15))
+    means, velocities = np.random.default_rng(0).normal(size=(2, 15))
     # 1e-9: rounding of the means over parts.
     assert_allclose(
-        results_of(means, speeds)['normality'].p_value, stats.shapiro(means).pvalue, rtol=1e-9
+        results_of(means, velocities)['normality'].p_value, stats.shapiro(means).pvalue, rtol=1e-9
     )
 
 
 @pytest.mark.parametrize('name', ['normality', 'trend', 'speed', 'spread'])
 def test_each_test_detects_its_own_fault(name: str) -> None:
     rng = np.random.default_rng(1)
-    noise, speeds = rng.normal(size=(2, COUNT))
+    noise, velocities = rng.normal(size=(2, COUNT))
     faulty = {
         'normality': noise**3,
         'trend': noise + np.linspace(-1.0, 1.0, COUNT),
-        'speed': noise + speeds**2,
-        'spread': noise * np.exp(speeds),
+        'speed': noise + velocities**2,
+        'spread': noise * np.exp(velocities),
     }
-    assert not any(test.failed for test in results_of(noise, speeds).values())
-    assert results_of(faulty[name], speeds)[name].failed
+    assert not any(test.failed for test in results_of(noise, velocities).values())
+    assert results_of(faulty[name], velocities)[name].failed
 
 
 def test_too_few_parts_are_not_tested() -> None:

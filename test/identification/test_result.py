@@ -9,13 +9,12 @@ from needle_dynamics import NeedleParameters, ParameterError
 from needle_identification import (
     FrictionSummary,
     IdentificationError,
-    result_yaml,
     Statistic,
     StiffnessSummary,
     write_result,
 )
 from needle_identification.estimation.formatting import between, measured, rounded, UNKNOWN
-from needle_identification.result import model_parameters
+from needle_identification.result import model_parameters, result_yaml
 from needle_ros.settings import from_values
 import pytest
 import yaml

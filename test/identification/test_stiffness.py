@@ -155,18 +155,18 @@ def test_rotating_the_axes_rotates_the_matrix(matrix: FloatArray, angle: float) 
     recording = pressed(matrix, grid((1.2,)))
     (level,) = identify_stiffness(recording).levels
     other, turn = turned(recording, angle)
-    (seen,) = identify_stiffness(other).levels
+    (turned_level,) = identify_stiffness(other).levels
     # 1e-7: ten times the rounding of a reading, since some matrices amplify it.
     size = float(np.linalg.norm(matrix))
-    assert_allclose(seen.matrix, turn @ level.matrix @ turn.T, atol=1e-7 * size)
-    assert_allclose(seen.curl.value, level.curl.value, atol=1e-7 * size)
-    assert_allclose(seen.spring.value, level.spring.value, atol=1e-7)
+    assert_allclose(turned_level.matrix, turn @ level.matrix @ turn.T, atol=1e-7 * size)
+    assert_allclose(turned_level.curl.value, level.curl.value, atol=1e-7 * size)
+    assert_allclose(turned_level.spring.value, level.spring.value, atol=1e-7)
 
 
 def test_a_quarter_turn_keeps_the_errors() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     (level,) = identify_stiffness(recording).levels
-    (seen,) = identify_stiffness(turned(recording, np.pi / 2.0)[0]).levels
+    (turned_level,) = identify_stiffness(turned(recording, np.pi / 2.0)[0]).levels
     for name, other in (
         ('k_xx', 'k_zz'),
         ('k_zz', 'k_xx'),
@@ -175,8 +175,8 @@ def test_a_quarter_turn_keeps_the_errors() -> None:
         ('principal_stiffness_1', 'principal_stiffness_1'),
     ):
         # 1e-6: a quarter turn swaps the axes, up to rounding.
-        assert_allclose(seen[name].value, level[other].value, rtol=1e-6)
-        assert_allclose(seen[name].interval, level[other].interval, rtol=1e-6)
+        assert_allclose(turned_level[name].value, level[other].value, rtol=1e-6)
+        assert_allclose(turned_level[name].interval, level[other].interval, rtol=1e-6)
 
 
 def test_units_scale_the_matrix_and_its_errors() -> None:
@@ -386,10 +386,10 @@ def test_a_press_without_a_hold_is_discarded_and_reported() -> None:
     forces = grid((1.3,))
     exact = pressed(TABLE[1.3], forces)
     force, position = exact.force.copy(), exact.position.copy()
-    held = np.abs(exact.time - 1.65) < 0.15
-    shake = 1.0 + 0.3 * np.sin(2.0 * np.pi * 8.0 * exact.time[held, np.newaxis])
-    force[held] = (force[held] - (0.3, -0.2)) * shake + (0.3, -0.2)
-    position[held] = (position[held] - (0.1, 0.05)) * shake + (0.1, 0.05)
+    hold = np.abs(exact.time - 1.65) < 0.15
+    shake = 1.0 + 0.3 * np.sin(2.0 * np.pi * 8.0 * exact.time[hold, np.newaxis])
+    force[hold] = (force[hold] - (0.3, -0.2)) * shake + (0.3, -0.2)
+    position[hold] = (position[hold] - (0.1, 0.05)) * shake + (0.1, 0.05)
     estimate = identify_stiffness(replace(exact, force=force, position=position))
     assert estimate.levels[0].presses == 7
     assert any('presses left out: 1' in warning for warning in estimate.warnings)

@@ -110,7 +110,9 @@ def test_matlab_files_have_columns_and_factors(run: tuple[Any, Any, Any], tmp_pa
 
 def test_velocities_without_depth_are_integrated(tmp_path: Path) -> None:
     made = strokes(seed=2)
-    path = written(tmp_path, lines('time,vel_mm/s,force', made.time, 1e3 * made.speed, made.force))
+    path = written(
+        tmp_path, lines('time,vel_mm/s,force', made.time, 1e3 * made.velocity, made.force)
+    )
     read = read_friction_recording(path)
     assert any('integral of the speed' in words for words in read.losses)
     found = identify_friction(read)

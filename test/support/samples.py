@@ -43,13 +43,13 @@ def wrench(stamp_ns: int, force: float) -> bytes:
 
 
 def joint_states(
-    stamp_ns: int, depth: float, speed: float | None, names: Sequence[str] = ('insertion',)
+    stamp_ns: int, depth: float, velocity: float | None, names: Sequence[str] = ('insertion',)
 ) -> bytes:
     message = STORE.types[MOTION](
         header(stamp_ns),
         list(names),
         np.array([depth] * len(names)),
-        np.array([] if speed is None else [speed] * len(names)),
+        np.array([] if velocity is None else [velocity] * len(names)),
         np.array([]),
     )
     return bytes(STORE.serialize_cdr(message, MOTION))
@@ -66,14 +66,14 @@ def motion(
     """Move the base of the simulated needle; return depth, velocity and true axial force."""
     integrator = Integrator(TRUTH, [0.17, 0, 0, 0, 0, 0, 0, 0], step=1e-3)
     rows = []
-    for speed, duration in legs:
-        ramp = max(1, round(abs(speed - integrator.velocity) / acceleration * rate))
-        rise = np.linspace(integrator.velocity, speed, ramp + 1)[1:]
-        for target in [*rise, *[speed] * round(duration * rate)]:
+    for velocity, duration in legs:
+        ramp = max(1, round(abs(velocity - integrator.velocity) / acceleration * rate))
+        rise = np.linspace(integrator.velocity, velocity, ramp + 1)[1:]
+        for target in [*rise, *[velocity] * round(duration * rate)]:
             force = integrator.advance_moved(1.0 / rate, target).axial_force
             rows.append((integrator.depth, integrator.velocity, force))
-    depth, speeds, force = np.array(rows).T
-    return depth, speeds, force
+    depth, velocities, force = np.array(rows).T
+    return depth, velocities, force
 
 
 def simulated(
@@ -84,7 +84,7 @@ def simulated(
     seed: int = 0,
 ) -> Recording:
     """Record the simulated needle with a simulated sensor."""
-    depth, speed, force = motion(legs, rate)
+    depth, velocity, force = motion(legs, rate)
     device = ForceSensor(sensor, rate, seed)
     true = np.zeros((len(force), 6))
     true[:, 1] = force
@@ -92,14 +92,14 @@ def simulated(
         name=f'simulated {seed}',
         time=np.arange(len(force)) / rate,
         depth=depth,
-        speed=speed,
+        velocity=velocity,
         force=np.array([device.measure(row)[1] for row in true]),
     )
 
 
 def write_bag(path: Path, recording: Recording, configuration: str = '') -> None:
     """Write a recording with the topics of the plant."""
-    assert recording.speed is not None
+    assert recording.velocity is not None
     with BagWriter(path) as bag:
         bag.add_topic('/base_wrench', WRENCH)
         bag.add_topic('/wrench_command', WRENCH)
@@ -108,11 +108,11 @@ def write_bag(path: Path, recording: Recording, configuration: str = '') -> None
         bag.add_topic('/plant/configuration', TEXT)
         if configuration:
             bag.write('/plant/configuration', text(configuration), EPOCH)
-        for time, depth, speed, force in zip(
-            recording.time, recording.depth, recording.speed, recording.force, strict=True
+        for time, depth, velocity, force in zip(
+            recording.time, recording.depth, recording.velocity, recording.force, strict=True
         ):
             stamp = EPOCH + round(time * 1e9)
             bag.write('/base_wrench', wrench(stamp, force), stamp)
             bag.write('/wrench_command', wrench(stamp, 0.0), stamp)
-            bag.write('/joint_states', joint_states(stamp, depth, speed), stamp)
+            bag.write('/joint_states', joint_states(stamp, depth, velocity), stamp)
             bag.write('/ground_truth', joint_states(stamp, 0.0, 0.0), stamp)

@@ -25,16 +25,16 @@ def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
     rise = rise if push else rise[:0]
     pushed = np.maximum(rise - COULOMB, 0.0) / VISCOUS
     rows = []
-    speed = pushed[-1] if len(pushed) else 0.0
+    velocity = pushed[-1] if len(pushed) else 0.0
     for target, duration in [(0.0, 0.3)] + [
         leg for v in speeds for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))
     ]:
         for _ in range(round(duration / STEP)):
-            change = np.clip(target - speed, -ACCELERATION * STEP, ACCELERATION * STEP)
-            speed = speed + change
+            change = np.clip(target - velocity, -ACCELERATION * STEP, ACCELERATION * STEP)
+            velocity = velocity + change
             # Avoid rounding errors at rest.
-            speed = 0.0 if abs(speed) < 1e-12 else speed
-            rows.append(speed)
+            velocity = 0.0 if abs(velocity) < 1e-12 else velocity
+            rows.append(velocity)
     return np.concatenate([pushed, rows]), rise
 
 
@@ -52,21 +52,25 @@ def strokes(
     cutoff: float = 125.0,
 ) -> Recording:
     """Record strokes; with a seed through a noisy second-order sensor, else exactly."""
-    speed, rise = motion(speeds, push)
-    time = np.asarray(STEP * np.arange(1, len(speed) + 1), float)
-    more = 1.0 + (breakaway - 1.0) * np.exp(-((speed / 1e-3) ** 2))
-    force = COULOMB * more * np.sign(speed) + VISCOUS * speed
-    force = np.where(speed < 0.0, withdrawal, 1.0) * force + mass * np.gradient(speed, STEP)
+    velocity, rise = motion(speeds, push)
+    time = np.asarray(STEP * np.arange(1, len(velocity) + 1), float)
+    more = 1.0 + (breakaway - 1.0) * np.exp(-((velocity / 1e-3) ** 2))
+    force = COULOMB * more * np.sign(velocity) + VISCOUS * velocity
+    force = np.where(velocity < 0.0, withdrawal, 1.0) * force + mass * np.gradient(velocity, STEP)
     # Before the needle moves, the sensor measures the push.
-    force[: len(rise)] = np.where(speed[: len(rise)] > 0.0, force[: len(rise)], rise)
+    force[: len(rise)] = np.where(velocity[: len(rise)] > 0.0, force[: len(rise)], rise)
     force = np.interp(time - lag, time, force) + offset
     if seed is not None:
         force = force + np.random.default_rng(seed).normal(scale=noise, size=len(force))
         b, a = butter(2, cutoff, fs=1.0 / STEP)
         force = np.round(lfilter(b, a, force) / 0.0025) * 0.0025
     # Insertion depth at the samples: half a step before the sum of velocities.
-    depth = 0.1 + STEP * (np.cumsum(speed) - 0.5 * speed)
+    depth = 0.1 + STEP * (np.cumsum(velocity) - 0.5 * velocity)
     kept = slice(EVERY - 1, None, EVERY)
     return Recording(
-        name='strokes', time=time[kept], depth=depth[kept], speed=speed[kept], force=force[kept]
+        name='strokes',
+        time=time[kept],
+        depth=depth[kept],
+        velocity=velocity[kept],
+        force=force[kept],
     )

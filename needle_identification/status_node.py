@@ -1,32 +1,22 @@
-"""Convert identification results to named values for /diagnostics."""
+"""Identification results as messages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import measured
 from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary
 from needle_identification.stiffness.estimate import StiffnessEstimate, StiffnessSummary
 
 
-class Status(NamedTuple):
-    """A result as a message and values; ``source`` is ``recordings`` or ``live``."""
-
-    name: str  # parameter or recording
-    message: str
-    values: Mapping[str, object]  # None if not applicable
-    is_determined: bool = True
-    source: str = ''
-
-
-def live_statuses(found: Sequence[Statistic], samples: int) -> list[Status]:
+def live_statuses(found: Sequence[Statistic], samples: int) -> list[DiagnosticStatus]:
     """Return one status per parameter identified from running topics."""
     return [_of_statistic(one, samples=samples, source='live') for one in found]
 
 
-def summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[Status]:
+def summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[DiagnosticStatus]:
     """Return one status per parameter and force level, then one per recording."""
     if isinstance(summary, FrictionSummary):
         samples = sum(one.samples for one in summary.estimates)
@@ -41,7 +31,7 @@ def summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[Status
 
 def _of_statistic(
     one: Statistic, *, level: str = '', samples: int | None = None, source: str = 'recordings'
-) -> Status:
+) -> DiagnosticStatus:
     values = {
         'estimate': one.mean,
         'interval_low': one.interval[0],
@@ -53,10 +43,12 @@ def _of_statistic(
         'samples': samples,
     }
     message = measured(one.mean, one.error, one.unit)
-    return Status(f'{one.name}{level}', message, values, one.count > 0, source)
+    status = _status(f'{one.name}{level}', message, values, source)
+    status.level = DiagnosticStatus.OK if one.count else DiagnosticStatus.WARN
+    return status
 
 
-def _of_friction(estimate: FrictionEstimate) -> Status:
+def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
     parameters = (*estimate.parameters, estimate.breakaway, estimate.lag)
     values = {
         **{p.name: measured(p.value, p.error, p.unit) for p in parameters if p is not None},
@@ -65,10 +57,10 @@ def _of_friction(estimate: FrictionEstimate) -> Status:
         'determination': estimate.determination,
         'condition': estimate.condition,
     }
-    return Status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
+    return _status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
 
 
-def _of_stiffness(estimate: StiffnessEstimate) -> Status:
+def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:
     worst = min(level.determination for level in estimate.levels)
     values = {
         'presses': sum(level.presses for level in estimate.levels),
@@ -77,7 +69,19 @@ def _of_stiffness(estimate: StiffnessEstimate) -> Status:
         'off_plane': estimate.off_plane,
         **{f'at {level.force:.2f} N': level.words for level in estimate.levels},
     }
-    return Status(estimate.name, f'R^2 >= {worst:.4f}', values)
+    return _status(estimate.name, f'R^2 >= {worst:.4f}', values)
+
+
+def _status(
+    name: str, message: str, values: Mapping[str, object], source: str = ''
+) -> DiagnosticStatus:
+    """Return a status, without values that are None."""
+    return DiagnosticStatus(
+        name=name,
+        message=message,
+        hardware_id=source,
+        values=[KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None],
+    )
 
 
 def sentence(found: Sequence[Statistic]) -> str:
