@@ -17,10 +17,10 @@ from needle_identification import (
     summarize,
     summarize_stiffness,
 )
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report.content import Grid, ReportSection
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import NeedleError
+from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import (
     compare_friction,
     compare_stiffness,

@@ -9,10 +9,9 @@ from math import nan
 from pathlib import Path
 from typing import Any, Final
 
-from needle_insertion.experiment.protocol import PROTOCOLS
-from needle_insertion.experiment.tables import TABLE_1, TABLE_2
 from needle_insertion.report.content import ReportSection
 from needle_insertion.report.page import write_page
+from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 from needle_insertion.report.text import filled, table
 from reproduction import claims, controllability, figures, mismatch, needle_constants
 from reproduction.campaign import Campaign
@@ -23,6 +22,7 @@ from reproduction.identified import (
     TABLES,
     VERDICTS,
 )
+from reproduction.protocol import PROTOCOLS
 from tqdm import tqdm
 
 #: Tables that decide about a result.

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
-from needle_insertion.experiment.tables import EXPERIMENTS, TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import EXPERIMENTS, TABLE_1, TABLE_2
 
 HOLDS: Final = 'holds'
 ONLY_IF: Final = 'holds only if'

@@ -16,13 +16,13 @@ from needle_identification import (
     read_topic,
     SteeringSettings,
 )
-from needle_insertion.demo.insertion import record_insertion
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.text import Check
 from needle_ros.errors import NeedleError
 import numpy as np
+from reproduction.insertions.insertion import record_insertion
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Preset of needle and tissue, and plant with a bevel load and a tracker in the tip.

@@ -12,8 +12,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.demo.bending import read_needles, replay_check
-from needle_insertion.demo.insertion import RATE, SETTLING
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
@@ -27,6 +25,8 @@ from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
+from reproduction.insertions.bending import read_needles, replay_check
+from reproduction.insertions.insertion import RATE, SETTLING
 
 #: Target of the tip, x, y, z [m], and insertion depth at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
