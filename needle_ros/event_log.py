@@ -29,28 +29,14 @@ class Severity(IntEnum):
 
 
 class EventLog:
-    """
-    Event log: collects log lines until the node publishes them.
-
-    Parameters
-    ----------
-    steady : callable
-        Returns the time of a steady clock [s].
-
-    Attributes
-    ----------
-    rejected : int
-        Number of rejected inputs.
-    last_rejection : str
-        Reason of the last rejection, or last fault of the motion.
-    changed : bool
-        Whether there are new lines or changes.
-
-    """
+    """Log lines until the node publishes them; `steady` is the time of a steady clock [s]."""
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
+        #: Number of rejected inputs.
         self.rejected = 0
+        #: Reason of the last rejection, or last fault of the motion.
         self.last_rejection = ''
+        #: Whether there are new lines or changes.
         self.changed = False
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []

@@ -14,21 +14,10 @@ _MARK = 'ros__parameters'
 
 
 class ParameterSection(NamedTuple):
-    """
-    Section of a parameter file.
-
-    Attributes
-    ----------
-    file : str
-        The file.
-    nodes : str
-        Full name of the nodes; ``*`` matches one name, ``**`` any number of names.
-    names : frozenset of str
-        Names of the parameters.
-
-    """
+    """Section of a parameter file, with the names of its parameters."""
 
     file: str
+    #: Full name of the nodes; ``*`` matches one name, ``**`` any number of names.
     nodes: str
     names: frozenset[str]
 

@@ -48,17 +48,8 @@ class Publishers:
 
     A killed node stays in the graph for 20 s. With a lease it no longer counts after the end of
     the lease, 0.5 s. Publishers without a lease, such as ``ros2 topic pub``, count as long as they
-    are in the graph.
-
-    Parameters
-    ----------
-    node : BaseNode
-        The subscribing node.
-    lease : Topic
-        Topic of the lease, see `offer_lease`.
-    on_change : callable, optional
-        Called when a lease ends or is renewed.
-
+    are in the graph. `lease` is as in `offer_lease`; `on_change` is called when a lease ends or
+    is renewed.
     """
 
     def __init__(

@@ -113,31 +113,20 @@ class InsertionStudy:
 
 
 class _Course(NamedTuple):
-    """
-    Trajectory of one insertion up to its end or stop.
+    """Trajectory of one insertion up to its end or stop."""
 
-    Attributes
-    ----------
-    model : NeedleModel
-        The true needle.
-    states : ndarray, shape (k + 1, 2 (2 + n))
-        States at the samples.
-    commands, forces : ndarray, shape (k,)
-        Command of each sample, and the force that acts from that sample on [N].
-    noise : ndarray, shape (k + 1, 2)
-        Encoder errors of depth [m] and velocity [m/s].
-    goal : ndarray, shape (k + 1,)
-        Reference [m]; NaN without a reference.
-    stopped, left : float
-        As in `FIGURES`.
-    """
-
+    #: The true needle.
     model: NeedleModel
+    #: States at the samples, shape (k + 1, 2 (2 + n)).
     states: FloatArray
+    #: Command of each sample, and the force that acts from that sample on [N], shape (k,).
     commands: FloatArray
     forces: FloatArray
+    #: Encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2).
     noise: FloatArray
+    #: Reference [m], shape (k + 1,); NaN without a reference.
     goal: FloatArray
+    #: As in `FIGURES`.
     stopped: float
     left: float
 

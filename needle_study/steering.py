@@ -53,9 +53,7 @@ HIT: Final = 1e-3
 #: Insertion speed of a replay [m/s].
 _SPEED: Final = 0.01
 
-#: Joint states of a guide without efforts.
-_STATES: Final = contract.steered_states()
-_JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one in _STATES.joints))
+_JOINTS: Final = contract.steered_states().without_efforts()
 
 #: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63

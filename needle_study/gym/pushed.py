@@ -41,30 +41,17 @@ class Tissues(NamedTuple):
 
 
 class Pushed(NamedTuple):
-    """
-    State of n needles.
+    """State of n needles."""
 
-    Attributes
-    ----------
-    common : CompiledNeedle
-        Constants that are the same for all.
-    friction : ndarray, shape (n, 2)
-        Coulomb friction [N] and viscous friction [N s/m].
-    layers : Tissues
-        Layers of tissue.
-    times : ndarray, shape (n,)
-        [s].
-    states : ndarray, shape (n, 2 (2 + modes))
-        States.
-    targets : ndarray, shape (n,)
-        Target depths [m].
-    """
-
+    #: Constants that are the same for all.
     common: CompiledNeedle
+    #: Coulomb friction [N] and viscous friction [N s/m], shape (n, 2).
     friction: Matrix
     layers: Tissues
+    #: Times [s], shape (n,), and states, shape (n, 2 (2 + modes)).
     times: Vector
     states: Matrix
+    #: Target depths [m], shape (n,).
     targets: Vector
 
 
