@@ -58,25 +58,14 @@ class ReproduceError(NeedleError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedValue:
-    """
-    Published quantity and its statistics over the recordings.
+    """Published quantity and its statistics over the recordings."""
 
-    Attributes
-    ----------
-    quantity : str
-        With its unit and condition.
-    paper : (float, float)
-        Published mean and standard deviation, SI.
-    found : Statistic
-        Mean and standard deviation over the recordings.
-    truth : Coverage
-        Number of recordings whose 95 % interval contains the ground truth.
-
-    """
-
+    #: With its unit and condition.
     quantity: str
+    #: Published mean and standard deviation, SI.
     paper: tuple[float, float]
     found: Statistic
+    #: Number of recordings whose 95 % interval contains the ground truth.
     truth: Coverage = field(default_factory=Coverage)
 
     @property

@@ -47,12 +47,8 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
         for name, parameters in runs.items()
         if not _is_finished(folder / name, protocol, parameters)
     ]
-    bar = tqdm(
-        total=len(runs),
-        initial=len(runs) - len(missing),
-        desc=f'{protocol.name} runs',
-        disable=None,
-    )
+    done, words = len(runs) - len(missing), f'{protocol.name} runs'
+    bar = tqdm(total=len(runs), initial=done, desc=words, disable=None)
     if missing:
         with bar, rig(folder, protocol) as stand:
             for name in missing:

@@ -38,28 +38,14 @@ VERDICT_HEADS: Final = ('where', 'what', 'verdict')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """
-    Result for the page, the terminal and JSON.
-
-    Attributes
-    ----------
-    section : ReportSection
-        Section of the page.
-    text : str
-        Text for the terminal.
-    verdicts : tuple of (str, str, str)
-        Place in the paper, statement, and verdict.
-    document : Mapping[str, object]
-        Document for JSON.
-    holds : bool
-        False if a table differs from the paper.
-
-    """
+    """Result for the page (`section`), the terminal (`text`) and JSON (`document`)."""
 
     section: ReportSection
     text: str
+    #: Place in the paper, statement, and verdict.
     verdicts: tuple[tuple[str, str, str], ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)
+    #: False if a table differs from the paper.
     holds: bool = True
 
 

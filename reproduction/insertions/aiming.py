@@ -25,6 +25,7 @@ from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
+from reproduction.insertions import bending
 from reproduction.insertions.bending import read_needles, replay_check
 from reproduction.insertions.insertion import RATE, SETTLING
 
@@ -35,27 +36,19 @@ START: Final = 5e-3
 #: Insertion speed [m/s].
 SPEED: Final = 0.02
 
-#: Nominal model of needle and tissue.
-PRESET: Final = {'model.preset': 'bending_35mm'}
-
 #: Plant: tissue softer than the nominal model, bevel, random path deviation, EM tracker.
 PLANT: Final[dict[str, object]] = {
-    **PRESET,
-    'steered': True,
+    **bending.PLANT,
     'rate': RATE,
     'depth': START,
     'model.tissue_stiffness': 45e3,
     'steering.bevel_load': [0.15],
-    'steering.cutting_force': [1.0],
     'steering.path_noise': 1e-4,
-    'tip.rate': 40.0,
-    'tip.noise': 1.8e-4,
-    'tip.delay': 0.02,
 }
 
 #: Node `steering`: half the default measurement time of the tip, for a short demo.
 STEERING: Final[dict[str, object]] = {
-    **PRESET,
+    'model.preset': bending.PRESET,
     'speed': SPEED,
     'guide_speed': 0.02,
     'settle_time': 0.05,
@@ -65,7 +58,7 @@ STEERING: Final[dict[str, object]] = {
 
 #: Node `controller`.
 CONTROLLER: Final[dict[str, object]] = {
-    **PRESET,
+    'model.preset': bending.PRESET,
     'rate': RATE,
     'deflection_feedback': 'none',
     'reference.speed': SPEED,
@@ -79,8 +72,7 @@ LARGEST_MISS: Final = 1e-3
 #: chi-squared distribution with two degrees of freedom.
 _LARGEST: Final = 13.8
 
-#: Number of needles in the picture, and of frames in the animation.
-_DRAWN: Final = 5
+#: Number of frames in the animation.
 _FRAMES: Final = 80
 
 #: Timeout of the insertion, and of the answer to a target, in simulated time [s].
@@ -200,7 +192,7 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
     """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
     needles, path = read_needles(bag)
     (*_, last), _ = read_needles(other)
-    return draw_needle(evenly(needles, _DRAWN), path, np.array(TARGET), last)
+    return draw_needle(evenly(needles, bending.DRAWN), path, np.array(TARGET), last)
 
 
 def animate_aiming(bag: Path) -> Animation:

@@ -49,7 +49,7 @@ LEAST_DEFLECTION: Final = 2e-3
 LARGEST_DISTANCE: Final = 2.0
 
 #: Number of needles in the picture.
-_DRAWN: Final = 5
+DRAWN: Final = 5
 
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
@@ -104,7 +104,7 @@ def replay_check(bag: Path, what: str) -> Check:
 def draw_bending(bag: Path) -> Figure:
     """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
-    return draw_needle(evenly(needles, _DRAWN), path)
+    return draw_needle(evenly(needles, DRAWN), path)
 
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
