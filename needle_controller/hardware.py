@@ -12,6 +12,7 @@ from needle_controller.controller import Controller, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
+from needle_ros.axes import AXES, signed_axis
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
@@ -40,8 +41,6 @@ STATE_TYPES: Final = {
 
 #: Source of measurement stamps: message header or receive time.
 STAMPS: Final = ('header', 'receive')
-
-_AXES: Final = 'xyz'
 
 #: Time constant of an estimated velocity, and the gap after which it restarts [s].
 _FILTER: Final = 5e-3
@@ -176,10 +175,12 @@ class HardwareSettings:
             If an axis is unknown, or both are the same.
 
         """
-        along, sign = _signed_axis('force_axis', self.force_axis)
+        sign, axis = signed_axis(self.force_axis, 'force_axis')
+        along = AXES.index(axis)
         aside, other = (along + 1) % 3, 1.0
         if self.lateral_axis:
-            aside, other = _signed_axis('lateral_axis', self.lateral_axis)
+            other, axis = signed_axis(self.lateral_axis, 'lateral_axis')
+            aside = AXES.index(axis)
         if along == aside:
             raise ParameterError(
                 f'lateral_axis must be across force_axis {self.force_axis!r}, got '
@@ -188,14 +189,6 @@ class HardwareSettings:
         # x = y cross z.
         third = sign * other * (1.0 if (along + 1) % 3 == aside else -1.0)
         return (3 - along - aside, third), (along, sign), (aside, other)
-
-
-def _signed_axis(name: str, text: str) -> tuple[int, float]:
-    """Return index and sign of an axis."""
-    axis = text.removeprefix('-')
-    if len(axis) != 1 or axis not in _AXES:
-        raise ParameterError(f'{name} must be x, y, z, -x, -y or -z, got {text!r}')
-    return _AXES.index(axis), -1.0 if axis != text else 1.0
 
 
 def dynamic_reading(

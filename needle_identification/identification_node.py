@@ -19,15 +19,14 @@ from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
-    signed_axis,
 )
-from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status import live_statuses, sentence, Status, summary_statuses
 from needle_identification.stiffness.estimate import summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_ros import contract
+from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
@@ -124,9 +123,7 @@ class IdentificationNode(BaseNode):
         self._own = self.settings('', IdentificationSettings)
         self._is_live = bool(self.get_parameter('live').value)
         self._force_sign, self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
-        joint = self.text('motion_axis') or contract.INSERTION
-        self._joint_sign = -1.0 if joint.startswith('-') else 1.0
-        self._joint = joint.removeprefix('-')
+        self._joint_sign, self._joint = signed(self.text('motion_axis') or contract.INSERTION)
         if len(self.get_parameter('axes').value) != 2:
             raise ParameterError(f'axes must be two, got {list(self.get_parameter("axes").value)}')
         self._bags = [name for name in self.get_parameter('bags').value if name]

@@ -14,12 +14,10 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated
 from needle_identification.recordings.series import FINEST, Series
 from needle_ros import wire
+from needle_ros.axes import AXES
 from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
-
-#: Axes of a frame, in the order of message fields.
-AXES: Final = ('x', 'y', 'z')
 
 #: Upper limit of a plausible measurement [SI].
 _LARGEST: Final = 1e100
