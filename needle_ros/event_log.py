@@ -40,7 +40,7 @@ class EventLog:
         self.changed = False
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []
-        self._told: dict[str, float] = {}
+        self._times: dict[str, float] = {}
         self._left_out: Counter[str] = Counter()
 
     def add(self, severity: Severity, line: str = '', kind: str = '') -> None:
@@ -52,10 +52,10 @@ class EventLog:
         """
         if kind:
             now = self._steady()
-            if now - self._told.get(kind, -inf) < _PAUSE:
+            if now - self._times.get(kind, -inf) < _PAUSE:
                 self._left_out[kind] += 1
                 return
-            self._told[kind] = now
+            self._times[kind] = now
             more = self._left_out.pop(kind, 0)
             line = f'{line} ({more} similar omitted)' if line and more else line
         if line:

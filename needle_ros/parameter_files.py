@@ -41,7 +41,7 @@ def sections(arguments: Sequence[str]) -> list[ParameterSection]:
     ]
 
 
-def strangers(found: Sequence[ParameterSection], node: str) -> list[str]:
+def unmatched_files(found: Sequence[ParameterSection], node: str) -> list[str]:
     """Return a warning for each file without a section for a node."""
     lines = []
     for file in dict.fromkeys(section.file for section in found):

@@ -55,7 +55,7 @@ class Publishers:
     def __init__(
         self, node: BaseNode, lease: Topic, on_change: Callable[[], object] | None = None
     ) -> None:
-        self._node, self._told = node, on_change
+        self._node, self._notify = node, on_change
         self._lease = _name(node, lease)
         self._over = 0
         node.create_subscription(
@@ -68,8 +68,8 @@ class Publishers:
 
     def _on_change(self, event: Any) -> None:
         self._over = event.not_alive_count
-        if self._told is not None:
-            self._told()
+        if self._notify is not None:
+            self._notify()
 
     def count(self, topic: Topic, matched: int = 0) -> int:
         """

@@ -243,7 +243,7 @@ class PendingRequest:
         #: Name of the expected receiver, or of the node that has answered.
         self.node = node
 
-    def hear(self, node: str, status: RequestStatus) -> None:
+    def take_status(self, node: str, status: RequestStatus) -> None:
         """Process the status of a node."""
         answer = status.answer_to(self._topic, self._stamp)
         if answer is not None and (self.answer is None or not self.done):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
 from math import inf, isfinite
@@ -89,7 +89,7 @@ def check_constants(values: object) -> None:
             raise ParameterError(f'{item.name} must be {_NAMES[meta["type"]]}, got {value!r}')
 
 
-def check_choice(name: str, value: object, valid: Sequence[str]) -> None:
+def check_choice(name: str, value: object, valid: Collection[str]) -> None:
     """Raise `ParameterError` if a value is not one of the valid words."""
     if not isinstance(value, str) or value not in valid:
         raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')

@@ -156,7 +156,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
                 (
                     'Steered',
                     f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
-                    f'expected tip at {read_aimed(aimed).said} (95 %)',
+                    f'expected tip at {read_aimed(aimed).interval_text} (95 %)',
                 ),
             ],
             rows=rows,

@@ -141,9 +141,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-def _line(seen: NeedleShape | NeedlePath) -> FloatArray:
+def _line(line: NeedleShape | NeedlePath) -> FloatArray:
     """Return a needle or its path as points x, y, z, shape (k, 3) [m]."""
-    return np.insert(seen.deflections, 1, seen.depths, axis=1)
+    return np.insert(line.deflections, 1, line.depths, axis=1)
 
 
 def _target(text: str) -> FloatArray:
@@ -206,11 +206,11 @@ def sample_needle(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
-def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
-    """Return the expected tip and the half width of its interval; None without prediction."""
-    mean = None if there is None else there.mean.tolist()
-    half = None if there is None else there.half_width.tolist()
-    return {'expected tip [m]': mean, 'its interval of 95 % [m]': half}
+def _expected(estimate: TipEstimate | None) -> dict[str, list[float] | None]:
+    """Return the expected tip and the half width of its 95 % interval; None if not predicted."""
+    mean = None if estimate is None else estimate.mean.tolist()
+    half = None if estimate is None else estimate.half_width.tolist()
+    return {'expected tip [m]': mean, 'expected tip half width [m]': half}
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -255,10 +255,10 @@ def _run(options: argparse.Namespace) -> int:
         **_expected(law.expected()),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
-        'way of the guide [m]': done.travel,
+        'guide travel [m]': done.travel,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
-        'bending length over the nominal one': law.status().get('bending_length_ratio'),
+        'bending length ratio': law.status().get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
     if done.warning:
@@ -296,7 +296,7 @@ def _text(found: Mapping[str, Any]) -> str:
             ('target', found['target [m]'], None),
             ('tip', found['tip [m]'], found['miss [m]']),
             ('expected tip', found['expected tip [m]'], None),
-            ('± (95 %)', found['its interval of 95 % [m]'], None),
+            ('± (95 %)', found['expected tip half width [m]'], None),
             ('open loop', found['tip open loop [m]'], found['miss open loop [m]']),
         )
         if at is not None

@@ -176,7 +176,7 @@ class SlicerNode(BaseNode):
             self._states.take(name, level, printable(status.message), monotonic())
             if self._sending is not None:
                 values = {one.key: one.value for one in status.values}
-                self._sending[0].hear(name, RequestStatus.from_values(values))
+                self._sending[0].take_status(name, RequestStatus.from_values(values))
 
     # Messages of the peer.
 
@@ -198,7 +198,7 @@ class SlicerNode(BaseNode):
             if self._view.expected is not None:
                 link.send(interpreter.tip_expected(self._view.expected))
         self._repeat_target()
-        self.tell(self._events)
+        self.publish_events(self._events)
 
     def _repeat_target(self) -> None:
         """Publish the target again until it is answered, and report a rejection."""
@@ -238,12 +238,12 @@ class SlicerNode(BaseNode):
         self._target.publish(message)
         self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
         self._targets += 1
-        heard = self._target.get_subscription_count()
+        subscribers = self._target.get_subscription_count()
         words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))
         self._events.add(
-            Severity.INFO if heard else Severity.WARNING,
+            Severity.INFO if subscribers else Severity.WARNING,
             f'target ({words}) mm in {contract.ENTRY}, by {frame.kind} of {frame.device}'
-            + ('' if heard else f': no node subscribes to {contract.TARGET.name}'),
+            + ('' if subscribers else f': no node subscribes to {contract.TARGET.name}'),
             'target',
         )
 

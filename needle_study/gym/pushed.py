@@ -56,14 +56,14 @@ class Pushed(NamedTuple):
 
 
 @kernel
-def push(held: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
+def push(boxed: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
     Push the needles of the mask `which` for a period; overwrite their times and states.
 
     Actions, shape (n,), are forces as fractions of `FORCE`, clipped to [-1, 1]. Returns rewards
     [m], 0 where not pushed, and where a needle rests at its target or would have left its range.
     """
-    c, friction, layers, times, states, targets = held.value
+    c, friction, layers, times, states, targets = boxed.value
     n, u = states.shape[0], states.shape[1] // 2
     rewards, over = np.zeros(n), np.zeros(n, dtype=np.bool_)
     none = np.empty((0, 3))
@@ -89,13 +89,13 @@ def push(held: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[Float
 
 
 @kernel
-def observe(held: Boxed[Pushed]) -> Any:
+def observe(boxed: Boxed[Pushed]) -> Any:
     """Return depth error, velocity, depth and tip deflection, shape (n, 4), in `UNITS`."""
-    c, _, _, _, states, targets = held.value
+    c, _, _, _, states, targets = boxed.value
     tips, u = tip_deflections(c.modes, states), states.shape[1] // 2
-    seen = np.empty((states.shape[0], 4), dtype=np.float32)
+    observed = np.empty((states.shape[0], 4), dtype=np.float32)
     for k in range(states.shape[0]):
         depth = c.length - states[k, 0]
         for i, value in enumerate((targets[k] - depth, -states[k, u], depth, tips[k])):
-            seen[k, i] = min(max(value / UNITS[i], -BOUND), BOUND)
-    return seen
+            observed[k, i] = min(max(value / UNITS[i], -BOUND), BOUND)
+    return observed

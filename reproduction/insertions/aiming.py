@@ -138,7 +138,7 @@ class Aimed:
         return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
 
     @property
-    def said(self) -> str:
+    def interval_text(self) -> str:
         """Text of the expected tip position with its 95 % interval."""
         half = _NORMAL * np.sqrt(np.diag(self.covariance))
         return ', '.join(
@@ -167,7 +167,7 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
     """Check both misses, the expected tip, and the replay; `other` is with a guide at rest."""
     found = read_aimed(bag)
     off = found.tip - found.expected
-    held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
+    contained = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
     alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
     x, z = 1e3 * found.tip
     return [
@@ -183,7 +183,12 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
             f'{1e3 * alone:.2f} mm',
             alone > LARGEST_MISS,
         ),
-        Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
+        Check(
+            'expected tip, steered',
+            f'x = {x:.2f} mm, z = {z:.2f} mm',
+            found.interval_text,
+            contained,
+        ),
         replay_check(bag, 'steered'),
     ]
 
