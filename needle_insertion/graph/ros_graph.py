@@ -176,7 +176,7 @@ class Graph:
         states: Container[int] = range(256),
         show: Callable[[], object] = lambda: None,
     ) -> None:
-        """Request the state of a node at a period [s], until it is one of `states`."""
+        """Request the state of a node at a period [s], until its state is in `states`."""
         client = node.create_client(GetState, f'{name}/get_state')
         self.spin_until(client.service_is_ready, f'the node {name}', _START)
         # A response to a client that the server has not discovered is lost.
@@ -216,8 +216,8 @@ class Graph:
 
         The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
         condition is checked after each event, which costs more CPU time. Raises `GraphError` on a
-        timeout, with the name `what` and the last log line of each process, and if a process of
-        the graph has ended.
+        timeout, with the awaited event (`what`) and the last log line of each process, and if a
+        process of the graph has ended.
         """
         deadline, last = time.monotonic() + timeout, sign()
         while not condition():
