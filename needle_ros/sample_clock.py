@@ -14,7 +14,6 @@ _TICK: Final = 1e-3
 #: Samples per tick at maximum speed.
 _AT_ONCE: Final = 20
 
-
 #: Maximum lead of an independent time over a recorder, by lockstep [samples]: the pending messages
 #: fit into the queues of the recorder, in lockstep together with the messages of other nodes.
 _AHEAD: Final = {True: 10, False: 80}

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-import json
 from math import isfinite
 from pathlib import Path
-import sys
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
@@ -42,7 +40,13 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
-from needle_insertion.commands.common import check_file, constants, Subcommand
+from needle_insertion.commands.common import (
+    check_file,
+    constants,
+    print_each,
+    print_result,
+    Subcommand,
+)
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach
@@ -261,8 +265,7 @@ def _run(options: argparse.Namespace) -> int:
         'bending length ratio': law.status().get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
-    if done.warning:
-        sys.stderr.write(f'warning: {done.warning}\n')
+    print_each('warning', found['warnings'])
     if options.output is not None:
         at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
         # In the frame of the needle, to which the sensor frame is rotated.
@@ -274,17 +277,13 @@ def _run(options: argparse.Namespace) -> int:
             _line(alone.needle.shape),
         )
         write_whole(options.output, png(figure))
-    if options.json:
-        sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
-        return 0
-    sys.stdout.write(
+    text = (
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
         f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.travel:.1f} mm in total '
         f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
-        f'{_text(found)}\n'
+        f'{_text(found)}'
     )
-    if options.output is not None:
-        sys.stdout.write(f'wrote {options.output}\n')
+    print_result(found, text, filter(None, [options.output]), as_json=options.json)
     return 0
 
 
