@@ -41,6 +41,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
 from needle_insertion.commands.common import (
+    add_constants,
     check_file,
     constants,
     print_each,
@@ -93,21 +94,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'steering law, one of {", ".join(STEERING_LAWS)}, or module:Class of your own '
         f'(default {DEFAULT_LAW})',
     )
-    parser.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help=f'constant of the nominal model, one of {", ".join(CONSTANTS)}, SI units; repeatable',
-    )
-    parser.add_argument(
-        '--prior',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='prior uncertainty of the model, one of '
-        f'{", ".join(asdict(SteeringPrior()))}, SI units; repeatable',
-    )
+    words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
+    add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
+    add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
     parser.add_argument(
         '--step',
         type=float,
