@@ -19,9 +19,9 @@ from needle_dynamics import (
 )
 from needle_identification import FrictionSettings, StiffnessSettings
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
-from needle_insertion.experiment.protocol import DIRECTIONS, HOLD_TIME
 import numpy as np
 from numpy.typing import NDArray
+from reproduction.protocol import DIRECTIONS, HOLD_TIME
 from scipy.linalg import solveh_banded
 from scipy.signal import butter, sosfilt
 

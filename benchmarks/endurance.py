@@ -68,7 +68,7 @@ def record(folder: Path, duration: float) -> Answer:
         *((f'CPU of the {name} [%]', f'{share:.1f}') for name, share in shares.items()),
     ]
     section = PageSection(
-        'Recorder', ('figure', 'found'), rows, f'{len(_TOPICS)} topics, {duration:g} s.'
+        'Recorder', ('metric', 'found'), rows, f'{len(_TOPICS)} topics, {duration:g} s.'
     )
     total = float(sum(lost.values()))
     return [section], [Bar(f'messages lost by the recorder in {duration:g} s', total, 0.0)]

@@ -118,7 +118,7 @@ def conclusion(bars: Iterable[Bar], seconds: float) -> str:
         verdict += f', {absent} not measured'
     section = PageSection(
         'Bars',
-        ('figure', 'wanted', 'found', 'verdict'),
+        ('metric', 'required', 'found', 'verdict'),
         [bar.row() for bar in bars],
         f'The benchmark took {seconds:.0f} s.',
     )

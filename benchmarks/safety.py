@@ -43,7 +43,7 @@ _AFTER, _NEAR = 0.03, 2e-4
 _ITS_OWN: Final = 1e-3
 
 #: Outcomes of a motion.
-BORNE, LET_GO, STOPPED = 'borne', 'no force', 'stop'
+CONTINUED, NO_FORCE, STOPPED = 'continued', 'no force', 'stop'
 
 #: Limits of force [N], distance from the motion [m] (2 mm plus braking distance), and time [s].
 _FORCE: Final = 15.0
@@ -128,7 +128,7 @@ def _lies(topic: str) -> dict[str, _Alter]:
         'one in ten': lambda k, s, _f, _r: (s,) if k % 10 == 0 else (),
         '20 ms late': lambda _k, s, _f, _r: (s._replace(late=_ms(20.0)),),
         '200 ms late': lambda _k, s, _f, _r: (s._replace(late=_ms(200.0)),),
-        'late by chance': lambda _k, s, _f, r: (s._replace(late=_ms(r.uniform(0.0, 150.0))),),
+        'random delay': lambda _k, s, _f, r: (s._replace(late=_ms(r.uniform(0.0, 150.0))),),
         'twice': lambda _k, s, _f, _r: (s, s),
         'swapped': swapped,
         'frozen': lambda _k, _s, f, _r: (f,),
@@ -195,7 +195,7 @@ class MotionResult:
     Attributes
     ----------
     outcome : str
-        Strongest reaction: borne, no force, stop.
+        Strongest reaction: continued, no force, stop.
     force : float
         Largest force on the needle [N].
     beyond : float
@@ -254,7 +254,7 @@ def measure(cell: FaultCell) -> MotionResult:
     last = end + round(_WATCHED * _RATE)
     reach = min(own[begin : last + 1]), max(own[begin : last + 1])
     force = beyond = 0.0
-    unsafe, outcome = begin, BORNE
+    unsafe, outcome = begin, CONTINUED
     for k in range(last):
         _aim(loop, k / _RATE)
         happens = begin <= k < end
@@ -269,8 +269,8 @@ def measure(cell: FaultCell) -> MotionResult:
             unsafe = k + 1
         if loop.supervisor.safety.stop is not None:
             outcome = STOPPED
-        elif outcome == BORNE and loop.acting == 0.0 and loop.supervisor.fault is not None:
-            outcome = LET_GO
+        elif outcome == CONTINUED and loop.acting == 0.0 and loop.supervisor.fault is not None:
+            outcome = NO_FORCE
     return MotionResult(outcome, force, beyond, (unsafe - begin) / _RATE, _recovery(loop))
 
 
@@ -303,15 +303,15 @@ def compare(tick: Tick, fault: str = '') -> Answer:
     sections = [_section(topic, chosen, found) for topic in dict.fromkeys(c.topic for c in chosen)]
     bars = [
         Bar('worst force', max(one.force for one in found), _FORCE, 'N'),
-        Bar('motion beyond its own', 1e3 * max(one.beyond for one in found), 1e3 * _BEYOND, 'mm'),
+        Bar('additional motion', 1e3 * max(one.beyond for one in found), 1e3 * _BEYOND, 'mm'),
         Bar('time to safe', max(one.unsafe for one in found), _UNSAFE, 's'),
         Bar('cells without recovery', float(sum(one.recovery == inf for one in found)), 0.0),
     ]  # fmt: skip
     if not fault:
         bars.insert(0, Bar('cells', float(len(chosen)), 500.0, at_least=True))
         rows, more = strangers.measure(tick)
-        comes = ('what comes', 'tries', 'moved by', 'bar', 'afterwards')
-        sections.append(PageSection('Real nodes', comes, rows))
+        heads = ('input', 'repetitions', 'moved by', 'bar', 'afterwards')
+        sections.append(PageSection('Real nodes', heads, rows))
         bars += more
     return sections, bars
 
@@ -333,7 +333,7 @@ def _section(
                 for cell, one in own
                 if one.outcome == outcome
             ]
-            for outcome in (BORNE, LET_GO, STOPPED)
+            for outcome in (CONTINUED, NO_FORCE, STOPPED)
         }
         rows.append(
             (
@@ -348,7 +348,7 @@ def _section(
     return PageSection(
         f'`{topic}`',
         (
-            'fault', BORNE, LET_GO, STOPPED, 'worst force [N]', 'motion beyond its own [mm]',
+            'fault', CONTINUED, NO_FORCE, STOPPED, 'worst force [N]', 'additional motion [mm]',
             'time to safe [s]', 'to the next target [s]',
         ),
         rows,

@@ -169,7 +169,7 @@ def _answer(
     ]
     section = PageSection(
         'Node slicer with a peer',
-        ('figure', 'found'),
+        ('metric', 'found'),
         rows,
         f'{duration:g} s with a plant and a client of pyigtl that sends 10 targets a second; '
         'then node and peer are killed in turn.',

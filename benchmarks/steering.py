@@ -354,7 +354,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
     )
     bars.append(Bar('a step, guide and roll', _times(every, TURNING[0])[0], 2.0, 'ms'))
     heads = (
-        'controller', 'mean', 'STD', 'median', '95 %', 'within 1 mm', 'way of the guide [mm]',
+        'controller', 'mean', 'STD', 'median', '95 %', 'within 1 mm', 'guide travel [mm]',
         'turns', 'load on the guide [N]', 'a step [ms]',
     )  # fmt: skip
     return [
@@ -367,8 +367,8 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within '
             f'{1e3 * LIMITS.guide_limit:g} mm, steps of {1e3 * STEP:g} mm. Statistics: targets '
             'that are reachable with all parameters known except the path, and that ours did not '
-            'reject. Way, turns and load are means, of the load the mean of the largest value of '
-            'each insertion.',
+            'reject. Guide travel, turns and load are means, of the load the mean of the largest '
+            'value of each insertion.',
         ),
         PageSection(
             'Ours',

@@ -213,11 +213,11 @@ def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Ba
                 found = 1e3 * act(graph, bystander)
                 moved = f'{found:.3f} mm'
                 bystander.goes_to(NEXT)
-                afterwards = 'goes on' if bystander.stops <= {0} else 'goes on after a stop'
+                afterwards = 'continues' if bystander.stops <= {0} else 'continues after a stop'
             except GraphError as error:
                 afterwards = f'{error}: {bystander.complaints}'
         rows.append((what, str(count), moved, f'{bar:g} mm', afterwards))
-        bars.append(Bar(what, found if afterwards == 'goes on' else float('inf'), bar, 'mm'))
+        bars.append(Bar(what, found if afterwards == 'continues' else float('inf'), bar, 'mm'))
     return rows, bars
 
 

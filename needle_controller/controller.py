@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Final, TypeAlias
 
@@ -19,7 +19,7 @@ from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, flag
 from needle_ros.status import ControllerStatus
 
 #: Controlled axes.
@@ -71,11 +71,8 @@ class ControllerSettings:
     stability_margin: float = constant(
         MARGIN, '1', 'required relative decrease of every control error per period', high=0.5
     )
-    rotation: bool = field(
-        default=True,
-        metadata={
-            'description': 'whether the robot rotates the needle; if false, the torque is zero'
-        },
+    rotation: bool = flag(
+        True, 'whether the robot rotates the needle; if false, the torque is zero'
     )
     lowest_depth: float = constant(
         0.0, 'm', 'least insertion depth to control; minimum_depth if that is larger'
@@ -87,8 +84,6 @@ class ControllerSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if not isinstance(self.rotation, bool):
-            raise ParameterError(f'rotation must be true or false, got {self.rotation!r}')
         if self.delay != int(self.delay):
             raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 

@@ -252,7 +252,7 @@ class ControllerNode(ModelNode):
             self._supervisor.change(parameters, law, self._gains(changes))
         except ParameterError as error:
             self._supervisor.events.reject(f'parameters: {error}')
-            self.tell(self._supervisor.events)
+            self.publish_events(self._supervisor.events)
             raise
         self._supervisor.retract_depth = depth
         if self._driver is not None:
@@ -363,7 +363,7 @@ class ControllerNode(ModelNode):
         if missing != self._missing:
             self._missing = missing
             self._supervisor.events.add(Severity.WARNING, missing)
-            self.tell(self._supervisor.events)
+            self.publish_events(self._supervisor.events)
 
     # Outputs.
 
@@ -382,7 +382,7 @@ class ControllerNode(ModelNode):
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
-        self.tell(self._supervisor.events)
+        self.publish_events(self._supervisor.events)
         if self._supervisor.requests.due():
             self.publish_diagnostics()
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from math import isfinite, isnan, nan
-from typing import Any, Final
+from typing import Final
 
 from needle_controller.admittance import Admittance
 from needle_controller.controller import Controller, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
+from needle_ros.axes import AXES, signed_axis
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, choice, constant, flag, text
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -41,8 +42,6 @@ STATE_TYPES: Final = {
 #: Source of measurement stamps: message header or receive time.
 STAMPS: Final = ('header', 'receive')
 
-_AXES: Final = 'xyz'
-
 #: Time constant of an estimated velocity, and the gap after which it restarts [s].
 _FILTER: Final = 5e-3
 _GAP: Final = 0.1
@@ -51,15 +50,11 @@ _GAP: Final = 0.1
 _INTERFACES: Final = ('position', 'velocity', 'effort')
 
 
-def _text(default: str, description: str) -> Any:
-    return field(default=default, metadata={'description': description})
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HardwareSettings:
     """Joints, units, topics and commands of a robot driver; the defaults are the contract."""
 
-    joint: str = _text(INSERTION, 'insertion joint of the robot')
+    joint: str = text(INSERTION, 'insertion joint of the robot')
     sign: float = constant(
         1.0, '1', '1 if the position of the robot increases into the tissue, else -1', low=-1.0,
         high=1.0,
@@ -71,36 +66,32 @@ class HardwareSettings:
     zero: float = constant(
         0.0, 'unit of the robot', 'position of the robot at insertion depth 0', low=-1e9, high=1e9
     )
-    state_topic: str = _text(
+    state_topic: str = text(
         '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
     )
-    state_type: str = _text('joint_state', f'one of {", ".join(STATE_TYPES)}')
-    stamps: str = _text(
-        STAMPS[0],
-        f'one of {", ".join(STAMPS)}: measurement time from the header, or the receive time '
-        'for a driver that does not stamp',
-    )
-    wrench_topic: str = _text(
+    state_type: str = choice('joint_state', STATE_TYPES)
+    stamps: str = choice(
+        STAMPS[0], STAMPS, 'measurement time from the header, or the receive time for a driver '
+        'that does not stamp',
+    )  # fmt: skip
+    wrench_topic: str = text(
         '', f'topic of the force sensor; empty: base_wrench; {BY_TYPE}: the only one of its type'
     )
-    wrench_frame: str = _text('', 'frame of the force sensor; empty: needle_base')
-    force_axis: str = _text(
+    wrench_frame: str = text('', 'frame of the force sensor; empty: needle_base')
+    force_axis: str = text(
         'y', 'axis of the force sensor that points into the tissue; may be signed: -z'
     )
-    lateral_axis: str = _text(
+    lateral_axis: str = text(
         '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the '
         'axis after force_axis',
     )  # fmt: skip
-    reaction: bool = field(
-        default=False,
-        metadata={
-            'description': 'the sensor reports the force of the needle on the sensor, not the '
-            'force on the needle'
-        },
-    )
-    command: str = _text(EFFORT, f'one of {", ".join(COMMANDS)}: kind of joint command')
-    command_topic: str = _text('', 'topic of the commands; empty: wrench_command')
-    command_type: str = _text('wrench', f'one of {", ".join(COMMAND_TYPES)}')
+    reaction: bool = flag(
+        False, 'the sensor reports the force of the needle on the sensor, not the force on the '
+        'needle',
+    )  # fmt: skip
+    command: str = choice(EFFORT, COMMANDS, 'kind of joint command')
+    command_topic: str = text('', 'topic of the commands; empty: wrench_command')
+    command_type: str = choice('wrench', COMMAND_TYPES)
     command_joints: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -118,26 +109,10 @@ class HardwareSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(item.default, str) and not isinstance(value, str):
-                raise ParameterError(f'{item.name} must be text, got {value!r}')
-        for name, valid in (
-            ('state_type', tuple(STATE_TYPES)),
-            ('stamps', STAMPS),
-            ('command', COMMANDS),
-            ('command_type', tuple(COMMAND_TYPES)),
-        ):
-            if getattr(self, name) not in valid:
-                raise ParameterError(
-                    f'{name} must be one of {", ".join(valid)}, got {getattr(self, name)!r}'
-                )
         if abs(self.sign) != 1.0:
             raise ParameterError(f'sign must be 1 or -1, got {self.sign!r}')
         if not self.joint:
             raise ParameterError("joint must be the name of a joint, got ''")
-        if not isinstance(self.reaction, bool):
-            raise ParameterError(f'reaction must be true or false, got {self.reaction!r}')
         self.axes()
         joints = self.command_joints
         if joints and (self.joint not in joints or len({*joints}) < len(joints)):
@@ -176,10 +151,12 @@ class HardwareSettings:
             If an axis is unknown, or both are the same.
 
         """
-        along, sign = _signed_axis('force_axis', self.force_axis)
+        sign, axis = signed_axis(self.force_axis, 'force_axis')
+        along = AXES.index(axis)
         aside, other = (along + 1) % 3, 1.0
         if self.lateral_axis:
-            aside, other = _signed_axis('lateral_axis', self.lateral_axis)
+            other, axis = signed_axis(self.lateral_axis, 'lateral_axis')
+            aside = AXES.index(axis)
         if along == aside:
             raise ParameterError(
                 f'lateral_axis must be across force_axis {self.force_axis!r}, got '
@@ -188,14 +165,6 @@ class HardwareSettings:
         # x = y cross z.
         third = sign * other * (1.0 if (along + 1) % 3 == aside else -1.0)
         return (3 - along - aside, third), (along, sign), (aside, other)
-
-
-def _signed_axis(name: str, text: str) -> tuple[int, float]:
-    """Return index and sign of an axis."""
-    axis = text.removeprefix('-')
-    if len(axis) != 1 or axis not in _AXES:
-        raise ParameterError(f'{name} must be x, y, z, -x, -y or -z, got {text!r}')
-    return _AXES.index(axis), -1.0 if axis != text else 1.0
 
 
 def dynamic_reading(

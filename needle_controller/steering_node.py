@@ -261,7 +261,7 @@ class SteeringNode(CompiledNode):
             self._told = loop.expected
             if loop.expected is not None:
                 self._tell_tip(loop.expected, loop.depth)
-        self.tell(loop.events)
+        self.publish_events(loop.events)
         if loop.requests.due():
             self.publish_diagnostics()
 

@@ -12,7 +12,7 @@ from needle_dynamics.compiled.friction import FRICTION_LAWS
 from needle_dynamics.friction import Friction
 from needle_dynamics.tissue import Tissue
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import check_constants, choice, constant, flag, from_values
 
 #: Formulations: all terms of the Euler-Lagrange equations, or the final form in the source.
 FORMULATIONS: Final = ('complete', 'as_printed')
@@ -78,9 +78,7 @@ class NeedleParameters:
     tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
     coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
     viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
-    friction_law: str = field(
-        default='coulomb', metadata={'description': f'one of {", ".join(FRICTION_LAWS)}'}
-    )
+    friction_law: str = choice('coulomb', FRICTION_LAWS)
     withdrawal_friction: float = constant(
         1.0, '1', 'ratio of friction on withdrawal to friction on insertion'
     )
@@ -97,15 +95,11 @@ class NeedleParameters:
         1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)', open_low=True
     )
     modes: int = field(default=2, metadata={'description': 'number of shape modes n'})
-    formulation: str = field(
-        default='complete', metadata={'description': f'one of {", ".join(FORMULATIONS)}'}
-    )
+    formulation: str = choice('complete', FORMULATIONS)
     minimum_depth: float = constant(
         1e-3, 'm', 'insertion depth below which the model stops', open_low=True
     )
-    hub_stop: bool = field(
-        default=True, metadata={'description': 'the hub stops on the skin (inelastic)'}
-    )
+    hub_stop: bool = flag(True, 'the hub stops on the skin (inelastic)')
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -113,13 +107,6 @@ class NeedleParameters:
             if 'unit' in item.metadata:
                 # An integer would cause compiled functions to be compiled for another type.
                 object.__setattr__(self, item.name, float(getattr(self, item.name)))
-        if not isinstance(self.hub_stop, bool):
-            raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
-        for name, valid in (('friction_law', FRICTION_LAWS), ('formulation', FORMULATIONS)):
-            if getattr(self, name) not in valid:
-                raise ParameterError(
-                    f'{name} must be one of {", ".join(valid)}, got {getattr(self, name)!r}'
-                )
         if self.minimum_depth >= self.length:
             raise ParameterError(
                 f'minimum_depth must be < length = {self.length:g} m, got {self.minimum_depth!r}'

@@ -18,16 +18,14 @@ from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
-    signed,
-    signed_axis,
 )
-from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status_node import live_statuses, sentence, summary_statuses
 from needle_identification.stiffness.estimate import summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_ros import contract
+from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError

@@ -1,1 +1,1 @@
-"""Command line, demo, experiments and reports of the needle insertion suite."""
+"""Command line, running nodes and reports of the needle insertion suite."""

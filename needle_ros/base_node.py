@@ -329,7 +329,7 @@ class BaseNode(ParameterNode):
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
 
-    def tell(self, events: EventLog) -> None:
+    def publish_events(self, events: EventLog) -> None:
         """Log the new lines of an event log (`EventLog`), and publish diagnostics on change."""
         if not events.changed:
             return

@@ -35,31 +35,19 @@ USER: Final = 'user'
 
 
 class Qos(NamedTuple):
-    """
-    Quality of service that the publishers of a topic offer.
+    """Quality of service that the publishers of a topic offer."""
 
-    Attributes
-    ----------
-    name : str
-        Name in the documentation.
-    reliable : bool
-        Whether a lost message is sent again.
-    latched : bool
-        Whether late-joining subscribers receive the previous messages.
-    depth : int
-        Messages kept for a busy or late-joining subscriber.
-    lossy : bool
-        Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
-    lease : float
-        Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
-
-    """
-
+    #: Name in the documentation.
     name: str
+    #: Whether a lost message is sent again.
     reliable: bool
+    #: Whether late-joining subscribers receive the previous messages.
     latched: bool
+    #: Messages kept for a busy or late-joining subscriber.
     depth: int
+    #: Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
     lossy: bool = False
+    #: Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
     lease: float = 0.0
 
 
@@ -103,22 +91,12 @@ LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
 
 
 class Joint(NamedTuple):
-    """
-    A joint of a JointState.
-
-    Attributes
-    ----------
-    name : str
-        Name of the joint.
-    unit : str
-        Unit of the position; the unit of the velocity is the same per second.
-    effort : str
-        Unit of the effort, '' if the topic has no efforts.
-
-    """
+    """A joint of a JointState."""
 
     name: str
+    #: Unit of the position; the unit of the velocity is the same per second.
     unit: str
+    #: Unit of the effort, '' if the topic has no efforts.
     effort: str = ''
 
 
@@ -143,36 +121,19 @@ _QUANTITIES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """
-    A topic of the contract.
+    """A topic of the contract."""
 
-    Attributes
-    ----------
-    name : str
-        Name, relative to the namespace of the node; ``~`` stands for the node.
-    type_name : str
-        Message type.
-    publisher : str
-        Publishing nodes, `EVERY_NODE`, or `USER`.
-    meaning : str
-        Content of the messages, for the documentation.
-    qos : Qos
-        Quality of service.
-    frame : str
-        Frame of the header, '' without a frame.
-    joints : tuple of Joint
-        Joints of a JointState.
-    stamp : Stamp
-        Meaning of the stamp.
-
-    """
-
+    #: Name, relative to the namespace of the node; ``~`` stands for the node.
     name: str
     type_name: str
+    #: Publishing nodes, `EVERY_NODE`, or `USER`.
     publisher: str
+    #: Content of the messages, for the documentation.
     meaning: str
     qos: Qos = SENSOR
+    #: Frame of the header, '' without a frame.
     frame: str = ''
+    #: Joints of a JointState.
     joints: tuple[Joint, ...] = ()
     stamp: Stamp = Stamp.UNCHECKED
 
@@ -186,6 +147,10 @@ class Topic:
             *(Quantity(f'velocity of {joint.name}', f'{joint.unit}/s') for joint in self.joints),
             *(Quantity(f'effort of {j.name}', j.effort) for j in self.joints if j.effort),
         )
+
+    def without_efforts(self) -> Topic:
+        """Return the topic of a JointState without efforts."""
+        return replace(self, joints=tuple(joint._replace(effort='') for joint in self.joints))
 
     def template(self) -> Template:
         """Return a template that writes and reads messages of this topic."""
@@ -261,20 +226,18 @@ def ground_truth(modes: int, *, commanded: bool) -> Topic:
     """
     bending = [Joint(f'q{k + 1}', 'm^1.5', 'N m^-0.5') for k in range(modes)]
     joints = (Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m'), *bending)
-    if not commanded:
-        joints = tuple(joint._replace(effort='') for joint in joints)
-    return replace(GROUND_TRUTH, joints=joints)
+    truth = replace(GROUND_TRUTH, joints=joints)
+    return truth if commanded else truth.without_efforts()
 
 
 def steered_truth(*, commanded: bool) -> Topic:
     """Return `GROUND_TRUTH` of a steered needle; `commanded` adds the efforts."""
-    joints: tuple[Joint, ...] = (
+    joints = (
         Joint('d', 'm', 'N'), Joint('tip_x', 'm', 'N'), Joint('tip_z', 'm', 'N'),
         Joint('tip_roll', 'rad', 'N m'),
     )  # fmt: skip
-    if not commanded:
-        joints = tuple(joint._replace(effort='') for joint in joints)
-    return replace(GROUND_TRUTH, joints=joints)
+    truth = replace(GROUND_TRUTH, joints=joints)
+    return truth if commanded else truth.without_efforts()
 
 
 END_EFFECTOR_POSE: Final = Topic(

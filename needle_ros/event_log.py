@@ -29,32 +29,18 @@ class Severity(IntEnum):
 
 
 class EventLog:
-    """
-    Event log: collects log lines until the node publishes them.
-
-    Parameters
-    ----------
-    steady : callable
-        Returns the time of a steady clock [s].
-
-    Attributes
-    ----------
-    rejected : int
-        Number of rejected inputs.
-    last_rejection : str
-        Reason of the last rejection, or last fault of the motion.
-    changed : bool
-        Whether there are new lines or changes.
-
-    """
+    """Log lines until the node publishes them; `steady` is the time of a steady clock [s]."""
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
+        #: Number of rejected inputs.
         self.rejected = 0
+        #: Reason of the last rejection, or last fault of the motion.
         self.last_rejection = ''
+        #: Whether there are new lines or changes.
         self.changed = False
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []
-        self._told: dict[str, float] = {}
+        self._times: dict[str, float] = {}
         self._left_out: Counter[str] = Counter()
 
     def add(self, severity: Severity, line: str = '', kind: str = '') -> None:
@@ -66,10 +52,10 @@ class EventLog:
         """
         if kind:
             now = self._steady()
-            if now - self._told.get(kind, -inf) < _PAUSE:
+            if now - self._times.get(kind, -inf) < _PAUSE:
                 self._left_out[kind] += 1
                 return
-            self._told[kind] = now
+            self._times[kind] = now
             more = self._left_out.pop(kind, 0)
             line = f'{line} ({more} similar omitted)' if line and more else line
         if line:

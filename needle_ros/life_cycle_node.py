@@ -31,18 +31,8 @@ class LifeCycle:
 
     A transition that is invalid in the current state is rejected; rclpy raises an error that ends
     the node. `configure` first runs the preparation while the executor spins; the response follows
-    it.
-
-    Parameters
-    ----------
-    node : LifecycleNode
-        The node.
-    preparation : Preparation
-        Work before `configure`.
-    is_valid : callable
-        Returns whether the parameters are valid; if not, the preparation is skipped and
-        `configure` fails at once.
-
+    it. With invalid parameters (`is_valid`) the preparation is skipped, and `configure` fails at
+    once.
     """
 
     def __init__(

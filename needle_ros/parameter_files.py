@@ -14,21 +14,10 @@ _MARK = 'ros__parameters'
 
 
 class ParameterSection(NamedTuple):
-    """
-    Section of a parameter file.
-
-    Attributes
-    ----------
-    file : str
-        The file.
-    nodes : str
-        Full name of the nodes; ``*`` matches one name, ``**`` any number of names.
-    names : frozenset of str
-        Names of the parameters.
-
-    """
+    """Section of a parameter file, with the names of its parameters."""
 
     file: str
+    #: Full name of the nodes; ``*`` matches one name, ``**`` any number of names.
     nodes: str
     names: frozenset[str]
 
@@ -52,7 +41,7 @@ def sections(arguments: Sequence[str]) -> list[ParameterSection]:
     ]
 
 
-def strangers(found: Sequence[ParameterSection], node: str) -> list[str]:
+def unmatched_files(found: Sequence[ParameterSection], node: str) -> list[str]:
     """Return a warning for each file without a section for a node."""
     lines = []
     for file in dict.fromkeys(section.file for section in found):

@@ -15,7 +15,7 @@ from dataclasses import fields
 from typing import Any, ClassVar, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
-from needle_ros.settings import from_values, unknown_name
+from needle_ros.settings import check_choice, from_values, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
@@ -138,9 +138,9 @@ class ParameterNode(LifecycleNode):
         value = (changes or {}).get(name, self._value(name))
         if isinstance(value, bool):
             value = _READ_AS_BOOL[not value]
-        if not isinstance(value, str) or (valid and value not in valid):
-            raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
-        return value
+        if valid:
+            check_choice(name, value, valid)
+        return str(value)
 
     def configuration(self) -> str:
         """Return all parameters as a ROS parameter file (YAML)."""

@@ -32,27 +32,16 @@ class Preparation:
     """
     Steps that run once, in the thread of the caller or in a separate thread.
 
-    Parameters
-    ----------
-    steps : iterable of PreparationProgress
-        Each iteration executes the next step.
-
-    Attributes
-    ----------
-    progress : PreparationProgress
-        The latest state.
-    error : Exception or None
-        Error of a step.
-    is_complete : bool
-        Whether all steps are done, or a step failed.
-
+    Each iteration of `steps` executes the next step.
     """
 
     def __init__(self, steps: Iterable[PreparationProgress]) -> None:
         self._steps = iter(steps)
         self.progress = PreparationProgress(0, 1, '')
+        #: Error of a step.
         self.error: Exception | None = None
         self._thread: Thread | None = None
+        #: Whether all steps are done, or a step failed.
         self.is_complete = False
 
     @property

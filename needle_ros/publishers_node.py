@@ -48,23 +48,14 @@ class Publishers:
 
     A killed node stays in the graph for 20 s. With a lease it no longer counts after the end of
     the lease, 0.5 s. Publishers without a lease, such as ``ros2 topic pub``, count as long as they
-    are in the graph.
-
-    Parameters
-    ----------
-    node : BaseNode
-        The subscribing node.
-    lease : Topic
-        Topic of the lease, see `offer_lease`.
-    on_change : callable, optional
-        Called when a lease ends or is renewed.
-
+    are in the graph. `lease` is as in `offer_lease`; `on_change` is called when a lease ends or
+    is renewed.
     """
 
     def __init__(
         self, node: BaseNode, lease: Topic, on_change: Callable[[], object] | None = None
     ) -> None:
-        self._node, self._told = node, on_change
+        self._node, self._notify = node, on_change
         self._lease = _name(node, lease)
         self._over = 0
         node.create_subscription(
@@ -77,8 +68,8 @@ class Publishers:
 
     def _on_change(self, event: Any) -> None:
         self._over = event.not_alive_count
-        if self._told is not None:
-            self._told()
+        if self._notify is not None:
+            self._notify()
 
     def count(self, topic: Topic, matched: int = 0) -> int:
         """

@@ -57,25 +57,14 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """
-    Answer of a receiver to a request.
+    """Answer of a receiver to a request."""
 
-    Attributes
-    ----------
-    topic : str
-        Topic of the request, by its name in the contract.
-    stamp : int
-        Stamp of the request [ns]; 0 for a message without a stamp.
-    verdict : Verdict
-        The result.
-    reason : str
-        Reason of a rejection, for users.
-
-    """
-
+    #: Topic of the request, by its name in the contract.
     topic: str
+    #: Stamp of the request [ns]; 0 for a message without a stamp.
     stamp: int
     verdict: Verdict
+    #: Reason of a rejection, for users.
     reason: str = ''
 
     @property
@@ -86,22 +75,13 @@ class Acknowledgement:
 
 @dataclass(frozen=True, slots=True)
 class RequestStatus:
-    """
-    Accepted request topics of a node and its latest answers, as fields of a DiagnosticStatus.
+    """Accepted request topics of a node and its latest answers, as part of a DiagnosticStatus."""
 
-    Attributes
-    ----------
-    takes : Mapping of str to tuple of str
-        Moved joints by topic of the request.
-    answers : tuple of Acknowledgement
-        The latest answers, the newest last.
-    paused : bool
-        Whether a user has paused the motion, for an unlimited time.
-
-    """
-
+    #: Moved joints by topic of the request.
     takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    #: The latest answers, the newest last.
     answers: tuple[Acknowledgement, ...] = ()
+    #: Whether a user has paused the motion, for an unlimited time.
     paused: bool = False
 
     def to_values(self) -> dict[str, str]:
@@ -143,15 +123,8 @@ class RequestLog:
     """
     Log of received requests: accept each once, in the order of the stamps, and record answers.
 
-    Parameters
-    ----------
-    takes : Mapping of Topic to sequence of str
-        Moved joints by topic of the request.
-    frames : sequence of str
-        Valid frames of a request.
-    steady : callable
-        Returns the time of a steady clock [s].
-
+    `takes` are the moved joints by topic of the request, `frames` the valid frames of a request;
+    `steady` returns the time of a steady clock [s].
     """
 
     def __init__(
@@ -256,24 +229,8 @@ class PendingRequest:
     """
     A request that is repeated until it is answered.
 
-    Parameters
-    ----------
-    topic : Topic
-        Its topic.
-    stamp : int
-        Its stamp [ns], equal in all repetitions, so that the request is executed once.
-    node : str
-        Name of the expected receiver.
-    steady : callable
-        Returns the time of a steady clock [s].
-
-    Attributes
-    ----------
-    answer : Acknowledgement or None
-        The latest answer.
-    node : str
-        Name of the expected receiver, or of the node that has answered.
-
+    Its stamp [ns] is equal in all repetitions, so that it is executed once. `steady` returns the
+    time of a steady clock [s].
     """
 
     def __init__(
@@ -281,10 +238,12 @@ class PendingRequest:
     ) -> None:
         self._topic, self._stamp, self._steady = topic.name, stamp, steady
         self._begun, self._repeats = steady(), 0
+        #: The latest answer.
         self.answer: Acknowledgement | None = None
+        #: Name of the expected receiver, or of the node that has answered.
         self.node = node
 
-    def hear(self, node: str, status: RequestStatus) -> None:
+    def take_status(self, node: str, status: RequestStatus) -> None:
         """Process the status of a node."""
         answer = status.answer_to(self._topic, self._stamp)
         if answer is not None and (self.answer is None or not self.done):

@@ -17,7 +17,7 @@ from types import FrameType
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError
 from needle_ros.network import LOCAL, RANGE, stay_local
-from needle_ros.parameter_files import sections, shared_names, strangers
+from needle_ros.parameter_files import sections, shared_names, unmatched_files
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
@@ -113,7 +113,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
 def _read_files(node: BaseNode) -> None:
     """Set the shared parameters of a node, and warn of files without a section for it."""
     found, name = sections(sys.argv), node.get_fully_qualified_name()
-    for line in strangers(found, name):
+    for line in unmatched_files(found, name):
         node.get_logger().warning(line)
     node.shared = shared_names(found, name)
 

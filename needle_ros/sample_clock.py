@@ -14,7 +14,6 @@ _TICK: Final = 1e-3
 #: Samples per tick at maximum speed.
 _AT_ONCE: Final = 20
 
-
 #: Maximum lead of an independent time over a recorder, by lockstep [samples]: the pending messages
 #: fit into the queues of the recorder, in lockstep together with the messages of other nodes.
 _AHEAD: Final = {True: 10, False: 80}
@@ -30,39 +29,11 @@ class SampleClock:
     Samples missed in a stall are taken afterwards, up to the backlog. Older samples are dropped if
     simulated time equals the time of the clock; an independent simulated time waits instead.
 
-    Parameters
-    ----------
-    rate : float
-        Samples per second of simulated time [Hz].
-    factor : float
-        Simulated seconds per second of the clock; 0: as fast as possible.
-    backlog : float
-        Maximum delay that is made up after a stall [s].
-    own : bool
-        Whether simulated time is independent of the clock and may wait; always so in lockstep, and
-        if the factor is not 1.
-    lockstep : bool
-        Whether each sample waits for the responses to the sample before; time then starts at zero.
-
-    Attributes
-    ----------
-    tick : float
-        Period of the schedule [s].
-    stamp : int
-        Simulated time of the newest sample [ns].
-    paused : bool
-        Whether time is paused.
-    lost : int
-        Number of dropped samples.
-    waited : int
-        Accumulated delay of simulated time by an overloaded machine [ns].
-    participants : int
-        Number of nodes that report processed samples in lockstep: the next sample waits for all of
-        them, and for a command.
-    recorded : dict of str to int
-        Stamp of the newest sample of each recorder, by name [ns]: an independent time is at most
-        80 samples ahead of it, in lockstep 10.
-
+    `rate` is in Hz of simulated time, `factor` in simulated seconds per second of the clock (0: as
+    fast as possible), and `backlog` the maximum delay that is made up after a stall [s]. `own`
+    makes simulated time independent of the clock; it always is in lockstep, and if the factor is
+    not 1. In lockstep each sample waits for the responses to the sample before, and time starts at
+    zero.
     """
 
     def __init__(
@@ -71,9 +42,12 @@ class SampleClock:
         self._rate, self._factor = rate, factor
         self._own, self._lockstep = own or lockstep or factor != 1.0, lockstep
         self._backlog = max(1, int(backlog * rate * factor))
+        #: Number of nodes that report processed samples in lockstep: the next sample waits for all
+        #: of them, and for a command.
         self.participants = 0
+        #: Stamp of the newest sample of each recorder, by name [ns].
         self.recorded: dict[str, int] = {}
-        # Several samples per tick are allowed, so the tick rate need not exceed real time.
+        #: Period of the schedule [s]; with several samples per tick it need not exceed real time.
         self.tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK)) if factor else _TICK
         #: Maximum samples per tick if time may wait: more would overflow the subscribers.
         self._burst = ceil(2.0 * rate * factor * self.tick) if factor else _AT_ONCE
@@ -82,6 +56,7 @@ class SampleClock:
     def begin(self, now: int, *, paused: bool = False) -> None:
         """Start simulated time, optionally paused; `now` is the time of the clock [ns]."""
         self.paused = paused
+        #: Number of dropped samples, and delay of simulated time by an overloaded machine [ns].
         self.lost = self.waited = 0
         #: Nodes that have answered the newest sample in lockstep; None if no answer is needed.
         self._answers: set[str] | None = None
@@ -92,6 +67,7 @@ class SampleClock:
         """Restart the sample count at the time `now` of the clock [ns]."""
         #: Time of the clock at the start of simulated time [ns], and number of samples since.
         self._clock, self._count = now, 0
+        #: Simulated time of the newest sample [ns].
         self.stamp = self._start
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
 from math import inf, isfinite
@@ -15,6 +15,9 @@ _Settings = TypeVar('_Settings')
 
 #: Types accepted for a tuple.
 _LISTS: Final = (list, array, type(None))
+
+#: Names of the types of fields that are not numbers.
+_NAMES: Final = {bool: 'true or false', str: 'text'}
 
 #: Larger integers cannot be converted to float.
 _LARGEST_INTEGER: Final = 10**300
@@ -50,20 +53,46 @@ def constant(
     )
 
 
+def choice(default: str, valid: Iterable[str], meaning: str = '') -> Any:
+    """Declare a dataclass field with one of the `valid` words, which its description lists."""
+    words = tuple(valid)
+    description = f'one of {", ".join(words)}' + (meaning and f': {meaning}')
+    return field(default=default, metadata={'valid': words, 'description': description})
+
+
+def flag(default: bool, description: str) -> Any:
+    """Declare a dataclass field that is true or false."""
+    return field(default=default, metadata={'type': bool, 'description': description})
+
+
+def text(default: str, description: str) -> Any:
+    """Declare a dataclass field with any text."""
+    return field(default=default, metadata={'type': str, 'description': description})
+
+
 def check_constants(values: object) -> None:
     """
-    Check that every numeric field of a dataclass is within its range, and finite or unlimited.
+    Check every field of a dataclass that is declared by a function of this module.
 
     The message of the `ParameterError` contains the field, the value, and the valid range with its
-    unit.
+    unit, or the valid words.
     """
     for item in fields(values):  # type: ignore[arg-type]
-        if 'unit' not in item.metadata:
-            continue
-        value = getattr(values, item.name)
-        several = isinstance(item.default, tuple) and isinstance(value, tuple)
-        for number in value if several else (value,):
-            _check_number(item.name, number, item.metadata)
+        value, meta = getattr(values, item.name), item.metadata
+        if 'unit' in meta:
+            several = isinstance(item.default, tuple) and isinstance(value, tuple)
+            for number in value if several else (value,):
+                _check_number(item.name, number, meta)
+        elif 'valid' in meta:
+            check_choice(item.name, value, meta['valid'])
+        elif 'type' in meta and not isinstance(value, meta['type']):
+            raise ParameterError(f'{item.name} must be {_NAMES[meta["type"]]}, got {value!r}')
+
+
+def check_choice(name: str, value: object, valid: Collection[str]) -> None:
+    """Raise `ParameterError` if a value is not one of the valid words."""
+    if not isinstance(value, str) or value not in valid:
+        raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
 
 
 def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:

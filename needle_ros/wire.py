@@ -64,26 +64,16 @@ _TEMPLATES: Final = 32
 
 
 class Reading(NamedTuple):
-    """
-    Content of a message.
+    """Content of a message."""
 
-    Attributes
-    ----------
-    stamp : int
-        Time of the header [ns].
-    frame : str
-        Frame of the header.
-    names : tuple of str
-        Joints; empty if the type has no such field.
-    values : tuple of tuple of float
-        Positions, velocities and efforts of a JointState; else one tuple of all numbers, in the
-        order of the fields.
-
-    """
-
+    #: Time of the header [ns].
     stamp: int
+    #: Frame of the header.
     frame: str
+    #: Joints; empty if the type has no such field.
     names: tuple[str, ...]
+    #: Positions, velocities and efforts of a JointState; else one tuple of all numbers, in the
+    #: order of the fields.
     values: tuple[tuple[float, ...], ...]
 
 
@@ -150,31 +140,9 @@ class Template:
     Message with a header as a template with a variable stamp and variable numbers.
 
     It writes and reads single messages; `decode` reads a batch. Padding is written as zeros (rmw
-    writes uninitialized memory) and is not compared on reading.
-
-    Parameters
-    ----------
-    type_name : str
-        One of `TYPES`.
-    frame : str
-        Frame of the header.
-    names : sequence of str
-        Joints of a JointState.
-    counts : sequence of int
-        Number of positions, velocities and efforts of a JointState.
-
-    Attributes
-    ----------
-    frame : str
-        Frame of the header.
-    names : tuple of str
-        Joints; empty if the type has no such field.
-    arrays : tuple of (int, int)
-        Position in the message [bytes] and length of each array of numbers: positions, velocities
-        and efforts of a JointState, else all numbers as one array.
-    order : str
-        Byte order, ``<`` or ``>``.
-
+    writes uninitialized memory) and is not compared on reading. `type_name` is one of `TYPES`;
+    `names` are the joints of a JointState, and `counts` the numbers of its positions, velocities
+    and efforts.
     """
 
     def __init__(
@@ -207,6 +175,8 @@ class Template:
         if fields.numbers:
             arrays.append(cursor.numbers(fields.numbers))
         cursor.close()
+        #: Position in the message [bytes] and length of each array of numbers (positions,
+        #: velocities and efforts of a JointState, else one array), and byte order, ``<`` or ``>``.
         self.arrays, self.order = tuple(arrays), cursor.order
         self._fixed, self._message = cursor.fixed, bytes(cursor.message)
         #: Created on first use; a batch does not need it.
@@ -318,27 +288,15 @@ Choice = Callable[[Template], Sequence[int] | None]
 
 
 class Decoded(NamedTuple):
-    """
-    Content of a batch of messages.
+    """Content of a batch of messages."""
 
-    Attributes
-    ----------
-    stamps : ndarray, shape (n,)
-        Stamps of the headers [ns].
-    values : ndarray, shape (n, k)
-        The selected numbers, nan where a message has no such number.
-    used : ndarray, shape (n,)
-        Indices of these messages in the batch.
-    invalid : int
-        Number of invalid messages.
-    fault : str
-        Error of the first invalid message.
-
-    """
-
+    #: Stamps of the headers [ns], shape (n,).
     stamps: NDArray[np.int64]
+    #: The selected numbers, nan where a message has no such number, shape (n, k).
     values: NDArray[np.float64]
+    #: Indices of these messages in the batch, shape (n,).
     used: NDArray[np.intp]
+    #: Number of invalid messages, and error of the first.
     invalid: int
     fault: str
 
@@ -354,21 +312,9 @@ def decode(
     """
     Parse stamps and selected numbers of a batch of messages.
 
-    Invalid messages and messages that `choice` does not select are left out.
-
-    Parameters
-    ----------
-    data : ndarray, shape (bytes,)
-        Bytes of all messages.
-    begin, end : ndarray, shape (m,)
-        First byte and end of each message [bytes].
-    type_name : str
-        One of `TYPES`.
-    choice : callable
-        Selection of the numbers.
-    columns : int
-        Number of selected numbers.
-
+    `data` are the bytes of all messages, `begin` and `end`, shape (m,), the first byte and the end
+    of each. `choice` selects `columns` numbers of a message. Invalid messages and messages that it
+    does not select are left out.
     """
     stamps = np.zeros(len(begin), dtype=np.int64)
     values = np.full((len(begin), columns), np.nan)

@@ -113,31 +113,20 @@ class InsertionStudy:
 
 
 class _Course(NamedTuple):
-    """
-    Trajectory of one insertion up to its end or stop.
+    """Trajectory of one insertion up to its end or stop."""
 
-    Attributes
-    ----------
-    model : NeedleModel
-        The true needle.
-    states : ndarray, shape (k + 1, 2 (2 + n))
-        States at the samples.
-    commands, forces : ndarray, shape (k,)
-        Command of each sample, and the force that acts from that sample on [N].
-    noise : ndarray, shape (k + 1, 2)
-        Encoder errors of depth [m] and velocity [m/s].
-    goal : ndarray, shape (k + 1,)
-        Reference [m]; NaN without a reference.
-    stopped, left : float
-        As in `FIGURES`.
-    """
-
+    #: The true needle.
     model: NeedleModel
+    #: States at the samples, shape (k + 1, 2 (2 + n)).
     states: FloatArray
+    #: Command of each sample, and the force that acts from that sample on [N], shape (k,).
     commands: FloatArray
     forces: FloatArray
+    #: Encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2).
     noise: FloatArray
+    #: Reference [m], shape (k + 1,); NaN without a reference.
     goal: FloatArray
+    #: As in `FIGURES`.
     stopped: float
     left: float
 
@@ -363,7 +352,7 @@ class InsertionProtocol:
         acting = np.concatenate([np.zeros(delay), commands])[:count] + noise[:, 2]
         done = int(batch.completed[0])
         course = _Course(
-            model, batch.courses[0], commands, acting, _said(noise), batch.goal, 0.0,
+            model, batch.courses[0], commands, acting, _padded(noise), batch.goal, 0.0,
             float(done < count),
         )  # fmt: skip
         course = _cut(course, done)
@@ -396,9 +385,9 @@ class InsertionProtocol:
         models = [NeedleModel(self._truth(row)) for row in rows]
         commands, noise = [], []
         for row, rng in zip(rows, streams, strict=True):
-            way = row['target'] - row['depth']
-            force = copysign(numbers.push, way)
-            pushed = round(_time(nominal, force, way) * numbers.rate)
+            distance = row['target'] - row['depth']
+            force = copysign(numbers.push, distance)
+            pushed = round(_time(nominal, force, distance) * numbers.rate)
             count = pushed + max(1, round(numbers.wait * numbers.rate))
             commands.append(np.where(np.arange(count) < pushed, force, 0.0))
             noise.append(self._noise(row, rng, count))
@@ -421,7 +410,7 @@ class InsertionProtocol:
             count = len(pushes)
             done = min(round(batch.completed[k] * numbers.rate), count)
             course = _Course(
-                model, batch.states[k], pushes, forces[k], _said(blur),
+                model, batch.states[k], pushes, forces[k], _padded(blur),
                 np.full(count + 1, nan), nan, float(done < count),
             )  # fmt: skip
             yield _cut(course, done)
@@ -434,7 +423,7 @@ class InsertionProtocol:
         moving = np.flatnonzero(np.abs(speed) > _REST)
         still = 0 if not len(moving) else int(moving[-1]) + 1
         after = speed[-(1 + round(self._numbers.wait * self._numbers.rate)) :]
-        ways = np.sign(after[np.abs(after) > _REST])
+        directions = np.sign(after[np.abs(after) > _REST])
         whole = not (course.left or course.stopped == 1.0)
         return {
             'error': error,
@@ -444,13 +433,13 @@ class InsertionProtocol:
             'force': float(np.abs(course.forces).max(initial=0.0)),
             'deflection': float(np.abs(course.tip).max()),
             'rest': still * self._period if whole and still < len(speed) else nan,
-            'reversals': float(np.count_nonzero(np.diff(ways))) if whole else nan,
+            'reversals': float(np.count_nonzero(np.diff(directions))) if whole else nan,
             'stopped': course.stopped,
             'left': course.left,
         }
 
 
-def _said(noise: FloatArray) -> FloatArray:
+def _padded(noise: FloatArray) -> FloatArray:
     """Append zeros for the last sample, which no command follows, to the encoder noise."""
     return np.concatenate([noise[:, :2], np.zeros((1, 2))])
 
@@ -466,13 +455,13 @@ def _cut(course: _Course, end: int) -> _Course:
     )
 
 
-def _time(axis: Axis, force: float, way: float) -> float:
+def _time(axis: Axis, force: float, distance: float) -> float:
     """Return the time in which a constant force moves an axis by a distance, from rest [s]."""
-    if way == 0.0:
+    if distance == 0.0:
         return 0.0
 
     def missing(time: float) -> float:
-        return abs(way) - abs(axis.propagate(0.0, 0.0, force, time)[0])
+        return abs(distance) - abs(axis.propagate(0.0, 0.0, force, time)[0])
 
     most = 1e-3
     while missing(most) > 0.0:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from needle_ros.errors import ParameterError
-from needle_ros.settings import unknown_name
+from needle_ros.settings import check_choice, unknown_name
 
 
 def check_names(where: str, given: Iterable[Any], valid: Iterable[str]) -> None:
@@ -28,7 +28,5 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
 
 def one_of(name: str, value: Any, valid: Iterable[str]) -> str:
     """Return a word of the file; raise `ParameterError` if it is not valid."""
-    words = tuple(valid)
-    if value not in words:
-        raise ParameterError(f'{name} must be one of {", ".join(words)}, got {value!r}')
+    check_choice(name, value, tuple(valid))
     return str(value)

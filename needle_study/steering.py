@@ -53,9 +53,7 @@ HIT: Final = 1e-3
 #: Insertion speed of a replay [m/s].
 _SPEED: Final = 0.01
 
-#: Joint states of a guide without efforts.
-_STATES: Final = contract.steered_states()
-_JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one in _STATES.joints))
+_JOINTS: Final = contract.steered_states().without_efforts()
 
 #: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63
@@ -129,10 +127,10 @@ class SteeringProtocol:
                 f'settings.depth must be <= {reach:g} m, the length of the needle without its '
                 f'free length, got {numbers.depth:g} m'
             )
-        ways = numbers.depth / numbers.step
-        if ways > _MOST:
+        steps = numbers.depth / numbers.step
+        if steps > _MOST:
             raise ParameterError(
-                f'settings: depth over step must be <= {_MOST} steps, got {ways:.3g}'
+                f'settings: depth over step must be <= {_MOST} steps, got {steps:.3g}'
             )
         moves = {
             DEFAULT_LAW: numbers.guide_limit or numbers.turns,
@@ -259,22 +257,22 @@ class SteeringProtocol:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
         tilt = row['tilt_x'], row['tilt_z']
-        still, seen = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
+        still, messages = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
         def watch(plant: SteeringPlant) -> None:
             one = plant.needle
             stamp = round(one.depth / _SPEED * NANOSECONDS)
-            seen.append(
+            messages.append(
                 MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
             )
             x, z = plant.tip.tolist()
-            seen.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
+            messages.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
 
         self._steered(self._truth(row, rng), row, rng, watch)
         yield MeasuredRun(
             contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z'])
         )
-        yield from seen
+        yield from messages
 
     def _steered(
         self,
@@ -305,12 +303,12 @@ class SteeringProtocol:
             'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.travel,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
-        there = law.expected()
-        if there is not None:
+        estimate = law.expected()
+        if estimate is not None:
             figures |= {
-                'said_x': float(there.mean[0]),
-                'said_z': float(there.mean[1]),
-                'held': float(there.contains(tip)),
+                'said_x': float(estimate.mean[0]),
+                'said_z': float(estimate.mean[1]),
+                'held': float(estimate.contains(tip)),
                 'warned': float(bool(done.warning)),
             }
         return figures

@@ -81,16 +81,16 @@ class Study:
                 sequence.fast_forward(first)
             # A single sample first: scipy warns of a first draw that is not a power of 2.
             return np.concatenate([sequence.random(1), sequence.random(count - 1)])
-        chance = np.array(
+        uniform = np.array(
             [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
         ).reshape(count, dimensions)
         if self.design != 'latin':
-            return chance
+            return uniform
         strata = [
             _permutation(self.samples, self.seed, dimension)[first : first + count]
             for dimension in range(dimensions)
         ]
-        return np.asarray((np.transpose(strata) + chance) / self.samples).reshape(chance.shape)
+        return np.asarray((np.transpose(strata) + uniform) / self.samples).reshape(uniform.shape)
 
     def rng(self, number: int, stream: int) -> np.random.Generator:
         """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""

@@ -63,8 +63,8 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
     """Estimate a probability from values 1 and 0, with the interval of Wilson; NaN is ignored."""
     n, yes = 0, 0.0
     for values in parts:
-        seen = values[np.isfinite(values)]
-        n, yes = n + len(seen), yes + float(seen.sum())
+        finite = values[np.isfinite(values)]
+        n, yes = n + len(finite), yes + float(finite.sum())
     if n == 0:
         return Estimate(np.nan, 0.0, 1.0, 0)
     p, z = yes / n, _NORMAL
@@ -80,17 +80,17 @@ def quantile(values: FloatArray, part: float) -> Estimate:
     The distribution-free interval lies between two of the values; an end is infinite with too few
     values.
     """
-    seen = np.sort(values[np.isfinite(values)])
-    n = len(seen)
+    finite = np.sort(values[np.isfinite(values)])
+    n = len(finite)
     if n == 0:
         return Estimate(np.nan, -np.inf, np.inf, 0)
     # Ranks, from 1: the true value is below the first, and above the second, in one of 40 studies
     # each.
     low, high = (int(binom.ppf(tail, n, part)) for tail in (_TAIL, 1.0 - _TAIL))
     return Estimate(
-        float(np.quantile(seen, part)),
-        float(seen[low - 1]) if low >= 1 else -np.inf,
-        float(seen[high]) if high < n else np.inf,
+        float(np.quantile(finite, part)),
+        float(finite[low - 1]) if low >= 1 else -np.inf,
+        float(finite[high]) if high < n else np.inf,
         n,
     )
 
@@ -102,16 +102,16 @@ def share(values: FloatArray, by: FloatArray) -> float:
     First-order Sobol index, from means of equal groups, corrected for its bias; NaN for fewer than
     200 samples.
     """
-    seen = np.isfinite(values)
-    y = values[seen][np.argsort(by[seen], kind='stable')]
+    finite = np.isfinite(values)
+    y = values[finite][np.argsort(by[finite], kind='stable')]
     if len(y) < _FEWEST:
         return float('nan')
-    if np.ptp(y) == 0.0 or np.ptp(by[seen]) == 0.0:
+    if np.ptp(y) == 0.0 or np.ptp(by[finite]) == 0.0:
         return 0.0
     means = [(len(one), one.mean()) for one in np.array_split(y, _GROUPS)]
     between = sum(n * (mean - y.mean()) ** 2 for n, mean in means) / (len(y) * y.var())
-    chance = (_GROUPS - 1) / (len(y) - 1)
-    return float(max(0.0, (between - chance) / (1.0 - chance)))
+    by_chance = (_GROUPS - 1) / (len(y) - 1)
+    return float(max(0.0, (between - by_chance) / (1.0 - by_chance)))
 
 
 def worst(parts: Iterable[FloatArray], number: int) -> list[int]:

@@ -16,44 +16,24 @@ _ELEMENTS: Final = 24
 
 #: Matrices of a cubic element of unit length, bending stiffness and mass; coordinates are value
 #: and slope at both ends.
-_BENDING: Final = np.array(
-    [
-        [12.0, 6.0, -12.0, 6.0],
-        [6.0, 4.0, -6.0, 2.0],
-        [-12.0, -6.0, 12.0, -6.0],
-        [6.0, 2.0, -6.0, 4.0],
-    ]
-)
-_GRAM: Final = (
-    np.array(
-        [
-            [156.0, 22.0, 54.0, -13.0],
-            [22.0, 4.0, 13.0, -3.0],
-            [54.0, 13.0, 156.0, -22.0],
-            [-13.0, -3.0, -22.0, 4.0],
-        ]
-    )
-    / 420.0
-)
+_BENDING: Final = np.array([
+    [12.0, 6.0, -12.0, 6.0], [6.0, 4.0, -6.0, 2.0],
+    [-12.0, -6.0, 12.0, -6.0], [6.0, 2.0, -6.0, 4.0],
+])  # fmt: skip
+_GRAM: Final = np.array([
+    [156.0, 22.0, 54.0, -13.0], [22.0, 4.0, 13.0, -3.0],
+    [54.0, 13.0, 156.0, -22.0], [-13.0, -3.0, -22.0, 4.0],
+]) / 420.0  # fmt: skip
 
 
 class WholeNeedle(NamedTuple):
-    """
-    Response of a beam that is clamped at its base.
+    """Response of a beam that is clamped at its base."""
 
-    Attributes
-    ----------
-    frequency : float
-        First natural frequency [Hz].
-    compliance : float
-        Deflection of the tip per lateral force at the tip [m/N].
-    force : float
-        Magnitude of the lateral force at the base for 1 N at the tip [N].
-
-    """
-
+    #: First natural frequency [Hz].
     frequency: float
+    #: Deflection of the tip per lateral force at the tip [m/N].
     compliance: float
+    #: Magnitude of the lateral force at the base for 1 N at the tip [N].
     force: float
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from needle_dynamics.simulated.force_sensor import HIGHEST_RATE
-from needle_insertion.experiment.population import draw_friction, draw_stiffness
-from needle_insertion.experiment.protocol import ExperimentProtocol, indenter_name
-from needle_insertion.experiment.tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import ParameterError
+from reproduction.population import draw_friction, draw_stiffness
+from reproduction.protocol import ExperimentProtocol, indenter_name
 
 #: Sample rates at which strokes and presses are resolved [Hz].
 RATES: Final = (40.0, 5000.0)

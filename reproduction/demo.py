@@ -20,27 +20,6 @@ from needle_identification import (
     summarize_stiffness,
     write_result,
 )
-from needle_insertion.demo.aiming import (
-    aiming_checks,
-    animate_aiming,
-    draw_aiming,
-    read_aimed,
-    record_aimed,
-)
-from needle_insertion.demo.bending import bending_checks, draw_bending, record_bending
-from needle_insertion.demo.insertion import (
-    draw_insertions,
-    insertion_checks,
-    RATE,
-    read_insertion,
-    record_insertion,
-    RecordedInsertion,
-    SPEED,
-    START_DEFLECTION,
-    START_DEPTH,
-    TARGET_DEPTH,
-)
-from needle_insertion.experiment.protocol import PROTOCOLS
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_figures import (
@@ -52,6 +31,27 @@ from needle_insertion.report.page import write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 from needle_ros.errors import NeedleError
 from reproduction.campaign import Campaign
+from reproduction.insertions.aiming import (
+    aiming_checks,
+    animate_aiming,
+    draw_aiming,
+    read_aimed,
+    record_aimed,
+)
+from reproduction.insertions.bending import bending_checks, draw_bending, record_bending
+from reproduction.insertions.insertion import (
+    draw_insertions,
+    insertion_checks,
+    RATE,
+    read_insertion,
+    record_insertion,
+    RecordedInsertion,
+    SPEED,
+    START_DEFLECTION,
+    START_DEPTH,
+    TARGET_DEPTH,
+)
+from reproduction.protocol import PROTOCOLS
 from reproduction.record import rig
 from reproduction.truth import (
     compare_friction,
@@ -156,7 +156,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
                 (
                     'Steered',
                     f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
-                    f'expected tip at {read_aimed(aimed).said} (95 %)',
+                    f'expected tip at {read_aimed(aimed).interval_text} (95 %)',
                 ),
             ],
             rows=rows,

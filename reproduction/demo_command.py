@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from needle_insertion.commands.common import check_folder, Subcommand
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from reproduction.protocol import SHIPPED_BAGS
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from needle_insertion.commands.common import check_folder, Subcommand
-from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
 from needle_ros.errors import ParameterError
+from reproduction.protocol import FASTEST, PROTOCOLS, SPEED
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

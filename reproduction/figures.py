@@ -68,19 +68,10 @@ def _label(case: tuple[str, ...]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperFigure:
-    """
-    Figure of the paper.
-
-    Attributes
-    ----------
-    picture : Picture
-        Figure and caption.
-    outcomes : Mapping[tuple of str, RunOutcome]
-        Metrics of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
-
-    """
+    """Figure of the paper."""
 
     picture: Picture
+    #: Metrics of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
     outcomes: Mapping[tuple[str, ...], RunOutcome]
 
     def table(self, title: str = '') -> Grid:

@@ -17,10 +17,10 @@ from needle_identification import (
     summarize,
     summarize_stiffness,
 )
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report.content import Grid, ReportSection
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import NeedleError
+from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import (
     compare_friction,
     compare_stiffness,
@@ -58,25 +58,14 @@ class ReproduceError(NeedleError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedValue:
-    """
-    Published quantity and its statistics over the recordings.
+    """Published quantity and its statistics over the recordings."""
 
-    Attributes
-    ----------
-    quantity : str
-        With its unit and condition.
-    paper : (float, float)
-        Published mean and standard deviation, SI.
-    found : Statistic
-        Mean and standard deviation over the recordings.
-    truth : Coverage
-        Number of recordings whose 95 % interval contains the ground truth.
-
-    """
-
+    #: With its unit and condition.
     quantity: str
+    #: Published mean and standard deviation, SI.
     paper: tuple[float, float]
     found: Statistic
+    #: Number of recordings whose 95 % interval contains the ground truth.
     truth: Coverage = field(default_factory=Coverage)
 
     @property

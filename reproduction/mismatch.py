@@ -68,21 +68,11 @@ _MEASURES: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mismatch:
-    """
-    Results of the mismatch study.
+    """Results of the mismatch study."""
 
-    Attributes
-    ----------
-    factors : ndarray, shape (runs, 3)
-        Ratio of true to nominal mu_s, mu_v and k_a.
-    batches : Mapping[str, LoopBatch]
-        Runs of each of `CASES`.
-    nominal : Mapping[str, LoopBatch]
-        Run of each case without mismatch.
-
-    """
-
+    #: Ratio of true to nominal mu_s, mu_v and k_a, shape (runs, 3).
     factors: FloatArray
+    #: Runs of each of `CASES`, and run of each case without mismatch.
     batches: Mapping[str, LoopBatch]
     nominal: Mapping[str, LoopBatch]
 

@@ -12,7 +12,6 @@ from typing import Any
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import JobError, ParameterError
 from needle_identification import message_counts, read_topic, RecordingError
-from needle_insertion.experiment.protocol import ExperimentProtocol, SPEED
 from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document
@@ -22,6 +21,7 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from reproduction.campaign import Campaign
+from reproduction.protocol import ExperimentProtocol, SPEED
 from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -47,12 +47,8 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
         for name, parameters in runs.items()
         if not _is_finished(folder / name, protocol, parameters)
     ]
-    bar = tqdm(
-        total=len(runs),
-        initial=len(runs) - len(missing),
-        desc=f'{protocol.name} runs',
-        disable=None,
-    )
+    done, words = len(runs) - len(missing), f'{protocol.name} runs'
+    bar = tqdm(total=len(runs), initial=done, desc=words, disable=None)
     if missing:
         with bar, rig(folder, protocol) as stand:
             for name in missing:

@@ -9,10 +9,9 @@ from math import nan
 from pathlib import Path
 from typing import Any, Final
 
-from needle_insertion.experiment.protocol import PROTOCOLS
-from needle_insertion.experiment.tables import TABLE_1, TABLE_2
 from needle_insertion.report.content import ReportSection
 from needle_insertion.report.page import write_page
+from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 from needle_insertion.report.text import filled, table
 from reproduction import claims, controllability, figures, mismatch, needle_constants
 from reproduction.campaign import Campaign
@@ -23,6 +22,7 @@ from reproduction.identified import (
     TABLES,
     VERDICTS,
 )
+from reproduction.protocol import PROTOCOLS
 from tqdm import tqdm
 
 #: Tables that decide about a result.
@@ -38,28 +38,14 @@ VERDICT_HEADS: Final = ('where', 'what', 'verdict')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """
-    Result for the page, the terminal and JSON.
-
-    Attributes
-    ----------
-    section : ReportSection
-        Section of the page.
-    text : str
-        Text for the terminal.
-    verdicts : tuple of (str, str, str)
-        Place in the paper, statement, and verdict.
-    document : Mapping[str, object]
-        Document for JSON.
-    holds : bool
-        False if a table differs from the paper.
-
-    """
+    """Result for the page (`section`), the terminal (`text`) and JSON (`document`)."""
 
     section: ReportSection
     text: str
+    #: Place in the paper, statement, and verdict.
     verdicts: tuple[tuple[str, str, str], ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)
+    #: False if a table differs from the paper.
     holds: bool = True
 
 

@@ -60,29 +60,18 @@ SHOWN: Final = 40.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutcome:
-    """
-    Metrics of a run.
+    """Metrics of a run."""
 
-    Attributes
-    ----------
-    peak, peak_time : float
-        Signed tip deflection of largest magnitude [m], and its time [s].
-    final : float
-        Largest magnitude of the tip deflection [m] over the last tenth of the run.
-    error : float
-        Final d [m]: the position error, as q_d = 0.
-    deepest : float
-        Largest insertion depth [m].
-    end : float
-        Final time [s].
-
-    """
-
+    #: Signed tip deflection of largest magnitude [m], and its time [s].
     peak: float
     peak_time: float
+    #: Largest magnitude of the tip deflection [m] over the last tenth of the run.
     final: float
+    #: Final d [m]: the position error, as q_d = 0.
     error: float
+    #: Largest insertion depth [m].
     deepest: float
+    #: Final time [s].
     end: float
 
     @classmethod

@@ -13,9 +13,9 @@ from needle_identification import (
     Recording,
     StiffnessEstimate,
 )
-from needle_insertion.experiment.protocol import indenter_name
-from needle_insertion.experiment.tables import TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 import numpy as np
+from reproduction.protocol import indenter_name
 from scipy.special import bdtr
 
 #: Coverage of an interval, and the significance level of a shortfall.

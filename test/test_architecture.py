@@ -40,6 +40,7 @@ MAY_IMPORT = {
         'needle_insertion',
         'needle_ros',
         'needle_study',
+        'reproduction',
     },
     'tools': set(),
 }

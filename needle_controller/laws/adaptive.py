@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf
 
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, flag
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveGains(InverseDynamicsGains):
     """Gains of inverse dynamics with friction adaptation."""
 
-    learn: bool = field(
-        default=True,
-        metadata={'description': 'adapt the friction; false freezes the learned friction'},
-    )
+    learn: bool = flag(True, 'adapt the friction; false freezes the learned friction')
     bound: float = constant(
         0.5, '1', 'largest learned change of dry and of viscous friction, relative to the model',
         high=10.0,
@@ -29,8 +25,6 @@ class AdaptiveGains(InverseDynamicsGains):
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if not isinstance(self.learn, bool):
-            raise ParameterError(f'learn must be true or false, got {self.learn!r}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from needle_controller.compiled.laws import PID
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, choice, constant, flag
 
 #: Methods against integrator windup by name.
 ANTI_WINDUP: Final = ('conditional', 'back_calculation')
@@ -27,14 +26,9 @@ class PidGains(LawGains):
     filter_time: float = constant(
         0.0, 's', 'time constant of the low-pass filter of the error rate; 0 for none'
     )
-    anti_windup: str = field(
-        default='conditional', metadata={'description': f'one of {", ".join(ANTI_WINDUP)}'}
-    )
+    anti_windup: str = choice('conditional', ANTI_WINDUP)
     tracking_time: float = constant(0.2, 's', 'time constant of back_calculation', open_low=True)
-    feed_forward: bool = field(
-        default=False,
-        metadata={'description': 'add the force of the reference motion on the modeled axis'},
-    )
+    feed_forward: bool = flag(False, 'add the force of the reference motion on the modeled axis')
     breakaway_speed: float = constant(
         1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward fully includes '
         'Coulomb friction', open_low=True,
@@ -42,12 +36,6 @@ class PidGains(LawGains):
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if self.anti_windup not in ANTI_WINDUP:
-            raise ParameterError(
-                f'anti_windup must be one of {", ".join(ANTI_WINDUP)}, got {self.anti_windup!r}'
-            )
-        if not isinstance(self.feed_forward, bool):
-            raise ParameterError(f'feed_forward must be true or false, got {self.feed_forward!r}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

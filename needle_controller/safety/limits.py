@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, flag
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,17 +60,10 @@ class SafetyLimits:
         'reading, or without a change of a noisy reading, that is reported',
         open_low=True, high=3600.0,
     )  # fmt: skip
-    sensors_required: bool = field(
-        default=False,
-        metadata={
-            'description': 'stop when base_wrench or tip_deflection, which the observer expects, '
-            'are stale; else the observer continues without them'
-        },
-    )
+    sensors_required: bool = flag(
+        False, 'stop when base_wrench or tip_deflection, which the observer expects, are stale; '
+        'else the observer continues without them',
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if not isinstance(self.sensors_required, bool):
-            raise ParameterError(
-                f'sensors_required must be true or false, got {self.sensors_required!r}'
-            )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import sqrt
 from typing import Final
 
@@ -10,7 +10,7 @@ from needle_controller.steering.limits import SteeringLimits, STEP_LENGTH
 from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
-from needle_ros.settings import constant
+from needle_ros.settings import constant, flag
 import numpy as np
 
 #: Least number of guide commands within a step.
@@ -36,13 +36,10 @@ class ExecutiveSettings(SteeringLimits):
         open_low=True,
     )
     roll_speed: float = constant(2.0, 'rad/s', 'highest angular speed of the roll', open_low=True)
-    continuous: bool = field(
-        default=False,
-        metadata={
-            'description': 'the needle is inserted without rests, and the guide follows its '
-            'depth; else it rests at the end of each step'
-        },
-    )
+    continuous: bool = flag(
+        False, 'the needle is inserted without rests, and the guide follows its depth; else it '
+        'rests at the end of each step',
+    )  # fmt: skip
     rate: float = constant(20.0, 'Hz', 'continuous: rate of guide commands', low=1.0, high=50.0)
     settle_time: float = constant(0.1, 's', 'time at rest before a tip measurement')
     look_time: float = constant(
@@ -80,8 +77,6 @@ class ExecutiveSettings(SteeringLimits):
                 f'depth_tolerance must be < half of step_length {self.step_length:g} m, got '
                 f'{self.depth_tolerance:g} m'
             )
-        if not isinstance(self.continuous, bool):
-            raise ParameterError(f'continuous must be true or false, got {self.continuous!r}')
         if self.continuous and self.turns:
             raise ParameterError('turns must be 0 if continuous: a needle is turned at rest')
         least = _PER_STEP * self.speed / self.step_length

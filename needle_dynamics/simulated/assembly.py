@@ -24,7 +24,7 @@ from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_dynamics.steering.insertion import Insertion
 from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import check_choice, check_constants, constant, from_values
 
 #: Modes: needle under force commands, needle moved by a robot, indenter.
 MODES: Final = ('simulation', 'robot', 'indenter')
@@ -149,8 +149,7 @@ class PlantConstants:
         """
         mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
         for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, NEEDLES)):
-            if not isinstance(value, str) or value not in valid:
-                raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
+            check_choice(name, value, valid)
         made = {}
         for prefix, defaults in SETTINGS.items():
             names = {item.name: f'{prefix}{item.name}' for item in fields(defaults)}

@@ -17,7 +17,6 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import (
     are_gaps,
-    AXES,
     EachJoint,
     Gathering,
     source_of,
@@ -25,6 +24,7 @@ from needle_identification.recordings.samples import (
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
+from needle_ros.axes import AXES
 from needle_ros.errors import NeedleError
 import numpy as np
 

@@ -21,7 +21,6 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_identification.recordings.samples import (
-    AXES,
     Gathering,
     position_and_velocity,
     SignalSource,
@@ -30,8 +29,9 @@ from needle_identification.recordings.samples import (
 from needle_identification.recordings.tables import is_table, read_friction_table, TABLES
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
+from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
-from needle_ros.errors import MessageError
+from needle_ros.errors import MessageError, ParameterError
 
 _FIRST: Final = 50  # number of messages that are read for joint names
 
@@ -101,6 +101,8 @@ def read_friction_recording(
     ------
     RecordingError
         If the bag is not readable or lacks a topic.
+    ParameterError
+        If an axis is not valid.
 
     Examples
     --------
@@ -185,11 +187,13 @@ def read_indentation_recording(
     ------
     RecordingError
         If the bag is not readable or lacks a topic.
+    ParameterError
+        If an axis is not valid.
 
     """
     signs, plane = zip(*(signed_axis(axis, 'axis of the plane') for axis in axes), strict=True)
     if len(set(plane)) != 2:
-        raise RecordingError(f'axes must be two different axes of x, y, z, got {axes!r}')
+        raise ParameterError(f'axes must be two different axes of x, y, z, got {axes!r}')
     across = next(axis for axis in AXES if axis not in plane)
     bag = Bag(path)
     topics = bag.topics()
@@ -213,19 +217,6 @@ def read_indentation_recording(
         configuration=configuration,
         clock_offset=clock_offset,
     )
-
-
-def signed(text: str) -> tuple[float, str]:
-    """Split a name into its sign (1 or -1, from a leading ``-``) and the rest."""
-    return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
-
-
-def signed_axis(text: str, what: str) -> tuple[float, str]:
-    """Split an axis, such as ``-x``, into sign and name; reject names other than x, y, z."""
-    sign, axis = signed(text)
-    if axis not in AXES:
-        raise RecordingError(f'{what} must be x, y, z, -x, -y or -z, got {text!r}')
-    return sign, axis
 
 
 def _motion_source(bag: Bag, topic: BagTopic, axis: str | None) -> tuple[SignalSource, float]:

@@ -14,11 +14,11 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated
 from needle_identification.recordings.series import FINEST, Series
 from needle_ros import wire
+from needle_ros.axes import AXES
 from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
 
-AXES: Final = ('x', 'y', 'z')  #: axes of a frame, in the order of message fields
 _LARGEST: Final = 1e100  # upper limit of a plausible measurement [SI]
 _MAX_NAMES: Final = 100  # largest number of joint names kept for error messages
 _GAP: Final = 10.0  # shortest gap between samples [sampling periods]

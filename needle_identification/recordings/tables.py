@@ -28,6 +28,7 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps
 from needle_identification.recordings.series import Series
+from needle_ros.axes import signed
 from needle_ros.errors import shown
 import numpy as np
 
@@ -79,7 +80,7 @@ _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
 
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
-_SPEC: Final = re.compile(r'^(-?)\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
+_SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
 
 class Table(NamedTuple):
@@ -189,12 +190,13 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
         return np.asarray((both[0] - both[0][np.isfinite(both[0])][:1].sum()) + 1e-9 * both[1])
     if spec in table.columns:
         # The name itself contains brackets.
-        sign, name, factor, unit = '', spec, None, None
+        sign, name, factor, unit = 1.0, spec, None, None
     else:
-        match = _SPEC.match(spec)
+        sign, rest = signed(spec)
+        match = _SPEC.match(rest)
         if match is None:
             raise RecordingError(f'--columns {role}={spec} is not [-]NAME[*FACTOR][UNIT]')
-        sign, name, factor, unit = match.groups()
+        name, factor, unit = match.groups()
     name, column = _column(table, role, name)
     unit = unit or _unit_of(name, role)
     if unit is not None and unit not in UNITS[role]:
@@ -202,7 +204,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
             f'--columns {role}={spec}: the unit must be one of {", ".join(UNITS[role])}, '
             f'got {unit!r}'
         )
-    scale = (-1.0 if sign else 1.0) * (UNITS[role][unit] if unit else 1.0)
+    scale = sign * (UNITS[role][unit] if unit else 1.0)
     if factor is not None:
         scale *= _factor(table, role, spec, factor)
     found = scale * column

@@ -20,8 +20,6 @@ from needle_identification.recordings.reading import (
     chosen_topic,
     first_names,
     read_samples,
-    signed,
-    signed_axis,
     Wanted,
 )
 from needle_identification.recordings.samples import EachJoint, source_of
@@ -35,6 +33,7 @@ from needle_identification.recordings.tables import (
 from needle_identification.recordings.timebase import merge
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
+from needle_ros.axes import signed, signed_axis
 import numpy as np
 
 _TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))

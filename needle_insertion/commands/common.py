@@ -37,12 +37,17 @@ def add_needle(parser: ArgumentParser) -> None:
         default=DEFAULT_PRESET,
         help=f'constants of needle and tissue (default {DEFAULT_PRESET})',
     )
+    add_constants(parser, '--set', 'any other constant of the model')
+
+
+def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
+    """Add a repeatable option for `constants`."""
     parser.add_argument(
-        '--set',
+        option,
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='any other constant of the model, SI units; repeatable',
+        help=f'{meaning}, SI units; repeatable',
     )
 
 

@@ -219,14 +219,14 @@ def steering_text(found: SteeringEstimate) -> str:
     others = ', '.join(
         f'{"+".join(terms)} {1e3 * rms:.3f} mm' for terms, rms in found.alternatives.items()
     )
-    way = 'move together' if found.order == ORDERS[0] else 'move one after the other'
+    motion = 'move together' if found.order == ORDERS[0] else 'move one after the other'
     return '\n'.join(
         [
             table(rows, ('medium', 'parameter', 'value ± SE', '95 % interval')),
             '',
             table(fits, ('medium', 'recordings', 'samples', 'rms per axis [mm]')),
             '',
-            f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {way}',
+            f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {motion}',
         ]
     )
 

@@ -27,7 +27,7 @@ from needle_ros.errors import ParameterError
 _DEFLECTION: Final = 5e-4
 
 #: Default duration if the force does not insert the needle [s].
-_NO_WAY: Final = 1.0
+_DURATION: Final = 1.0
 
 #: Duration of the warm-up simulation [s].
 _MOMENT: Final = 1e-6
@@ -95,12 +95,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
     """Return the time of insertion up to the hub under a constant force, to two digits [s]."""
-    drive, way = force - parameters.coulomb_friction, parameters.length - depth
-    if drive <= 0.0 or way <= 0.0:
-        return _NO_WAY
+    drive, distance = force - parameters.coulomb_friction, parameters.length - depth
+    if drive <= 0.0 or distance <= 0.0:
+        return _DURATION
     # Upper bound: acceleration and steady motion, one after the other.
-    longest = way * parameters.viscous_friction / drive + sqrt(
-        2.0 * way * parameters.moving_mass / drive
+    longest = distance * parameters.viscous_friction / drive + sqrt(
+        2.0 * distance * parameters.moving_mass / drive
     )
     return float(f'{1.05 * longest:.2g}')
 

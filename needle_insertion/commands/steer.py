@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-import json
 from math import isfinite
 from pathlib import Path
-import sys
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
@@ -42,7 +40,14 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
-from needle_insertion.commands.common import check_file, constants, Subcommand
+from needle_insertion.commands.common import (
+    add_constants,
+    check_file,
+    constants,
+    print_each,
+    print_result,
+    Subcommand,
+)
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach
@@ -89,21 +94,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'steering law, one of {", ".join(STEERING_LAWS)}, or module:Class of your own '
         f'(default {DEFAULT_LAW})',
     )
-    parser.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help=f'constant of the nominal model, one of {", ".join(CONSTANTS)}, SI units; repeatable',
-    )
-    parser.add_argument(
-        '--prior',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='prior uncertainty of the model, one of '
-        f'{", ".join(asdict(SteeringPrior()))}, SI units; repeatable',
-    )
+    words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
+    add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
+    add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
     parser.add_argument(
         '--step',
         type=float,
@@ -141,9 +134,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-def _line(seen: NeedleShape | NeedlePath) -> FloatArray:
+def _line(line: NeedleShape | NeedlePath) -> FloatArray:
     """Return a needle or its path as points x, y, z, shape (k, 3) [m]."""
-    return np.insert(seen.deflections, 1, seen.depths, axis=1)
+    return np.insert(line.deflections, 1, line.depths, axis=1)
 
 
 def _target(text: str) -> FloatArray:
@@ -206,11 +199,11 @@ def sample_needle(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
-def _expected(there: TipEstimate | None) -> dict[str, list[float] | None]:
-    """Return the expected tip and the half width of its interval; None without prediction."""
-    mean = None if there is None else there.mean.tolist()
-    half = None if there is None else there.half_width.tolist()
-    return {'expected tip [m]': mean, 'its interval of 95 % [m]': half}
+def _expected(estimate: TipEstimate | None) -> dict[str, list[float] | None]:
+    """Return the expected tip and the half width of its 95 % interval; None if not predicted."""
+    mean = None if estimate is None else estimate.mean.tolist()
+    half = None if estimate is None else estimate.half_width.tolist()
+    return {'expected tip [m]': mean, 'expected tip half width [m]': half}
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -255,14 +248,13 @@ def _run(options: argparse.Namespace) -> int:
         **_expected(law.expected()),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
-        'way of the guide [m]': done.travel,
+        'guide travel [m]': done.travel,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
-        'bending length over the nominal one': law.status().get('bending_length_ratio'),
+        'bending length ratio': law.status().get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
-    if done.warning:
-        sys.stderr.write(f'warning: {done.warning}\n')
+    print_each('warning', found['warnings'])
     if options.output is not None:
         at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
         # In the frame of the needle, to which the sensor frame is rotated.
@@ -274,17 +266,13 @@ def _run(options: argparse.Namespace) -> int:
             _line(alone.needle.shape),
         )
         write_whole(options.output, png(figure))
-    if options.json:
-        sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
-        return 0
-    sys.stdout.write(
+    text = (
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
         f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.travel:.1f} mm in total '
         f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
-        f'{_text(found)}\n'
+        f'{_text(found)}'
     )
-    if options.output is not None:
-        sys.stdout.write(f'wrote {options.output}\n')
+    print_result(found, text, filter(None, [options.output]), as_json=options.json)
     return 0
 
 
@@ -296,7 +284,7 @@ def _text(found: Mapping[str, Any]) -> str:
             ('target', found['target [m]'], None),
             ('tip', found['tip [m]'], found['miss [m]']),
             ('expected tip', found['expected tip [m]'], None),
-            ('± (95 %)', found['its interval of 95 % [m]'], None),
+            ('± (95 %)', found['expected tip half width [m]'], None),
             ('open loop', found['tip open loop [m]'], found['miss open loop [m]']),
         )
         if at is not None

@@ -28,12 +28,12 @@ class State(NamedTuple):
     #: Requests that the node accepts, and its answers.
     requests: RequestStatus
     #: Time of receipt by `time.monotonic` [s].
-    heard: float
+    received: float
 
     @property
     def age(self) -> float:
         """Time since receipt [s]; the node publishes every second."""
-        return monotonic() - self.heard
+        return monotonic() - self.received
 
 
 def listen_states(
@@ -42,7 +42,7 @@ def listen_states(
     """Subscribe to /diagnostics; return the latest state of each node, by its bare name."""
     states: dict[str, State] = {}
 
-    def hear(array: DiagnosticArray) -> None:
+    def on_array(array: DiagnosticArray) -> None:
         for status in array.status:
             name = printable(status.name.rpartition('/')[2])
             values = {printable(one.key): printable(one.value) for one in status.values}
@@ -57,7 +57,7 @@ def listen_states(
             on_state(name, states[name])
 
     topic = contract.DIAGNOSTICS
-    node.create_subscription(DiagnosticArray, topic.name, hear, profile(topic.qos))
+    node.create_subscription(DiagnosticArray, topic.name, on_array, profile(topic.qos))
     return states
 
 

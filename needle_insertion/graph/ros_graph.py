@@ -36,7 +36,7 @@ CLEANUP = Transition.TRANSITION_CLEANUP
 _START: Final = 180.0
 
 #: Period of the requests for the state of a node [s].
-_ASK: Final = 0.2
+_REQUEST: Final = 0.2
 
 #: Timeout of the clean end of the nodes, before they are killed [s].
 _PATIENCE: Final = 3.0
@@ -153,10 +153,10 @@ class Graph:
     def wait_for(self, node: Node, name: str) -> None:
         """Wait until a node of the suite answers a node of this process with all its clients."""
         if name not in self._life_cycles:
-            # Clients are discovered in the order of their creation: once the last has a response,
-            # all will.
+            # Clients are discovered in the order of their creation: when the last client receives
+            # a response, the others are discovered too.
             self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
-            self._ask_state(node, name, f'the answer of {name}', 1.0)
+            self._await_state(node, name, f'the answer of {name}', 1.0)
 
     def wait_active(
         self, node: Node, name: str, show: Callable[[str], object] = lambda _name: None
@@ -165,9 +165,9 @@ class Graph:
         show(name)
         self.wait_for(node, name)
         what, active = f'the activation of {name}', (State.PRIMARY_STATE_ACTIVE,)
-        self._ask_state(node, name, what, _ASK, active, lambda: show(name))
+        self._await_state(node, name, what, _REQUEST, active, lambda: show(name))
 
-    def _ask_state(
+    def _await_state(
         self,
         node: Node,
         name: str,
@@ -176,7 +176,7 @@ class Graph:
         states: Container[int] = range(256),
         show: Callable[[], object] = lambda: None,
     ) -> None:
-        """Ask a node for its state in a period [s], until an answer is one of `states`."""
+        """Request the state of a node at a period [s], until its state is in `states`."""
         client = node.create_client(GetState, f'{name}/get_state')
         self.spin_until(client.service_is_ready, f'the node {name}', _START)
         # A response to a client that the server has not discovered is lost.
@@ -200,8 +200,8 @@ class Graph:
             answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
             self.spin_until(answer.done, f'the answer of {name}', _START)
             if not answer.result().success:
-                said = [p.last_line for p in self._processes if p.name == name]
-                raise GraphError(f'{name} failed to start: {"".join(said[-1:])}')
+                lines = [p.last_line for p in self._processes if p.name == name]
+                raise GraphError(f'{name} failed to start: {"".join(lines[-1:])}')
 
     def spin_until(
         self,
@@ -216,13 +216,13 @@ class Graph:
 
         The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
         condition is checked after each event, which costs more CPU time. Raises `GraphError` on a
-        timeout, with the name `what` and the last log line of each process, and if a process of
-        the graph has ended.
+        timeout, with the awaited event (`what`) and the last log line of each process, and if a
+        process of the graph has ended.
         """
-        deadline, seen = time.monotonic() + timeout, sign()
+        deadline, last = time.monotonic() + timeout, sign()
         while not condition():
-            if (now := sign()) != seen:
-                deadline, seen = time.monotonic() + timeout, now
+            if (now := sign()) != last:
+                deadline, last = time.monotonic() + timeout, now
             for started in self._processes:
                 # A process that was interrupted on purpose ends with status 0.
                 if started.process.poll() not in (None, 0) and not started.killed:

@@ -237,8 +237,8 @@ class SimulatedRun:
 
     def _show_start(self, name: str) -> None:
         """Show the starting node and its status."""
-        said = self.states[name].message if name in self.states else ''
-        self._show(f'starting {name}' + (f': {said}' if said else ''))
+        message = self.states[name].message if name in self.states else ''
+        self._show(f'starting {name}' + (f': {message}' if message else ''))
 
     def _is_recorded(self) -> bool:
         """Return whether the recorder has subscribed to all topics."""

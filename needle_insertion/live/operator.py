@@ -61,7 +61,7 @@ class Operator:
             for request in requests:
                 kind = Trigger if request.data is None else SetBool
                 self._client(kind, request.node, request.service)
-        self.states = listen_states(node, self._hear)
+        self.states = listen_states(node, self._on_state)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_CHECK, self._repeat, clock=steady)
 
@@ -71,9 +71,9 @@ class Operator:
             self._clients[node, service] = client
         return self._clients[node, service]
 
-    def _hear(self, name: str, state: State) -> None:
+    def _on_state(self, name: str, state: State) -> None:
         for pending, _ in self._sending:
-            pending.hear(name, state.requests)
+            pending.take_status(name, state.requests)
 
     def _repeat(self) -> None:
         """Repeat targets without an answer; use simulated time if it is published."""

@@ -36,13 +36,13 @@ class Readings:
         self._node = node
         self._newest: dict[str, bytes] = {}
         self._readers = {topic.name: MessageReader(topic.type_name) for topic in _TOPICS}
-        self._come = {
+        self._waiting = {
             topic.name: waiting(node, topic, topic.qos._replace(depth=1)) for topic in _TOPICS
         }
 
     def newest(self, topic: Topic) -> Reading | None:
         """Return the newest message of a topic; None before the first, or if unreadable."""
-        for message in self._come[topic.name]():
+        for message in self._waiting[topic.name]():
             self._newest[topic.name] = message
         data = self._newest.get(topic.name)
         try:

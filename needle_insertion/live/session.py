@@ -117,8 +117,8 @@ def _bring_up(
     begin = monotonic()
 
     def show(name: str) -> None:
-        said = operator.states[name].message if name in operator.states else ''
-        screen.show(f'starting {name}, {monotonic() - begin:.0f} s' + (said and f': {said}'))
+        message = operator.states[name].message if name in operator.states else ''
+        screen.show(f'starting {name}, {monotonic() - begin:.0f} s' + (message and f': {message}'))
 
     processes = start_nodes(
         graph, node, session.nodes, show, session.file, lockstep=session.lockstep
@@ -130,8 +130,8 @@ def _bring_up(
 
     def listen() -> bool:
         # This process subscribes, too.
-        hear = count(contract.JOINT_STATES) >= len(processes) + 1 + holds - own
-        return hear and count(contract.TARGET) >= len(processes) - own
+        subscribed = count(contract.JOINT_STATES) >= len(processes) + 1 + holds - own
+        return subscribed and count(contract.TARGET) >= len(processes) - own
 
     what = 'the nodes' if own else 'a robot that publishes joint_states, and for the nodes'
     graph.spin_until(listen, what, _START)

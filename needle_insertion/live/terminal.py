@@ -82,7 +82,7 @@ class Terminal:
         screen.complete([*WORDS, *LAWS])
         #: Latest message of each node without its numbers, and when it was printed.
         self._last: dict[str, str] = {}
-        self._told: dict[tuple[str, str], float] = {}
+        self._printed: dict[tuple[str, str], float] = {}
         #: Whether all nodes have begun.
         self._begun = False
         #: Whether the latest motion is a steered insertion.
@@ -102,10 +102,10 @@ class Terminal:
         self._begun = True
 
     def _wait_for(self, name: str, topic: str) -> None:
-        def sees() -> bool:
-            return _sees(self._state(name), topic)
+        def has_accepted() -> bool:
+            return _has_accepted(self._state(name), topic)
 
-        self._spin_until(sees, f'{topic}, an input of {name}', _ANSWER)
+        self._spin_until(has_accepted, f'{topic}, an input of {name}', _ANSWER)
 
     def next_line(self) -> str | None:
         """Wait for the next line, None at the end; raise `GraphError` if a node ends."""
@@ -148,12 +148,12 @@ class Terminal:
 
     def _spin_until(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
         def holds() -> bool:
-            self._look()
+            self._print_warnings()
             return condition()
 
         self._graph.spin_until(holds, what, timeout)
 
-    def _look(self) -> None:
+    def _print_warnings(self) -> None:
         """Print new warnings and errors of the nodes."""
         if not self._begun:
             # During the start the nodes wait for each other.
@@ -164,10 +164,10 @@ class Terminal:
                 level, message = _ERROR, f'no status for {_SILENT:g} s'
             # A changed number is not a new warning.
             kind = re.sub(r'\d+', '', message)
-            again = level >= _ERROR or now - self._told.get((name, kind), -inf) > _AGAIN
+            again = level >= _ERROR or now - self._printed.get((name, kind), -inf) > _AGAIN
             if level and kind != self._last.get(name) and again:
                 self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
-                self._told[name, kind] = now
+                self._printed[name, kind] = now
             self._last[name] = kind
 
     # Words.
@@ -285,7 +285,7 @@ def _length(word: str) -> float:
     return value
 
 
-def _sees(state: State, topic: str) -> bool:
+def _has_accepted(state: State, topic: str) -> bool:
     """Return whether a node has accepted a measurement."""
     status = state.status
     if not isinstance(status, (ControllerStatus, SteeringStatus)):

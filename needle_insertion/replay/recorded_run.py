@@ -137,8 +137,8 @@ class RecordedRun:
         self.path, self.name = path, name
         space = name.rpartition('/')[0]
         configurations = _configurations(messages[f'{name}/configuration'])
-        said = _events(messages.get(f'{name}/events', []))
-        made = (event.content for _, _, event in said if event.kind == CONFIGURED)
+        recorded = _events(messages.get(f'{name}/events', []))
+        made = (event.content for _, _, event in recorded if event.kind == CONFIGURED)
         #: Parameters and constants at the start, and topics by full name.
         self.values = {**_UNLIMITED, **next(made, configurations[0][1])}
         lacking = next((name for name in _NEEDED if name not in self.values), None)
@@ -152,13 +152,13 @@ class RecordedRun:
         self.topics = {f'{space}/{topic.name}': topic for topic in plant.topics.values()}
         self._period = NANOSECONDS / self.constants.own.rate
         #: Known pairs of stamp [ns] and sample number, from which the others are interpolated.
-        self._anchors = [(stamp, number) for stamp, number, _ in said]
+        self._anchors = [(stamp, number) for stamp, number, _ in recorded]
         #: Recording times [ns] and sample numbers.
         self._arrivals: list[tuple[int, int]] = []
         self.rows = self._measured(messages)
         self.numbers = sorted({number for _, number in self._arrivals})
         trajectories = messages.get(f'{space}/joint_trajectory', [])
-        done = [(number, event) for _, number, event in said]
+        done = [(number, event) for _, number, event in recorded]
         #: Events by the number of the first affected sample.
         self.events: dict[int, list[Event]] = defaultdict(list)
         for number, event in done or self._guessed(configurations, trajectories):
@@ -177,7 +177,7 @@ class RecordedRun:
             if values.get('fault.kind', 'none') != 'none'
         }
         self.faults = ' and '.join(sorted(faults))
-        self.notes = [*losses, *self._unsaid(has_events=bool(said))]
+        self.notes = [*losses, *self._missing(has_events=bool(recorded))]
 
     def _measured(self, messages: Mapping[str, _Messages]) -> dict[str, Rows]:
         """Sort the measurements by sample number."""
@@ -249,7 +249,7 @@ class RecordedRun:
         for received, event in sorted(found, key=lambda each: each[0]):
             yield self._newest(received) + 1, event
 
-    def _unsaid(self, *, has_events: bool) -> Iterator[str]:
+    def _missing(self, *, has_events: bool) -> Iterator[str]:
         """Yield notes about missing information."""
         if not has_events:
             yield (

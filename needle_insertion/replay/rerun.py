@@ -81,15 +81,15 @@ class Rerun:
         self._halted = ''
         #: Whether a motion by `joint_commands` has been noted.
         self._driven = False
-        self._told = self._commands()
+        self._active = self._commands()
         numbers = recorded.numbers
         #: Number of samples without a recorded active command.
-        self._untold = 0
+        self._unknown = 0
         if recorded.constants.mode == 'simulation':
-            self._untold = numbers[-1] - numbers[0] + 1 - len(self._told)
-        if self._untold:
+            self._unknown = numbers[-1] - numbers[0] + 1 - len(self._active)
+        if self._unknown:
             self.notes.append(
-                f'which command acted before {self._untold} samples is not in the bag: each is '
+                f'which command acted before {self._unknown} samples is not in the bag: each is '
                 'assumed to act one period after the sample that it responds to'
             )
         computed = self._compute()
@@ -141,10 +141,12 @@ class Rerun:
             topic = self.recorded.topics[name]
             efforts = [k for k, q in enumerate(topic.quantities) if q.name.startswith('effort')]
             if topic.name == GROUND_TRUTH.name and efforts:
-                told = zip(rows.numbers.tolist(), rows.values[:, efforts].tolist(), strict=True)
+                forces = zip(rows.numbers.tolist(), rows.values[:, efforts].tolist(), strict=True)
                 # Insertion reduces d.
                 return {
-                    n: AppliedForces(0, -d, torque) for n, (d, torque, *_) in told if not isnan(d)
+                    n: AppliedForces(0, -d, torque)
+                    for n, (d, torque, *_) in forces
+                    if not isnan(d)
                 }
         return {}
 
@@ -164,7 +166,7 @@ class Rerun:
             try:
                 for event in recorded.events.get(number, ()):
                     plant = self._perform(plant, event, number)
-                measured = plant.take(stamp, self._told.get(number))
+                measured = plant.take(stamp, self._active.get(number))
             except NeedleError as error:
                 self._halted = str(error)
                 break
@@ -255,7 +257,7 @@ class Rerun:
                 sum(differing.values()) == 1
             ),
             'the bag holds no wrench_command and no joint_commands: record them with the rest': (
-                self._untold and not recorded.commands
+                self._unknown and not recorded.commands
             ),
             'the bag holds no joint_trajectory: record it with the rest': (
                 not simulated and not kinds & {MOTION, TRAJECTORY}
@@ -263,7 +265,7 @@ class Rerun:
             f'the bag begins with sample {start}: earlier commands are missing': (
                 simulated and start > 1
             ),
-            'which command acted is not in the bag': self._untold,
+            'which command acted is not in the bag': self._unknown,
             'the motion is as computed: the seed or the constants of a sensor differ': (
                 len(wrong - {BASE_WRENCH.name, TIP_DEFLECTION.name}) == 0
                 and len(differing) > len(wrong)

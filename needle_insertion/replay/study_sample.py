@@ -32,11 +32,11 @@ def replay_sample(results: Results, number: int, bag: Path) -> bool:
     drawn = {name: float(row[name][0]) for name in study.population}
     templates: dict[str, Template] = {}
     with BagWriter(bag) as writer:
-        for seen in study.protocol.replay(drawn, study.rng(number, 1)):
-            name = f'/{seen.topic.name}'
+        for message in study.protocol.replay(drawn, study.rng(number, 1)):
+            name = f'/{message.topic.name}'
             if name not in templates:
-                templates[name] = seen.topic.template()
-                writer.add_topic(name, seen.topic.type_name)
-            data = templates[name].serialize(seen.stamp, *seen.values)
-            writer.write(name, data, seen.stamp)
+                templates[name] = message.topic.template()
+                writer.add_topic(name, message.topic.type_name)
+            data = templates[name].serialize(message.stamp, *message.values)
+            writer.write(name, data, message.stamp)
     return compared

@@ -20,8 +20,8 @@ from needle_identification import (
     StiffnessEstimate,
     StiffnessSummary,
 )
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_2
 from needle_insertion.report.identify_text import label_of
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_2
 import numpy as np
 
 #: Colors: insertion and results, withdrawal, data, pale data, fits.

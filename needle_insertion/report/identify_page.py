@@ -19,7 +19,6 @@ from needle_identification import (
 )
 from needle_identification.estimation.formatting import between, measured, rounded, spread
 from needle_identification.result import model_parameters
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import identify_figures as figures
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_text import (
@@ -37,6 +36,7 @@ from needle_insertion.report.identify_text import (
 )
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.page import write_page
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 
 #: Parameters that can be set on a running plant.

@@ -29,7 +29,6 @@ _NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
 #: Heads of the rows of `mean_row`.
 MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags')
 
-
 #: Heads of the rows of `puncture_rows`.
 PUNCTURE_HEADS: Final = ('bag', 'puncture at [s]', 'depth [mm] ± SE', 'drop [N] ± SE')
 

@@ -56,16 +56,16 @@ def write_study(results: Results, path: Path) -> None:
     figures, drawn = study.protocol.figures, list(study.population)
     main = next(iter(figures))
     values = column(table, main, _MOST)
-    chances, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
+    probabilities, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
     for name, one in figures.items():
         if not one.unit:
-            chances[name] = probability(batches(table, name))
+            probabilities[name] = probability(batches(table, name))
             continue
-        seen = values if name == main else column(table, name, _MOST)
-        parts = [quantile(seen, part) for part in _PARTS]
-        if there := parts[0].samples:
+        found = values if name == main else column(table, name, _MOST)
+        parts = [quantile(found, part) for part in _PARTS]
+        if known := parts[0].samples:
             words = (f'{value} ({ends})' for value, ends in (_rounded(p, one.unit) for p in parts))
-            quantiles.append((_head(name, one.unit), *words, str(there), one.meaning))
+            quantiles.append((_head(name, one.unit), *words, str(known), one.meaning))
     shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
     order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
     # The two most influential variables are drawn.
@@ -82,7 +82,7 @@ def write_study(results: Results, path: Path) -> None:
             ('metric', 'probability', '95 % interval', 'samples', 'meaning'),
             [
                 (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
-                for name, one in chances.items()
+                for name, one in probabilities.items()
                 if np.isfinite(one.value)
             ],
         ),
@@ -126,7 +126,7 @@ def write_study(results: Results, path: Path) -> None:
         )
     )
     pictures = [one for section in sections for one in section.pictures]
-    hit = chances.get('hit')
+    hit = probabilities.get('hit')
     cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
     if hit is not None:
         value, ends = _rounded(hit, '%')
@@ -197,18 +197,18 @@ def _share(part: float) -> str:
 def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
     drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
     axes = drawing.subplots()
-    seen = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
+    finite = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
     words = f'Distribution of {name}; dashed: {_dashed()}.'
-    if len(seen):
-        end = float(seen[-1])
-        if len(seen) >= _TAILED:
+    if len(finite):
+        end = float(finite[-1])
+        if len(finite) >= _TAILED:
             # Outliers would compress the rest of the histogram.
-            end = float(np.quantile(seen, 0.999))
+            end = float(np.quantile(finite, 0.999))
             words += ' The largest thousandth is not shown.'
-        bars = min(_BARS, ceil(2.0 * len(seen) ** (1.0 / 3.0)))
-        axes.hist(seen[seen <= end], bins=bars, color='tab:blue')
+        bars = min(_BARS, ceil(2.0 * len(finite) ** (1.0 / 3.0)))
+        axes.hist(finite[finite <= end], bins=bars, color='tab:blue')
         for part in _PARTS:
-            axes.axvline(float(np.quantile(seen, part)), color='k', lw=0.8, ls='--')
+            axes.axvline(float(np.quantile(finite, part)), color='k', lw=0.8, ls='--')
     axes.set(xlabel=_head(name, figure.unit), ylabel='samples')
     return Picture('distribution', words, drawing)
 

@@ -148,20 +148,20 @@ class Connection:
             if listener is None:
                 return
             try:
-                came, (host, port) = listener.accept()
+                accepted, (host, port) = listener.accept()
             except OSError:
                 # No peer, or a connection closed by the peer.
                 return
             if self.peer:
-                came.close()
+                accepted.close()
                 self._events.add(
                     Severity.WARNING,
                     f'{host}:{port} turned away: {self.peer} is connected',
                     'stranger',
                 )
             else:
-                came.setblocking(False)
-                self._greet(came, f'{host}:{port}')
+                accepted.setblocking(False)
+                self._greet(accepted, f'{host}:{port}')
 
     def _connect(self) -> None:
         """Start a connection, or check its progress."""

@@ -71,7 +71,7 @@ class Interpreter:
         None if the message has other points only; `MessageError` if the message is damaged or the
         target is invalid. See `is_wanted`.
         """
-        found = _said(_message(frame))
+        found = _coordinates(_message(frame))
         if found is None:
             return None
         at = np.array(found, dtype=np.float64)
@@ -151,7 +151,7 @@ def _message(frame: Frame) -> Any:
     return message
 
 
-def _said(message: Any) -> Any:
+def _coordinates(message: Any) -> Any:
     """Return the coordinates of the target in a message, None without a target."""
     if isinstance(message, TransformMessage):
         return message.matrix[:3, 3]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 #: Timeout of measurements [s].
-_LASTS: Final = 1.0
+_TIMEOUT: Final = 1.0
 
 #: Largest plausible coordinate [m].
 _FARTHEST: Final = 10.0
@@ -61,10 +61,10 @@ class NeedleView:
 
         ``stamp`` is in ns and ``now`` in s; `MessageError` if the shape is invalid.
         """
-        there = _places(points)
-        if there.ndim != 2 or not 2 <= len(there) <= MOST_POINTS:
-            raise MessageError(f'it has {len(there)} poses, a shape has 2 to {MOST_POINTS}')
-        self._shape = now, Shape(stamp, there, _turn(turn), MEASURED)
+        positions = _places(points)
+        if positions.ndim != 2 or not 2 <= len(positions) <= MOST_POINTS:
+            raise MessageError(f'it has {len(positions)} poses, a shape has 2 to {MOST_POINTS}')
+        self._shape = now, Shape(stamp, positions, _quaternion(turn), MEASURED)
 
     def take_tip(self, stamp: int, tip: ArrayLike, now: float) -> None:
         """Store a tip position [m]; `MessageError` if it is invalid."""
@@ -76,7 +76,7 @@ class NeedleView:
 
     def take_expected(self, stamp: int, position: ArrayLike, turn: ArrayLike) -> None:
         """Store a prediction of the tip pose; `MessageError` if it is invalid."""
-        self.expected = EntryPose(stamp, _places(position), _turn(turn))
+        self.expected = EntryPose(stamp, _places(position), _quaternion(turn))
 
     def shape(self, now: float) -> Shape | None:
         """
@@ -84,25 +84,25 @@ class NeedleView:
 
         None after the timeout of both; ``now`` is in s.
         """
-        if self._shape is not None and now - self._shape[0] <= _LASTS:
+        if self._shape is not None and now - self._shape[0] <= _TIMEOUT:
             return self._shape[1]
         if self._tip is None or self._guide is None:
             return None
-        (seen, stamp, tip), (moved, guide) = self._tip, self._guide
-        if now - min(seen, moved) > _LASTS:
+        (measured, stamp, tip), (moved, guide) = self._tip, self._guide
+        if now - min(measured, moved) > _TIMEOUT:
             return None
         return Shape(stamp, np.array([guide, tip]), _along(tip - guide), LINE)
 
 
 def _places(given: ArrayLike) -> FloatArray:
     """Return positions as an array [m]; `MessageError` if one is implausible."""
-    there = np.array(given, dtype=np.float64)
-    if not (np.abs(there) <= _FARTHEST).all():
+    positions = np.array(given, dtype=np.float64)
+    if not (np.abs(positions) <= _FARTHEST).all():
         raise MessageError(f'a position is not within {_FARTHEST:g} m')
-    return there
+    return positions
 
 
-def _turn(given: ArrayLike) -> FloatArray:
+def _quaternion(given: ArrayLike) -> FloatArray:
     """Return a quaternion as an array; `MessageError` if it is invalid."""
     try:
         rotation_matrix(given)

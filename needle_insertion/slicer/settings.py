@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from ipaddress import AddressValueError, IPv4Address
-from typing import Final
 
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
-
-#: Roles in the connection.
-ROLES: Final = ('server', 'client')
+from needle_ros.settings import check_constants, choice, constant, text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
     """Role and address of the connection, and the limit of targets."""
 
-    role: str = field(
-        default=ROLES[0],
-        metadata={
-            'description': f'one of {", ".join(ROLES)}: the server waits, the client connects'
-        },
-    )
-    host: str = field(
-        default='127.0.0.1',
-        metadata={
-            'description': 'IPv4 address: as server, address of this machine to listen on '
-            '(0.0.0.0: all addresses); as client, address of the peer'
-        },
-    )
+    role: str = choice('server', ('server', 'client'), 'the server waits, the client connects')
+    host: str = text(
+        '127.0.0.1', 'IPv4 address: as server, address of this machine to listen on (0.0.0.0: all '
+        'addresses); as client, address of the peer',
+    )  # fmt: skip
     port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0)
     reach: float = constant(
         0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
     )
 
     def __post_init__(self) -> None:
-        if self.role not in ROLES:
-            raise ParameterError(f'role must be one of {", ".join(ROLES)}, got {self.role!r}')
+        check_constants(self)
         try:
             # A name lookup can block.
             IPv4Address(self.host)
@@ -45,7 +32,6 @@ class LinkSettings:
             raise ParameterError(
                 f'host must be an IPv4 address such as 127.0.0.1, got {self.host!r}'
             ) from error
-        check_constants(self)
         if self.port != int(self.port):
             raise ParameterError(f'port must be a whole number, got {self.port!r}')
         object.__setattr__(self, 'port', int(self.port))

@@ -17,6 +17,7 @@ from needle_insertion.slicer.link import Connection
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
 from needle_insertion.slicer.settings import LinkSettings
+from needle_insertion.slicer.states import NodeStates
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.contract import Topic
@@ -36,21 +37,11 @@ if TYPE_CHECKING:
     from needle_insertion.slicer.messages import Interpreter
 
 #: Time between two checks of the connection, and between two shapes [s].
-_LOOK: Final = 0.02
+_CHECK: Final = 0.02
 _PERIOD: Final = 0.05
-
-#: Time between two states, unless something changes [s].
-_STATE_PERIOD: Final = 1.0
 
 #: Largest number of messages per reading.
 _AT_ONCE: Final = 16
-
-#: Largest number of transmitted node states, and ages of a silent and of a removed node [s].
-_MOST_NODES: Final = 20
-_SILENT: Final = 5.0
-_FORGOTTEN: Final = 60.0
-
-_LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
 
 _PACKAGE: Final = 'pyigtl'
 
@@ -79,17 +70,12 @@ class SlicerNode(BaseNode):
         self.declare_settings('', LinkSettings())
         self.declare_settings('registration.', Registration())
         self._link: Connection | None = None
-        self._events, self._view = EventLog(), NeedleView()
+        self._events, self._view, self._states = EventLog(), NeedleView(), NodeStates()
         self._interpreter: Interpreter | None = None
-        self._greeted = ''
         self._shapes = self._targets = 0
-        self._source = ''
         self._rate = RateCounter()
         #: Unanswered target with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
-        #: Latest status of each node: time, level and message.
-        self._said: dict[str, tuple[float, int, str]] = {}
-        self._state_told = self._state_changed = -_STATE_PERIOD
 
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
@@ -99,8 +85,6 @@ class SlicerNode(BaseNode):
         self.listen(contract.TIP_DEFLECTION, self._on_tip)
         self.subscribe(contract.TIP_EXPECTED, self._on_expected)
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
-        #: Steady clock: a stopped ROS clock does not stop the connection.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     # Transitions.
 
@@ -127,7 +111,9 @@ class SlicerNode(BaseNode):
     def activate(self) -> None:
         """Open the connection and start its timer."""
         self._due = monotonic()
-        self._timer = self.create_timer(_LOOK, self._tick, clock=self._steady)
+        # Steady clock: a stopped ROS clock does not stop the connection.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(_CHECK, self._tick, clock=steady)
 
     def deactivate(self) -> None:
         self.destroy_timer(self._timer)
@@ -182,21 +168,15 @@ class SlicerNode(BaseNode):
         with self._rejecting(contract.TIP_EXPECTED):
             _check_frame(message.header.frame_id)
             self._view.take_expected(stamp, at, _quaternion(pose.orientation))
-            self._state_changed = monotonic()
+            self._states.mark_changed(monotonic())
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        now = monotonic()
         for status in message.status:
-            name, words = status.name.lstrip('/'), printable(status.message)
-            level = int.from_bytes(status.level, 'little')
-            if name not in self._said and len(self._said) >= _MOST_NODES:
-                continue
-            if self._said.get(name, (0.0, -1, ''))[1:] != (level, words):
-                self._state_changed = now
-            self._said[name] = now, level, words
+            name, level = status.name.lstrip('/'), int.from_bytes(status.level, 'little')
+            self._states.take(name, level, printable(status.message), monotonic())
             if self._sending is not None:
                 values = {one.key: one.value for one in status.values}
-                self._sending[0].hear(name, RequestStatus.from_values(values))
+                self._sending[0].take_status(name, RequestStatus.from_values(values))
 
     # Messages of the peer.
 
@@ -207,23 +187,18 @@ class SlicerNode(BaseNode):
             return
         self._take(interpreter, link.poll())
         now = monotonic()
-        shape = self._view.shape(now)
-        self._source = '' if shape is None else shape.source
         if now >= self._due:
             # A delay of less than a period does not delay the next shape.
             self._due = max(self._due + _PERIOD, now - _PERIOD)
-            if shape is not None:
+            if (shape := self._view.shape(now)) is not None:
                 self._publish_tip(shape)
-                self._tell_shape(link, interpreter, shape)
-        if link.peer:
-            since = self._state_told
-            changed = link.peer != self._greeted or self._state_changed > since
-            if changed or now - since >= _STATE_PERIOD:
-                self._state_told = now
-                self._tell_state(link, interpreter, now)
-        self._greeted = link.peer
+                self._send_shape(link, interpreter, shape)
+        if self._states.is_due(link.peer, now):
+            link.send(interpreter.state(self.now(), self._states.lines(now)))
+            if self._view.expected is not None:
+                link.send(interpreter.tip_expected(self._view.expected))
         self._repeat_target()
-        self.tell(self._events)
+        self.publish_events(self._events)
 
     def _repeat_target(self) -> None:
         """Publish the target again until it is answered, and report a rejection."""
@@ -251,7 +226,7 @@ class SlicerNode(BaseNode):
         if len(frames) > 2:
             self._events.add(
                 Severity.WARNING,
-                f'{len(frames)} messages within {_LOOK:g} s: only the newest target is used',
+                f'{len(frames)} messages within {_CHECK:g} s: only the newest target is used',
                 'flood',
             )
         if newest is None:
@@ -263,12 +238,12 @@ class SlicerNode(BaseNode):
         self._target.publish(message)
         self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
         self._targets += 1
-        heard = self._target.get_subscription_count()
+        subscribers = self._target.get_subscription_count()
         words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))
         self._events.add(
-            Severity.INFO if heard else Severity.WARNING,
+            Severity.INFO if subscribers else Severity.WARNING,
             f'target ({words}) mm in {contract.ENTRY}, by {frame.kind} of {frame.device}'
-            + ('' if heard else f': no node subscribes to {contract.TARGET.name}'),
+            + ('' if subscribers else f': no node subscribes to {contract.TARGET.name}'),
             'target',
         )
 
@@ -281,7 +256,7 @@ class SlicerNode(BaseNode):
         turn.x, turn.y, turn.z, turn.w = shape.turn.tolist()
         self._tip_pose.publish(message)
 
-    def _tell_shape(self, link: Connection, interpreter: Interpreter, shape: Shape) -> None:
+    def _send_shape(self, link: Connection, interpreter: Interpreter, shape: Shape) -> None:
         if not link.peer:
             return
         points, header = interpreter.shape(shape, self._shapes)
@@ -289,20 +264,6 @@ class SlicerNode(BaseNode):
             self._shapes += 1
             self._rate.add(self._steady_ns())
         link.send(interpreter.tip(shape))
-
-    def _tell_state(self, link: Connection, interpreter: Interpreter, now: float) -> None:
-        self._said = {
-            name: said for name, said in self._said.items() if now - said[0] < _FORGOTTEN
-        }
-        lines = []
-        for name, (when, level, words) in sorted(self._said.items()):
-            age = now - when
-            word = _LEVELS.get(level, str(level))
-            silent = f', silent for {age:.0f} s' if age > _SILENT else ''
-            lines.append(f'{name} [{word}{silent}]: {words}')
-        link.send(interpreter.state(self.now(), lines))
-        if self._view.expected is not None:
-            link.send(interpreter.tip_expected(self._view.expected))
 
     # Status.
 
@@ -314,7 +275,9 @@ class SlicerNode(BaseNode):
         link = self._link
         if link is None or not self.is_active:
             return Diagnosis(Severity.INFO, self.state, SlicerStatus())
-        source = self._source or (
+        shape = self._view.shape(monotonic())
+        source = '' if shape is None else shape.source
+        shown = source or (
             f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
             f'{contract.TIP_DEFLECTION.name} received'
         )
@@ -324,7 +287,7 @@ class SlicerNode(BaseNode):
             phase=phase,
             peer=link.peer,
             error=link.complaint,
-            shape_source=self._source,
+            shape_source=source,
             shapes=self._shapes,
             shape_rate=self._rate.rate(self._steady_ns()),
             left_out=link.left_out,
@@ -333,7 +296,7 @@ class SlicerNode(BaseNode):
             last_rejection=self._events.last_rejection,
         )
         severity = Severity.ERROR if link.complaint else Severity.INFO
-        return Diagnosis(severity, f'{link.state}; shape: {source}', status)
+        return Diagnosis(severity, f'{link.state}; shape: {shown}', status)
 
 
 def _quaternion(orientation: Any) -> list[float]:

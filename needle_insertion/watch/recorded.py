@@ -85,13 +85,13 @@ class ShownRecording:
         self._readers = {topic.name: MessageReader(topic.type_name) for topic in STREAMS}
 
         bag = Bag(path)
-        there = bag.topics()
-        chosen = _chosen(there)
+        topics = bag.topics()
+        chosen = _chosen(topics)
         if not chosen:
             known = ', '.join(topic.name for topic in (*STREAMS, *_OTHERS))
             raise RecordingError(
                 f'{path} has nothing to show: none of {known}; it has '
-                f'{", ".join(topic.name for topic in there)}'
+                f'{", ".join(topic.name for topic in topics)}'
             )
         first: int | None = None
         last = 0
@@ -143,11 +143,11 @@ class ShownRecording:
         for name, lines in self._lines.items():
             if drawn := lines.at(time):
                 view.line(name, drawn[1], drawn[0])
-        if said := self._expected.at(time):
-            view.expected(said[1])
+        if expected := self._expected.at(time):
+            view.expected(expected[1])
         for node, configurations in self._configurations.items():
-            if told := configurations.at(time):
-                view.configuration(node, told[1])
+            if parameters := configurations.at(time):
+                view.configuration(node, parameters[1])
         for states in self._nodes.values():
             if state := states.at(time):
                 view.status(state[1], state[0])
@@ -211,10 +211,10 @@ class PagePlayback:
         return self._at != now
 
 
-def _chosen(there: tuple[BagTopic, ...]) -> dict[BagTopic, str]:
+def _chosen(topics: tuple[BagTopic, ...]) -> dict[BagTopic, str]:
     """Return the topics to read, by contract name or, for configurations, by node name."""
     chosen: dict[BagTopic, str] = {}
-    for topic in sorted(there, key=lambda one: len(one.name), reverse=True):
+    for topic in sorted(topics, key=lambda one: len(one.name), reverse=True):
         space, _, last = topic.name.rpartition('/')
         for known in (*STREAMS, *_OTHERS):
             if topic.type_name == known.type_name and last == known.name.rpartition('/')[2]:

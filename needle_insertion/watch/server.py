@@ -245,7 +245,7 @@ class Server:
             if 'ask' in content:
                 connection.begin(self._do(content), str(content['ask'])[:20])
             elif content.keys() == {'seen'} and type(content['seen']) is int:
-                connection.seen(content['seen'])
+                connection.acknowledge(content['seen'])
             else:
                 connection.reader.take(content)
         except NeedleError as error:
@@ -287,7 +287,7 @@ class _Connection:
         self._credit = asyncio.Semaphore(_AHEAD)
         self._ahead = 0
 
-    def seen(self, number: int) -> None:
+    def acknowledge(self, number: int) -> None:
         """Process the acknowledgement of frames."""
         for _ in range(min(number, self._ahead)):
             self._ahead -= 1
@@ -320,8 +320,8 @@ class _Connection:
 
     async def answer(self, *, success: bool, words: str, asked: str = '') -> None:
         """Send the result of a message."""
-        said = {'asked': asked, 'success': success, 'words': printable(words)}
-        await self._put(json.dumps({'answer': said}))
+        answer = {'asked': asked, 'success': success, 'words': printable(words)}
+        await self._put(json.dumps({'answer': answer}))
 
     async def _put(self, text: str) -> bool:
         """Send a text; return whether the reader accepted it."""

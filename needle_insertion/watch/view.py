@@ -130,7 +130,7 @@ class View:
             'hit_probability': self._hit_probability(),
             **self._shape(depth, tip, guide, now),
             'silent': self._silent(now),
-            'nodes': self._told(now),
+            'nodes': self._node_rows(now),
             'invalid': self.invalid,
         }
 
@@ -175,9 +175,9 @@ class View:
         now: float,
     ) -> dict[str, Any]:
         """Return needle, path, and source of the shape."""
-        came, needle = self._lines.get('needle', (0.0, None))
+        received, needle = self._lines.get('needle', (0.0, None))
         path = self._lines.get('path', (0.0, None))[1]
-        if needle is not None and now - came < self._silence:
+        if needle is not None and now - received < self._silence:
             return {'needle': needle, 'path': path, 'shape': 'simulated'}
         if depth is None:
             return {'needle': None, 'path': path, 'shape': None}
@@ -193,7 +193,7 @@ class View:
 
     def _silent(self, now: float) -> dict[str, float]:
         """Return the age of each topic after its timeout [s]."""
-        ages = {name: now - came for name, (came, _) in self._readings.items()}
+        ages = {name: now - received for name, (received, _) in self._readings.items()}
         # A target is published once.
         return {
             name: round(age, 1)
@@ -201,13 +201,13 @@ class View:
             if age > self._silence and name != contract.TARGET.name
         }
 
-    def _told(self, now: float) -> list[dict[str, Any]]:
+    def _node_rows(self, now: float) -> list[dict[str, Any]]:
         """Return the status of each node, sorted by level, the worst first."""
         nodes = []
-        for name, (came, status, typed) in self._nodes.items():
+        for name, (received, status, typed) in self._nodes.items():
             level = status.level
             rejection = getattr(typed, 'last_rejection', '')
-            age = max(0.0, now - came)
+            age = max(0.0, now - received)
             nodes.append(
                 {
                     'name': printable(name),

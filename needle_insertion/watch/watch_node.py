@@ -34,13 +34,13 @@ _LINES: Final = contract.SENSOR._replace(depth=4)
 
 #: Timeout of a target, including planning, and polling period of answers [s].
 _PLANNED: Final = 60.0
-_LOOK: Final = 0.01
+_CHECK: Final = 0.01
 
 #: Largest number of events per call.
 _EVENTS: Final = 50
 
 #: QoS for the burst of status messages at the start.
-_SAID: Final = contract.SENSOR._replace(depth=50)
+_STATUSES: Final = contract.SENSOR._replace(depth=50)
 
 
 class WatchNode(Node):
@@ -72,9 +72,9 @@ class WatchNode(Node):
             topic = replace(contract.CONFIGURATION, name=f'{node}/configuration')
             self._listen(topic, contract.LATCHED, partial(self._configured, node))
         self._listen(
-            contract.TIP_EXPECTED, _NEWEST, lambda said, _: view.expected(said), raw=False
+            contract.TIP_EXPECTED, _NEWEST, lambda message, _: view.expected(message), raw=False
         )
-        self._listen(contract.DIAGNOSTICS, _SAID, self._told, raw=False)
+        self._listen(contract.DIAGNOSTICS, _STATUSES, self._on_diagnostics, raw=False)
 
     def _listen(
         self,
@@ -90,14 +90,14 @@ class WatchNode(Node):
     def _configured(self, node: str, data: bytes, _now: float) -> None:
         self._view.configuration(node, parameters_of(read_string(data)))
 
-    def _told(self, array: Any, now: float) -> None:
+    def _on_diagnostics(self, array: Any, now: float) -> None:
         for status in array.status:
             self._view.status(status, now)
 
     def poll(self, now: float) -> None:
         """Process waiting messages at a time of a steady clock [s]."""
-        for come, take in self._takers:
-            for message in come():
+        for waiting_messages, take in self._takers:
+            for message in waiting_messages():
                 try:
                     take(message, now)
                 except MessageError:  # noqa: PERF203
@@ -135,7 +135,7 @@ class Buttons:
         while not done():
             if monotonic() > end:
                 raise JobError(f'no answer to {what} within {timeout:g} s')
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_CHECK)
             self.spin()
 
     async def ask(self, what: str) -> tuple[bool, str]:

@@ -43,7 +43,7 @@ class _Needles:
             np.array([self._start] * number),
             np.zeros(number),
         )
-        self._held = Boxed(self._needles)
+        self._boxed = Boxed(self._needles)
 
     def begin(self, k: int, rng: np.random.Generator) -> None:
         """Sample a new needle and target for episode k."""
@@ -63,11 +63,11 @@ class _Needles:
         """Push the selected needles for a period; return rewards and which episodes ended."""
         if not np.isfinite(actions).all():
             raise ParameterError(f'an action must be finite, got {actions!r}')
-        return push(self._held, np.array(actions, dtype=np.float64), which)
+        return push(self._boxed, np.array(actions, dtype=np.float64), which)
 
     def observe(self) -> FloatArray:
         """Return the observations, shape (n, 4)."""
-        return np.asarray(observe(self._held))
+        return np.asarray(observe(self._boxed))
 
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):

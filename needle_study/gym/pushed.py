@@ -41,42 +41,29 @@ class Tissues(NamedTuple):
 
 
 class Pushed(NamedTuple):
-    """
-    State of n needles.
+    """State of n needles."""
 
-    Attributes
-    ----------
-    common : CompiledNeedle
-        Constants that are the same for all.
-    friction : ndarray, shape (n, 2)
-        Coulomb friction [N] and viscous friction [N s/m].
-    layers : Tissues
-        Layers of tissue.
-    times : ndarray, shape (n,)
-        [s].
-    states : ndarray, shape (n, 2 (2 + modes))
-        States.
-    targets : ndarray, shape (n,)
-        Target depths [m].
-    """
-
+    #: Constants that are the same for all.
     common: CompiledNeedle
+    #: Coulomb friction [N] and viscous friction [N s/m], shape (n, 2).
     friction: Matrix
     layers: Tissues
+    #: Times [s], shape (n,), and states, shape (n, 2 (2 + modes)).
     times: Vector
     states: Matrix
+    #: Target depths [m], shape (n,).
     targets: Vector
 
 
 @kernel
-def push(held: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
+def push(boxed: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
     Push the needles of the mask `which` for a period; overwrite their times and states.
 
     Actions, shape (n,), are forces as fractions of `FORCE`, clipped to [-1, 1]. Returns rewards
     [m], 0 where not pushed, and where a needle rests at its target or would have left its range.
     """
-    c, friction, layers, times, states, targets = held.value
+    c, friction, layers, times, states, targets = boxed.value
     n, u = states.shape[0], states.shape[1] // 2
     rewards, over = np.zeros(n), np.zeros(n, dtype=np.bool_)
     none = np.empty((0, 3))
@@ -102,13 +89,13 @@ def push(held: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[Float
 
 
 @kernel
-def observe(held: Boxed[Pushed]) -> Any:
+def observe(boxed: Boxed[Pushed]) -> Any:
     """Return depth error, velocity, depth and tip deflection, shape (n, 4), in `UNITS`."""
-    c, _, _, _, states, targets = held.value
+    c, _, _, _, states, targets = boxed.value
     tips, u = tip_deflections(c.modes, states), states.shape[1] // 2
-    seen = np.empty((states.shape[0], 4), dtype=np.float32)
+    observed = np.empty((states.shape[0], 4), dtype=np.float32)
     for k in range(states.shape[0]):
         depth = c.length - states[k, 0]
         for i, value in enumerate((targets[k] - depth, -states[k, u], depth, tips[k])):
-            seen[k, i] = min(max(value / UNITS[i], -BOUND), BOUND)
-    return seen
+            observed[k, i] = min(max(value / UNITS[i], -BOUND), BOUND)
+    return observed

@@ -104,15 +104,15 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
         plant.guide(GuideSetpoint(x, z))
         plant.insert()
-        seen = self._observe(plant)
+        observation = self._observe(plant)
         if not plant.done:
-            return seen, 0.0, False, False, {}
+            return observation, 0.0, False, False, {}
         miss = float(np.hypot(*(plant.tip - self._target)))
-        return seen, -1e3 * miss, True, False, {'miss': miss}
+        return observation, -1e3 * miss, True, False, {'miss': miss}
 
     def _observe(self, plant: SteeringPlant) -> FloatArray:
-        seen = plant.tip + self._prior.noise * self.np_random.standard_normal(2)
+        tip = plant.tip + self._prior.noise * self.np_random.standard_normal(2)
         depth = plant.needle.depth / self._depths[-1]
-        lengths = np.concatenate([seen, self._target, plant.needle.guide]) / self._limit
+        lengths = np.concatenate([tip, self._target, plant.needle.guide]) / self._limit
         numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)
         return np.asarray(numbers, dtype=np.float32)

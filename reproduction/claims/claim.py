@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
-from needle_insertion.experiment.tables import EXPERIMENTS, TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import EXPERIMENTS, TABLE_1, TABLE_2
 
 HOLDS: Final = 'holds'
 ONLY_IF: Final = 'holds only if'
@@ -29,37 +29,20 @@ def finding(numbers: Numbers, *, always: bool, sometimes: bool = False) -> Findi
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """
-    Claim of the paper with its verdict.
+    """Claim of the paper with its verdict."""
 
-    Attributes
-    ----------
-    name : str
-        Short name, equal to the name of the function that computes the verdict.
-    section : str
-        Section of the paper.
-    claim : str
-        Statement of the paper.
-    verdict : str
-        `HOLDS`, `ONLY_IF` or `FAILS`.
-    condition : str
-        Condition of `ONLY_IF`.
-    evidence : str
-        Evidence as text with numbers.
-    numbers : Numbers
-        Numbers of the evidence, by name.
-    test : str
-        Test that proves the verdict, if any.
-
-    """
-
+    #: Short name, equal to the name of the function that computes the verdict.
     name: str
+    #: Section of the paper, and its statement.
     section: str
     claim: str
+    #: `HOLDS`, `ONLY_IF` or `FAILS`, and the condition of `ONLY_IF`.
     verdict: str
     condition: str = ''
+    #: Evidence as text with numbers, and these numbers by name.
     evidence: str
     numbers: Numbers = field(default_factory=dict)
+    #: Test that proves the verdict, if any.
     test: str = ''
 
     @property
@@ -70,25 +53,14 @@ class Claim:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tables:
-    """
-    Statistics for claims about Tables 1 and 2.
-
-    Attributes
-    ----------
-    source : str
-        Source as text.
-    friction : Mapping[str, tuple of float]
-        Mean and standard deviation by the keys of `TABLE_1`, SI.
-    stiffness : Mapping[str, tuple of tuple of float]
-        Means and standard deviations at each force level by the keys of `TABLE_2`, SI.
-    experiments : int
-        Number of experiments of each statistic.
-
-    """
+    """Statistics for claims about Tables 1 and 2."""
 
     source: str = 'the printed tables'
+    #: Mean and standard deviation by the keys of `TABLE_1`, SI.
     friction: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TABLE_1)
+    #: Means and standard deviations at each force level by the keys of `TABLE_2`, SI.
     stiffness: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(
         default_factory=lambda: TABLE_2
     )
+    #: Number of experiments of each statistic.
     experiments: int = EXPERIMENTS

@@ -7,7 +7,7 @@ from typing import Final
 
 from needle_dynamics import FloatArray
 from needle_identification import asymmetry, StiffnessSettings
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 from reproduction.claims.claim import Finding, finding, Tables
 from reproduction.runs import hub_time, open_loop, READINGS

@@ -20,7 +20,7 @@ def test_cells_cover_faults_topics_and_moments() -> None:
 @pytest.mark.parametrize(
     ('cell', 'outcome'),
     [
-        (FaultCell('base_wrench', 'twice', 'moving'), 'borne'),
+        (FaultCell('base_wrench', 'twice', 'moving'), 'continued'),
         (FaultCell('joint_states', 'lost', 'moving'), 'no force'),
         (FaultCell('joint_states', 'frozen, new stamps', 'moving'), 'no force'),
         (FaultCell('tip_deflection', 'a number of 1e300', 'moving'), 'stop'),

@@ -11,10 +11,10 @@ import sys
 from needle_dynamics.plant_node import PlantNode
 from needle_identification import identify_friction, read_friction_recording
 from needle_insertion.cli import main
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import pytest
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
+from reproduction.protocol import SHIPPED_BAGS
 import yaml
 
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))]

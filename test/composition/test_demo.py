@@ -12,17 +12,17 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.demo.insertion import (
+import numpy as np
+import pytest
+from reproduction import demo
+from reproduction.demo import DemoError, run
+from reproduction.insertions.insertion import (
     COUNTED,
     insertion_checks,
     RecordedInsertion,
     TARGET_DEPTH,
 )
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
-import numpy as np
-import pytest
-from reproduction import demo
-from reproduction.demo import DemoError, run
+from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import compare_friction, compare_stiffness, TruthComparison
 
 

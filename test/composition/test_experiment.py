@@ -24,8 +24,13 @@ from needle_identification import (
     read_topic,
 )
 from needle_insertion.cli import main
-from needle_insertion.experiment.population import draw_friction, draw_stiffness
-from needle_insertion.experiment.protocol import (
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
+import numpy as np
+import pytest
+from reproduction import record as recorder
+from reproduction.campaign import Campaign
+from reproduction.population import draw_friction, draw_stiffness
+from reproduction.protocol import (
     DIRECTIONS,
     ExperimentProtocol,
     PROTOCOLS,
@@ -34,11 +39,6 @@ from needle_insertion.experiment.protocol import (
     SPEEDS,
     START_DEPTH,
 )
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
-import numpy as np
-import pytest
-from reproduction import record as recorder
-from reproduction.campaign import Campaign
 from reproduction.record import ExperimentError, record, Rig, rig
 
 FRICTION, STIFFNESS = PROTOCOLS['friction'], PROTOCOLS['stiffness']

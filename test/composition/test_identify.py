@@ -8,9 +8,9 @@ from typing import Any
 
 from needle_identification import TERMS
 from needle_insertion.cli import main
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import numpy as np
 import pytest
+from reproduction.protocol import SHIPPED_BAGS
 from support.pages import look_at
 from support.presses import STIFFNESS, write_presses
 import yaml

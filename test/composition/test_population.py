@@ -2,11 +2,11 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_insertion.experiment.population import draw_friction, draw_stiffness
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 from numpy.typing import ArrayLike
 import pytest
+from reproduction.population import draw_friction, draw_stiffness
 
 SEEDS = st.integers(0, 2**32)
 

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
-from needle_insertion.demo.aiming import animate_aiming
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 import pytest
+from reproduction.insertions.aiming import animate_aiming
 from support.browser import browser
 from support.pages import BROWSER, look_at
 from support.watched import TARGET, write_watched

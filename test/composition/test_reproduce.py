@@ -8,10 +8,9 @@ from typing import Any
 
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import controllability
 from needle_insertion.report.content import ReportSection
+from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
 from reproduction import figures, identified, mismatch, results
@@ -22,6 +21,7 @@ from reproduction.identified import (
     identify_table,
     PublishedValue,
 )
+from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import _stiffness, Coverage, TruthComparison
 from support.pages import look_at
 

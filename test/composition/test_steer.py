@@ -28,7 +28,7 @@ def test_steering_hits_where_open_loop_misses(
     assert said == ''
     off = np.array(found['tip [m]']) - found['expected tip [m]']
     # Single seed: three half-widths of the interval.
-    assert (np.abs(off) < 3.0 * np.array(found['its interval of 95 % [m]'])).all()
+    assert (np.abs(off) < 3.0 * np.array(found['expected tip half width [m]'])).all()
     assert picture.read_bytes().startswith(b'\x89PNG')
     assert steered(capsys)[0] == found
     other, _ = steered(capsys, '--seed', '1', '--target=-0.003,0.08,0.001', '--step', '0.004')
@@ -52,7 +52,7 @@ def test_roll_and_load_limits_take_effect(capsys: pytest.CaptureFixture[str]) ->
     rolled, _ = steered(capsys, near, *bevel, '--turns', '6', '--limit', '0')
     assert rolled['miss [m]'] < 1.5e-3 < 5e-3 < rolled['miss open loop [m]']
     assert 1 <= rolled['turns'] <= 6
-    assert rolled['way of the guide [m]'] == 0.0
+    assert rolled['guide travel [m]'] == 0.0
     free, _ = steered(capsys)
     bound, _ = steered(capsys, '--load-limit', '1')
     assert bound['largest load on the guide [N]'] < 1.3 < free['largest load on the guide [N]']

@@ -26,7 +26,6 @@ from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_identification import BagWriter, encode, message_type, RecordingError
 from needle_insertion.cli import main
-from needle_insertion.experiment.protocol import PROTOCOLS, SHIPPED_BAGS
 from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.replay.rerun import Rerun, verify
 from needle_ros.base_node import COMMAND, SENSOR
@@ -35,6 +34,7 @@ import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from reproduction.campaign import Campaign
+from reproduction.protocol import PROTOCOLS, SHIPPED_BAGS
 from reproduction.record import record
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger

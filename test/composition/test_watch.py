@@ -321,13 +321,16 @@ def file_of(bag: Path) -> Path:
 
 
 def test_readable_part_of_damaged_bag_is_shown(watched: Path, tmp_path: Path) -> None:
-    """Losses are reported."""
+    """The page receives the losses with its first frame."""
     file = tmp_path / 'cut.mcap'
     data = file_of(watched).read_bytes()
     file.write_bytes(data[: 2 * len(data) // 3])
     bag = ShownRecording(file)
     assert 0.5 < bag.duration < DURATION
-    assert bag.losses
+    first = asyncio.run(asyncio.wait_for(RecordedReader(bag).next(), 60.0))
+    losses = json.loads(first)['setting']['recording']['losses']
+    assert losses == [*bag.losses]
+    assert 'cut.mcap' in losses[0]
     assert bag.view(0.5).frame(0.5)['depth'] == pytest.approx(0.01, abs=1e-3)
 
 

@@ -16,6 +16,7 @@ from needle_identification import (
     read_indentation_recording,
     RecordingError,
 )
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -141,7 +142,7 @@ def test_the_force_axis_can_be_chosen(tmp_path: Path, axis: str, sign: float) ->
 
 @pytest.mark.parametrize('axis', ['', '-', 'w', '--x', 'xy'])
 def test_an_invalid_axis_is_rejected(tmp_path: Path, axis: str) -> None:
-    with pytest.raises(RecordingError, match='force axis must be'):
+    with pytest.raises(ParameterError, match='force axis must be'):
         read_friction_recording(tmp_path, force_axis=axis)
 
 
@@ -573,5 +574,5 @@ def test_the_joint_out_of_the_plane_may_be_missing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
 def test_an_invalid_plane_is_rejected(tmp_path: Path, axes: tuple[str, str]) -> None:
-    with pytest.raises(RecordingError, match=r'axes must be two different|axis of the plane must'):
+    with pytest.raises(ParameterError, match=r'axes must be two different|axis of the plane must'):
         read_indentation_recording(tmp_path, axes=axes)

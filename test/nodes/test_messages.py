@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics.plant_node import PlantNode
 from needle_identification import BagTopic, deserialize, encode
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 from needle_ros import wire
 from needle_ros.base_node import message_class, profile, SENSOR
@@ -23,6 +22,7 @@ from needle_ros.timing import nanoseconds
 from needle_ros.wire import JOINT_STATE, POINT, Reading, Template, WRENCH
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
+from reproduction.protocol import SHIPPED_BAGS
 from sensor_msgs.msg import JointState
 from support.installed import node_class
 from support.ros_graph import RosGraph, statuses

@@ -15,9 +15,9 @@ import xml.etree.ElementTree as ET
 
 from catkin_pkg.package import InvalidPackage, parse_package_string
 from lxml import etree
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 import pytest
+from reproduction.protocol import SHIPPED_BAGS
 from support.installed import ROOT
 from support.ros_graph import RosGraph
 import yaml

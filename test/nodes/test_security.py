@@ -12,12 +12,12 @@ import sys
 from typing import NamedTuple
 
 from lxml import etree
-from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
 from needle_ros.network import LOCAL, PROFILES, RANGE, stay_local
 import pytest
+from reproduction.protocol import SHIPPED_BAGS
 from support.installed import node_class, ROOT
 from support.ros_graph import RosGraph
 

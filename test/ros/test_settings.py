@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values, unknown_name
+from needle_ros.settings import (
+    check_constants,
+    choice,
+    constant,
+    flag,
+    from_values,
+    text,
+    unknown_name,
+)
 import pytest
 
 
@@ -25,6 +33,18 @@ class Robot:
         check_constants(self)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Stand:
+    """Example of settings that are not numbers."""
+
+    side: str = choice('left', ('left', 'right'), 'side of the robot')
+    mirrored: bool = flag(False, 'whether it is mirrored')
+    label: str = text('', 'label')
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
 def test_values_are_converted_to_field_types() -> None:
     """Integers to floats, lists and arrays to tuples; missing values get the default."""
     made = from_values(Robot, {'gain': 3, 'levels': [1, 2.5], 'law': 'pd'})
@@ -32,6 +52,28 @@ def test_values_are_converted_to_field_types() -> None:
     assert [type(number) for number in (made.gain, *made.levels)] == [float] * 3
     assert from_values(Robot, {'levels': array('d', [4.0])}).levels == (4.0,)
     assert from_values(Robot, {}) == Robot()
+
+
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [
+        ({'side': 'top'}, "stand.side must be one of left, right, got 'top'"),
+        ({'side': ['left']}, "stand.side must be one of left, right, got ['left']"),
+        ({'mirrored': 1}, 'stand.mirrored must be true or false, got 1'),
+        ({'label': 3}, 'stand.label must be text, got 3'),
+    ],
+)
+def test_an_invalid_word_is_named_with_the_valid_words(
+    given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ParameterError) as caught:
+        from_values(Stand, given, 'stand.')
+    assert str(caught.value) == message
+
+
+def test_a_choice_describes_its_words() -> None:
+    meta = Stand.__dataclass_fields__['side'].metadata
+    assert meta['description'] == 'one of left, right: side of the robot'
 
 
 def test_none_is_an_empty_tuple() -> None:

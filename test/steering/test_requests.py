@@ -475,13 +475,13 @@ def test_a_request_is_repeated_until_it_is_answered() -> None:
         pending = PendingRequest(TARGET, 7, 'steering', steady=lambda: now[0])
         own = RequestLog({TARGET: ()})
         own.answer(TARGET, 7, Verdict.RECEIVED)
-        pending.hear('node', own.status())
+        pending.take_status('node', own.status())
         now[0] += 60.0
         # A plan takes its time.
         assert not pending.done
         assert not pending.repeat()
         own.answer(TARGET, 7, verdict, 'too deep' if verdict is not Verdict.ACCEPTED else '')
-        pending.hear('node', own.status())
+        pending.take_status('node', own.status())
         assert pending.done
         assert pending.outcome == line
 

@@ -8,10 +8,10 @@ from math import cos, pi, sin
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from needle_insertion.experiment.tables import FORCE_LEVELS
+from needle_insertion.report.paper_tables import FORCE_LEVELS
 
 #: Recordings shipped with the source tree.
-SHIPPED_BAGS: Final = Path(__file__).parents[2] / 'bags'
+SHIPPED_BAGS: Final = Path(__file__).parents[1] / 'bags'
 
 #: Insertion depth at which the tip is past the tissue, so that nothing is cut [m].
 START_DEPTH: Final = 0.1

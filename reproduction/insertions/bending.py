@@ -16,13 +16,13 @@ from needle_identification import (
     read_topic,
     SteeringSettings,
 )
-from needle_insertion.demo.insertion import record_insertion
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.text import Check
 from needle_ros.errors import NeedleError
 import numpy as np
+from reproduction.insertions.insertion import record_insertion
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Preset of needle and tissue, and plant with a bevel load and a tracker in the tip.
@@ -49,7 +49,7 @@ LEAST_DEFLECTION: Final = 2e-3
 LARGEST_DISTANCE: Final = 2.0
 
 #: Number of needles in the picture.
-_DRAWN: Final = 5
+DRAWN: Final = 5
 
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
@@ -104,7 +104,7 @@ def replay_check(bag: Path, what: str) -> Check:
 def draw_bending(bag: Path) -> Figure:
     """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
-    return draw_needle(evenly(needles, _DRAWN), path)
+    return draw_needle(evenly(needles, DRAWN), path)
 
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:

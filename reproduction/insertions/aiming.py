@@ -12,8 +12,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.demo.bending import read_needles, replay_check
-from needle_insertion.demo.insertion import RATE, SETTLING
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
@@ -27,6 +25,9 @@ from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
+from reproduction.insertions import bending
+from reproduction.insertions.bending import read_needles, replay_check
+from reproduction.insertions.insertion import RATE, SETTLING
 
 #: Target of the tip, x, y, z [m], and insertion depth at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
@@ -35,27 +36,19 @@ START: Final = 5e-3
 #: Insertion speed [m/s].
 SPEED: Final = 0.02
 
-#: Nominal model of needle and tissue.
-PRESET: Final = {'model.preset': 'bending_35mm'}
-
 #: Plant: tissue softer than the nominal model, bevel, random path deviation, EM tracker.
 PLANT: Final[dict[str, object]] = {
-    **PRESET,
-    'steered': True,
+    **bending.PLANT,
     'rate': RATE,
     'depth': START,
     'model.tissue_stiffness': 45e3,
     'steering.bevel_load': [0.15],
-    'steering.cutting_force': [1.0],
     'steering.path_noise': 1e-4,
-    'tip.rate': 40.0,
-    'tip.noise': 1.8e-4,
-    'tip.delay': 0.02,
 }
 
 #: Node `steering`: half the default measurement time of the tip, for a short demo.
 STEERING: Final[dict[str, object]] = {
-    **PRESET,
+    'model.preset': bending.PRESET,
     'speed': SPEED,
     'guide_speed': 0.02,
     'settle_time': 0.05,
@@ -65,7 +58,7 @@ STEERING: Final[dict[str, object]] = {
 
 #: Node `controller`.
 CONTROLLER: Final[dict[str, object]] = {
-    **PRESET,
+    'model.preset': bending.PRESET,
     'rate': RATE,
     'deflection_feedback': 'none',
     'reference.speed': SPEED,
@@ -79,8 +72,7 @@ LARGEST_MISS: Final = 1e-3
 #: chi-squared distribution with two degrees of freedom.
 _LARGEST: Final = 13.8
 
-#: Number of needles in the picture, and of frames in the animation.
-_DRAWN: Final = 5
+#: Number of frames in the animation.
 _FRAMES: Final = 80
 
 #: Timeout of the insertion, and of the answer to a target, in simulated time [s].
@@ -146,7 +138,7 @@ class Aimed:
         return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
 
     @property
-    def said(self) -> str:
+    def interval_text(self) -> str:
         """Text of the expected tip position with its 95 % interval."""
         half = _NORMAL * np.sqrt(np.diag(self.covariance))
         return ', '.join(
@@ -175,7 +167,7 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
     """Check both misses, the expected tip, and the replay; `other` is with a guide at rest."""
     found = read_aimed(bag)
     off = found.tip - found.expected
-    held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
+    contained = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
     alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
     x, z = 1e3 * found.tip
     return [
@@ -191,7 +183,12 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
             f'{1e3 * alone:.2f} mm',
             alone > LARGEST_MISS,
         ),
-        Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
+        Check(
+            'expected tip, steered',
+            f'x = {x:.2f} mm, z = {z:.2f} mm',
+            found.interval_text,
+            contained,
+        ),
         replay_check(bag, 'steered'),
     ]
 
@@ -200,7 +197,7 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
     """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
     needles, path = read_needles(bag)
     (*_, last), _ = read_needles(other)
-    return draw_needle(evenly(needles, _DRAWN), path, np.array(TARGET), last)
+    return draw_needle(evenly(needles, bending.DRAWN), path, np.array(TARGET), last)
 
 
 def animate_aiming(bag: Path) -> Animation:

@@ -13,7 +13,7 @@ from itertools import count
 from typing import Final
 
 from needle_dynamics import FloatArray
-from needle_insertion.experiment.tables import TABLE_1, TABLE_2
+from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 import numpy as np
 from scipy.special import gammaincinv, ndtri
 

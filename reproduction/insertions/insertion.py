@@ -27,7 +27,6 @@ START_DEFLECTION: Final = 5e-4
 #: Topics sampled at `RATE`, whose messages are counted.
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
 
-
 #: Recorded time after the nominal arrival, for ramps and settling [s].
 SETTLING: Final = 1.6
 

@@ -1,1 +1,0 @@
-"""Define the experiments of the paper: published values, motions and sampled parameters."""
