@@ -120,27 +120,14 @@ class ControllerSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """
-    Readings of the encoders.
+    """Readings of the encoders."""
 
-    Attributes
-    ----------
-    time : float
-        Time of the sample [s].
-    depth, velocity : float
-        Insertion depth [m] and insertion velocity [m/s], positive into the tissue.
-    angle, angular_velocity : float
-        Rotation of the base about x [rad] and its velocity [rad/s].
-    force : float
-        Axial force on the needle as reported by the robot [N]; NaN if it is not reported.
-
-    """
-
-    time: float
-    depth: float
-    velocity: float
-    angle: float = 0.0
-    angular_velocity: float = 0.0
+    time: float  #: time of the sample [s]
+    depth: float  #: insertion depth [m]
+    velocity: float  #: insertion velocity [m/s], positive into the tissue
+    angle: float = 0.0  #: rotation of the base about x [rad]
+    angular_velocity: float = 0.0  #: its velocity [rad/s]
+    #: Axial force on the needle as reported by the robot [N]; NaN if not reported.
     force: float = nan
 
     def is_finite(self) -> bool:
@@ -155,29 +142,13 @@ NO_SETPOINT: Final = Setpoint(nan)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerOutput:
-    """
-    Command of a controller in response to a measurement.
+    """Command of a controller in response to a measurement."""
 
-    Attributes
-    ----------
-    force : float
-        f_y [N], positive into the tissue.
-    torque : float
-        tau about x [N m].
-    setpoint : Setpoint
-        Reference of the insertion depth at the time of the measurement; NaN without a reference.
-    fault : str or None
-        Why no force is commanded.
-    notice : str or None
-        A message for the user.
-
-    """
-
-    force: float
-    torque: float = 0.0
-    setpoint: Setpoint = NO_SETPOINT
-    fault: str | None = None
-    notice: str | None = None
+    force: float  #: f_y [N], positive into the tissue
+    torque: float = 0.0  #: tau about x [N m]
+    setpoint: Setpoint = NO_SETPOINT  #: of the measurement; NaN without a reference
+    fault: str | None = None  #: why no force is commanded
+    notice: str | None = None  #: message for the user
 
     def is_finite(self) -> bool:
         """Return whether force and torque are finite."""

@@ -49,29 +49,13 @@ _MOST_RATE: Final = 1e3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limit:
-    """
-    Stability limit of a loop: the critical axis, its poles and its limit cycle.
+    """Stability limit of a loop: the critical axis, its poles and its limit cycle."""
 
-    Attributes
-    ----------
-    radius : float
-        Spectral radius: the largest modulus of the poles.
-    bound : float
-        Largest valid radius: 1 - margin, or with the reserve just below 1.
-    unmodeled : int
-        Periods of delay that the law does not model: 0 or RESERVE.
-    plant : Axis
-        The true axis.
-    cycle : float
-        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 without a cycle.
-
-    """
-
-    radius: float
-    bound: float
-    unmodeled: int
-    plant: Axis
-    cycle: float = 0.0
+    radius: float  #: spectral radius: the largest modulus of the poles
+    bound: float  #: largest valid radius: 1 - margin, or with the reserve just below 1
+    unmodeled: int  #: periods of delay that the law does not model: 0 or RESERVE
+    plant: Axis  #: the true axis
+    cycle: float = 0.0  #: amplitude of a limit cycle of dry friction [m] or [rad]; 0 without
 
     @property
     def stable(self) -> bool:

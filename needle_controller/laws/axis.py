@@ -25,21 +25,14 @@ class Response(NamedTuple):
     """
     Linear response of an axis over a time, under a constant force.
 
-    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force.
-
-    Attributes
-    ----------
-    pv, vv : float
-        Response to the velocity [s], [1].
-    pf, vf : float
-        Response to the force [m/N], [m/(N s)]; for rotation, angles and torques.
-
+    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force;
+    for rotation these are angles and torques.
     """
 
-    pv: float
-    vv: float
-    pf: float
-    vf: float
+    pv: float  #: [s]
+    vv: float  #: [1]
+    pf: float  #: [m/N]
+    vf: float  #: [m/(N s)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

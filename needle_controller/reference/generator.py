@@ -23,26 +23,8 @@ class ReferenceGenerator:
     Reference generator: moves to a target or along a path, and can be paused.
 
     Every change starts at the present setpoint, with the next call of `at`: the reference is
-    continuous.
-
-    Parameters
-    ----------
-    kind : str
-        Motion to a target, a key of `REFERENCES`.
-    limits : ReferenceLimits
-        Limits.
-    depths : tuple of float
-        Least and largest insertion depth [m].
-
-    Attributes
-    ----------
-    paused : bool
-        Whether the reference is paused.
-    waits : bool
-        Whether the reference waits for a plant that does not follow.
-    target : float or None
-        Insertion depth at the end of the motion [m]; None without a target or path.
-
+    continuous. ``kind`` is a key of `REFERENCES`, and ``depths`` are the least and largest
+    insertion depth [m].
     """
 
     def __init__(self, kind: str, limits: ReferenceLimits, depths: tuple[float, float]) -> None:
@@ -59,8 +41,10 @@ class ReferenceGenerator:
 
     def forget(self) -> None:
         """Discard target, path and pause."""
+        #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
         self._path: Path | None = None
+        #: Whether it is paused, and whether it waits for a plant that does not follow.
         self.paused = self.waits = False
         self.release()
 

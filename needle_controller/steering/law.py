@@ -40,20 +40,10 @@ class SteeringFaultError(JobError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TipEstimate:
-    """
-    Estimated or predicted position of the tip.
+    """Estimated or predicted position of the tip."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (2,)
-        Position in x and z in the frame of the sensor [m].
-    covariance : ndarray, shape (2, 2)
-        Its covariance [m^2].
-
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  #: position in x and z in the frame of the sensor [m], shape (2,)
+    covariance: FloatArray  #: its covariance [m^2], shape (2, 2)
 
     @property
     def half_width(self) -> FloatArray:
@@ -75,21 +65,11 @@ class TipEstimate:
 
 
 class GuideSetpoint(NamedTuple):
-    """
-    Guide setpoint for the next step: guide and roll move while the tip rests.
+    """Guide setpoint for the next step: guide and roll move while the tip rests."""
 
-    Attributes
-    ----------
-    x, z : float
-        Position of the guide [m].
-    roll : float
-        Roll of the needle [rad].
-
-    """
-
-    x: float
-    z: float
-    roll: float = 0.0
+    x: float  #: position of the guide along x [m]
+    z: float  #: position of the guide along z [m]
+    roll: float = 0.0  #: roll of the needle [rad]
 
 
 class SteeringLaw(Protocol):

@@ -160,12 +160,9 @@ class SteeringModel:
         between = [
             np.gradient(grid, axis=axis) if grid.shape[axis] > 1 else 0.0 * grid for axis in (1, 0)
         ]
-        self.responses = HypothesisResponses(
-            *arrays,
-            np.array(between).reshape(2, *guide.shape),
-            _sums_from(guide[:, -1], n + 1),
-            _sums_from(bevel[:, -1], n + 3),
-        )
+        arrays.append(np.array(between).reshape(2, *guide.shape))
+        arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
+        self.responses = HypothesisResponses(*arrays)
         deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN]
         self.prior_covariance = np.diag(np.array(deviations) ** 2)
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length

@@ -19,26 +19,12 @@ _FEW: Final = 3
 
 
 class AveragedTipMeasurement(NamedTuple):
-    """
-    Result of an averaged tip measurement.
+    """Result of an averaged tip measurement."""
 
-    Attributes
-    ----------
-    tip : ndarray, shape (3,)
-        Position of the tip, x, y, z [m].
-    error : float
-        Standard error along x or z, from the scatter of the readings [m]; 0 for few readings.
-    readings : int
-        Number of valid readings.
-    frozen : bool
-        Whether at least three readings are identical in x and z.
-
-    """
-
-    tip: FloatArray
-    error: float
-    readings: int
-    frozen: bool
+    tip: FloatArray  #: position of the tip, x, y, z [m]
+    error: float  #: standard error along x or z, from the scatter of the readings [m]; 0 for few
+    readings: int  #: number of valid readings
+    frozen: bool  #: whether at least three readings are identical in x and z
 
 
 class TipMeasurements:

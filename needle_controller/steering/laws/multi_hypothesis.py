@@ -61,23 +61,11 @@ _REFUSED, _WARNED = 0.05, 0.5
 
 
 class Reach(NamedTuple):
-    """
-    Reachable set of the tip, for each hypothesis.
+    """Reachable set of the tip, for each hypothesis."""
 
-    Attributes
-    ----------
-    middles : ndarray of complex, shape (h,)
-        Final position without further motion, x + i z [m].
-    sizes : ndarray of complex, shape (h,)
-        Half width of the reachable set, along x + i along z [m].
-    weights : ndarray, shape (h,)
-        Weight (probability) of each hypothesis.
-
-    """
-
-    middles: ComplexArray
-    sizes: ComplexArray
-    weights: FloatArray
+    middles: ComplexArray  #: final position without further motion, x + i z [m]
+    sizes: ComplexArray  #: half width of the reachable set, along x + i along z [m]
+    weights: FloatArray  #: hypothesis weights
 
 
 class OutOfReachError(JobError):
