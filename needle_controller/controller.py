@@ -177,19 +177,6 @@ class Controller:
     uncertainty : Uncertainty, optional
         Uncertainty of the nominal constants; the gains must be stable within it.
 
-    Attributes
-    ----------
-    parameters, law, settings
-        As given.
-    guide : ReferenceGenerator
-        The reference generator: targets, paths, pauses.
-    limits : dict of str to Limit
-        Stability limit of each axis.
-    period : float
-        Sample period [s].
-    delay : int
-        Periods from a measurement to the effect of its command.
-
     Raises
     ------
     ParameterError
@@ -222,11 +209,15 @@ class Controller:
     ) -> None:
         self._uncertainty = uncertainty or Uncertainty()
         self.settings = settings = settings or ControllerSettings()
+        #: Sample period [s], and periods from a measurement to the effect of its command.
         self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
+        #: Targets, paths and pauses.
         self.guide = ReferenceGenerator(
             reference, limits or ReferenceLimits(), settings.depths(parameters)
         )
         self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
+        #: Stability limit of each axis.
+        self.limits: dict[str, Limit]
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)

@@ -40,13 +40,6 @@ class Axis(Friction):
     """
     Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction.
 
-    Attributes
-    ----------
-    inertia : float
-        Inertia.
-    law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed
-        As for `Friction`; without friction by default.
-
     Raises
     ------
     ParameterError
@@ -54,7 +47,7 @@ class Axis(Friction):
 
     """
 
-    inertia: float
+    inertia: float  #: [kg] or [kg m^2]
     coulomb: float = 0.0
     viscous: float = 0.0
 

@@ -87,17 +87,6 @@ class Observer:
     period : float
         Sample period of encoders and wrench [s].
 
-    Attributes
-    ----------
-    refused : int
-        Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
-        that are not finite, repeated, older than the history, far ahead of the encoders, or
-        (a wrench) between encoder samples.
-    restarts : int
-        Number of automatic restarts.
-    warning : str or None
-        Reason of the last restart; None without a restart since construction or `reset`.
-
     Raises
     ------
     ParameterError
@@ -162,7 +151,12 @@ class Observer:
 
     def reset(self) -> None:
         """Discard all measurements; the next encoder sample restarts the observer."""
-        self.refused = self.restarts = 0
+        #: Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
+        #: that are not finite, repeated, older than the history, far ahead of the encoders, or (a
+        #: wrench) between encoder samples.
+        self.refused = 0
+        #: Number of automatic restarts, and reason of the last one.
+        self.restarts = 0
         self.warning: str | None = None
         self._last: _Encoders | None = None
         self._waiting: list[tuple[int, float, float]] = []

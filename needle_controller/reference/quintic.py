@@ -94,12 +94,6 @@ class MinimumJerk(Reference):
         Limits; values that the start already exceeds are allowed.
     depths : tuple of float
         Lowest and highest position of the motion [m]; the start is always allowed.
-
-    Attributes
-    ----------
-    duration : float
-        Duration of the motion [s].
-
     """
 
     def __init__(

@@ -34,11 +34,6 @@ class Trapezoid(Reference):
     limits : ReferenceLimits
         Limits. If the start is faster than the limit, the motion first brakes.
 
-    Attributes
-    ----------
-    duration : float
-        Duration of the motion [s].
-
     Examples
     --------
     >>> from needle_controller import ReferenceLimits, Setpoint, Trapezoid

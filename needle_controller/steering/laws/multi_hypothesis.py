@@ -101,17 +101,6 @@ class MultiHypothesisLaw:
     roll : float
         Roll of the needle at the start [rad].
 
-    Attributes
-    ----------
-    target : ndarray, shape (2,)
-        The target [m].
-    step : int
-        Number of tip measurements so far.
-    turns : int
-        Number of turns left.
-    weights : ndarray, shape (h,)
-        Weight (probability) of each hypothesis.
-
     Raises
     ------
     ShapeError, ParameterError
