@@ -419,8 +419,8 @@ class Controller:
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
         torque = 0.0
         if self.settings.rotation:
-            still = Setpoint(0.0)
-            torque = self._rotation.command(measured.angle, measured.angular_velocity, still)
+            angle, rest = measured.angle, Setpoint(0.0)
+            torque = self._rotation.command(angle, measured.angular_velocity, rest)
         return ControllerOutput(
             force=self._insertion.command(measured.depth, measured.velocity, ahead, load),
             torque=torque,

@@ -224,8 +224,8 @@ class SampledLoop:
             return {}
         blocks = self.memory[LEARNED:].reshape(2, BLOCK)
         return {
-            f'{term}, {way} [{unit}]': (float(block[i]), sqrt(float(variance)))
-            for way, block in zip(('insertion', 'withdrawal'), blocks, strict=True)
+            f'{term}, {direction} [{unit}]': (float(block[i]), sqrt(float(variance)))
+            for direction, block in zip(('insertion', 'withdrawal'), blocks, strict=True)
             for i, (term, unit) in enumerate(_TERMS.items())
             if (variance := block[TERMS + i * (TERMS + 1)]) > 0.0
         }

@@ -84,17 +84,17 @@ class ReferenceGenerator:
 
     def pause(self) -> None:
         """Brake to rest within the limits and hold the position."""
-        self._still(True, self.waits)
+        self._set_pause(True, self.waits)
 
     def resume(self) -> None:
         """Continue to the target, or along the path from the position of the pause."""
-        self._still(False, self.waits)
+        self._set_pause(False, self.waits)
 
     def wait(self, waits: bool) -> None:
         """Brake and hold while the plant does not follow (``waits``), or continue."""
-        self._still(self.paused, waits)
+        self._set_pause(self.paused, waits)
 
-    def _still(self, paused: bool, waits: bool) -> None:
+    def _set_pause(self, paused: bool, waits: bool) -> None:
         before = self.paused or self.waits
         self.paused, self.waits = paused, waits
         if before != (paused or waits):

@@ -121,14 +121,16 @@ class SteeringLaw(Protocol):
         tip : array_like of shape (2,) or None
             Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
         at : int
-            Number of its depth: the present or, if the needle does not rest, the one before.
+            Number of its depth, not greater than `step`: the present or, if the needle does not
+            rest, the depth before.
         noise : float
             Standard deviation of the measurement along each axis, if above the configured one [m].
 
         Raises
         ------
         SteeringFaultError
-            If the needle must stop.
+            If the needle must stop, because the measurements are missing for too long, have
+            frozen, or are implausible.
 
         """
 
@@ -217,15 +219,11 @@ def build_law(
     # The constructor is any code of the user.
     except Exception as error:
         raise ParameterError(f'law {name!r} cannot be constructed: {error}') from error
-    missing = [one for one in _MEMBERS if not hasattr(law, one)]
+    members = 'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status'
+    missing = [name for name in members if not hasattr(law, name)]
     if missing:
         raise ParameterError(f'law {name!r} has no {", ".join(missing)}')
     return law
-
-
-_MEMBERS: Final = (
-    'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status',
-)  # fmt: skip
 
 
 def checked_roll(roll: float) -> float:

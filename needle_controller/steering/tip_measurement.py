@@ -37,7 +37,7 @@ class TipMeasurements:
         """Add a reading of the tip, x, y, z [m], at a distance before the depth [m]."""
         self._readings.append((*tip, before))
 
-    def seen(self, noise: float) -> AveragedTipMeasurement | None:
+    def average(self, noise: float) -> AveragedTipMeasurement | None:
         """
         Return the mean without outliers, or during motion a fitted line at the depth; or None.
 

@@ -104,7 +104,7 @@ class Plain:
         return (low + high) / 2.0, (high - low) / 2.0
 
     @property
-    def chance(self) -> float:
+    def hit_probability(self) -> float:
         """Return the probability of a hit near the target."""
         means, errors, turned = self.ends(self.turns, self.step + 1)
         shifts, chance = self.model.responses.guide[:, -1, self.step :], 1.0
@@ -209,7 +209,7 @@ class Compared(MultiHypothesisLaw):
         assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
         assert_allclose(self.weights, plain.weights, rtol=1e-6, atol=1e-12)
         # Sums in another order.
-        assert self.chance == pytest.approx(plain.chance, abs=1e-12)
+        assert self.hit_probability == pytest.approx(plain.hit_probability, abs=1e-12)
         return to
 
 

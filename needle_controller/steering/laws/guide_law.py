@@ -56,11 +56,11 @@ class GuideLaw(ABC):
         """Process a tip measurement, x and z [m], or None; see `SteeringLaw`."""
         if tip is None:
             return
-        found = np.array(tip, dtype=np.float64)
-        if found.shape != (2,):
-            raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
-        if np.isfinite(found).all():
-            self._newest = found, at
+        measured = np.array(tip, dtype=np.float64)
+        if measured.shape != (2,):
+            raise ShapeError(f'a tip measurement must be x and z, got shape {measured.shape}')
+        if np.isfinite(measured).all():
+            self._newest = measured, at
 
     def plan(self) -> GuideSetpoint:
         """Return guide and roll for the next step, and advance to it; unchanged at the end."""
