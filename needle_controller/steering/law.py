@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from math import isfinite
-from typing import Final, NamedTuple, Protocol
+from math import isfinite, nan
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
@@ -144,17 +144,8 @@ class SteeringLaw(Protocol):
         """Return values for the status by name: turns_left, hit_probability, or others."""
 
 
-class LawClass(Protocol):
-    """Constructor of a steering law."""
-
-    def __call__(
-        self,
-        model: SteeringModel,
-        target: ArrayLike,
-        limits: SteeringLimits,
-        roll: float,
-    ) -> SteeringLaw:
-        """Create a law; parameters as for `build_law`."""
+#: Constructor of a steering law: model, target, limits and roll, as for `build_law`.
+LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float], SteeringLaw]
 
 
 def find_law(name: str) -> LawClass:
@@ -231,6 +222,14 @@ def checked_roll(roll: float) -> float:
     if not isfinite(roll):
         raise ParameterError(f'roll must be finite, got {roll!r} rad')
     return roll
+
+
+def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
+    """Return a tip measurement x, z [m] as an array, nan if it is missing."""
+    found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
+    if found.shape != (2,):
+        raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
+    return found
 
 
 def checked_target(target: ArrayLike) -> FloatArray:

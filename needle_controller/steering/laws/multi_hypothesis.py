@@ -44,6 +44,7 @@ from needle_controller.compiled.steering import (
 from needle_controller.steering.law import (
     checked_roll,
     checked_target,
+    checked_tip,
     GuideSetpoint,
     SteeringFaultError,
     SteeringLaw,
@@ -52,7 +53,7 @@ from needle_controller.steering.law import (
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
-from needle_ros.errors import JobError, ParameterError, ShapeError
+from needle_ros.errors import JobError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -258,10 +259,7 @@ class MultiHypothesisLaw(SteeringLaw):
             raise JobError(f'all {self._model.steps} steps are done')
         if not 0 <= at <= self.step:
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
-        measured = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
-        if measured.shape != (2,):
-            raise ShapeError(f'a tip measurement must be x and z, got shape {measured.shape}')
-        x, z = measured.tolist()
+        x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
         kind, off_x, off_z = see(self._held, at, x, z, variance)
         if kind == FINE:
