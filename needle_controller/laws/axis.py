@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import inf
 from typing import NamedTuple
 
@@ -73,9 +73,7 @@ class Axis(Friction):
             Moving mass [kg] and friction.
 
         """
-        friction = parameters.friction
-        constants = {item.name: getattr(friction, item.name) for item in fields(friction)}
-        return cls(inertia=parameters.moving_mass, **constants)
+        return cls(inertia=parameters.moving_mass, **asdict(parameters.friction))
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:

@@ -33,7 +33,6 @@ class ReferenceGenerator:
         self._kind = REFERENCES[kind]
         self._limits, self._depths = limits, depths
         self._motion: Reference | None = None
-        self._motion_path: Path | None = None
         self._start = self._now = 0.0
         #: Elapsed time of the path at the last change [s].
         self._passed = 0.0
@@ -51,12 +50,12 @@ class ReferenceGenerator:
     def release(self) -> None:
         """Discard the motion: the next motion starts at the needle, to the same target."""
         self._mark()
-        self._motion = self._motion_path = None
+        self._motion = None
         self._change: Callable[[Setpoint], Reference] | None = self._plan
 
     def _mark(self) -> None:
         """Store the elapsed time of the path."""
-        if isinstance(self._motion, Joined) and self._motion_path is self._path:
+        if isinstance(self._motion, Joined) and self._motion.path is self._path:
             self._passed = max(self._now - self._start - self._motion.offset, self._passed)
 
     @property
@@ -114,7 +113,7 @@ class ReferenceGenerator:
             now = Setpoint(depth) if anew else self.ahead(time)
             self._mark()
             change, self._change = self._change, None
-            self._motion, self._motion_path, self._start = change(now), self._path, time
+            self._motion, self._start = change(now), time
         return self.ahead(time)
 
     def ahead(self, time: float) -> Setpoint:

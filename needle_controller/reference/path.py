@@ -166,7 +166,7 @@ class Joined(Reference):
     """
 
     def __init__(self, start: Setpoint, path: Path, since: float, limits: ReferenceLimits) -> None:
-        self._path = path
+        self.path = path
         self._halt: Reference | None = None
         depths = around(path.depths, start)
         if start.acceleration:
@@ -189,12 +189,12 @@ class Joined(Reference):
 
     def at(self, time: float) -> Setpoint:
         if time >= self.duration:
-            return Setpoint(self._path.last)
+            return Setpoint(self.path.last)
         if self._halt is not None and time < self._halting:
             return self._halt.at(time)
         if self._joining is not None and time < self._joined:
             return self._joining.at(time - self._halting)
-        return self._path.at(time - self.offset)
+        return self.path.at(time - self.offset)
 
 
 def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float]) -> Reference:
