@@ -59,20 +59,16 @@ _MOST: Final = 20.0
 _OVERSHOOT: Final = 0.3
 
 
-@dataclass(frozen=True)
-class _ThereAndBack:
+class _ThereAndBack(Reference):
     """Reference to a target and from there to a second target."""
 
-    there: MinimumJerk
-    back: MinimumJerk
+    def __init__(self, there: MinimumJerk, back: MinimumJerk) -> None:
+        self.there, self.back = there, back
+        self.duration = there.duration + back.duration
 
-    @property
-    def duration(self) -> float:
-        return self.there.duration + self.back.duration
-
-    def at(self, t: float) -> Setpoint:
+    def at(self, time: float) -> Setpoint:
         first = self.there.duration
-        return self.there.at(t) if t < first else self.back.at(t - first)
+        return self.there.at(time) if time < first else self.back.at(time - first)
 
 
 @dataclass(frozen=True)

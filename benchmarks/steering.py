@@ -156,7 +156,7 @@ class MeanPlan(MultiHypothesisLaw):
     def _choose(self) -> complex:
         # The final position of an unconstrained guide is the final tip position without guide.
         (means, _, w), limit = self.reach, self._now.limit
-        shifts = self._model.guide[:, -1, self.step :]
+        shifts = self._model.responses.guide[:, -1, self.step :]
         rows = np.sqrt(w)[:, np.newaxis] * shifts
         rows = np.vstack([rows, 0.1 * np.eye(shifts.shape[1])])
         found = []
@@ -229,8 +229,8 @@ def insert(sensor: str, spread: float, seed: int) -> SteeringOutcome:
     depths, target = one.depths, one.target
     alone = one.known()
     causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
-    drift = alone.causes[0, -1, :4] @ causes
-    could = LIMITS.guide_limit * np.abs(alone.guide[0, -1]).sum()
+    drift = alone.responses.causes[0, -1, :4] @ causes
+    could = LIMITS.guide_limit * np.abs(alone.responses.guide[0, -1]).sum()
     ends: dict[str, End] = {}
     warned = held = refused = False
     look = inf
@@ -262,10 +262,10 @@ def turn(seed: int) -> SteeringOutcome:
     truth, depths = one.truth, one.depths
     alone = one.known()
     # Reachable set of the bevel with a load to one side.
-    could = float(np.hypot(*truth.bevel)) * np.abs(alone.bevel[0, -1]).sum()
+    could = float(np.hypot(*truth.bevel)) * np.abs(alone.responses.bevel[0, -1]).sum()
     one.target *= could / ASIDE
     causes = np.array([np.zeros(2), truth.frame, truth.tilt])
-    drift = alone.causes[0, -1, :3] @ causes
+    drift = alone.responses.causes[0, -1, :3] @ causes
     model = _model(medium, len(depths) - 1, sensor, spread, BEVEL)
     laws: dict[str, SteeringLaw] = {
         TURNING[2]: RollToTargetLaw(model, one.target, replace(LIMITS, turns=len(depths))),

@@ -22,7 +22,7 @@ class NominalLaw:
         roll: float,
     ) -> None:
         nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - 1.0))
-        self.responses, self.depths = model.guide[nominal], model.depths
+        self.responses, self.depths = model.responses.guide[nominal], model.depths
         self.limits = limits
         self.guide = np.zeros((len(self.depths) - 1, 2))
         self.deviation, self.step = np.zeros(2), 0

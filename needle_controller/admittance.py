@@ -37,17 +37,6 @@ class Admittance:
     depths : tuple of float
         Least and largest insertion depth to command [m].
 
-    Attributes
-    ----------
-    axis : Axis
-        As given; it may be exchanged between steps.
-    position : float or None
-        Commanded insertion depth [m]; None before the first step.
-    velocity : float
-        Velocity of the base [m/s].
-    answered : int or None
-        Stamp of the last step [ns]; None at rest.
-
     Examples
     --------
     >>> from needle_controller import Axis
@@ -71,13 +60,17 @@ class Admittance:
         lead: float,
         depths: tuple[float, float],
     ) -> None:
+        #: May be exchanged between steps.
         self.axis = axis
         self._period, self._speed, self._lead = period, speed, lead
         self._low, self._high = depths
+        #: Commanded insertion depth [m]; None before the first step.
         self.position: float | None = None
+        #: Velocity of the base [m/s].
         self.velocity = 0.0
         #: Last measured insertion depth [m].
         self._measured = 0.0
+        #: Stamp of the last step [ns]; None at rest.
         self.answered: int | None = None
 
     def step(self, force: float, measured: float, stamp: int) -> float:

@@ -115,27 +115,14 @@ class ControllerSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
-    """
-    Readings of the encoders.
+    """Readings of the encoders."""
 
-    Attributes
-    ----------
-    time : float
-        Time of the sample [s].
-    depth, velocity : float
-        Insertion depth [m] and insertion velocity [m/s], positive into the tissue.
-    angle, angular_velocity : float
-        Rotation of the base about x [rad] and its velocity [rad/s].
-    force : float
-        Axial force on the needle as reported by the robot [N]; NaN if it is not reported.
-
-    """
-
-    time: float
-    depth: float
-    velocity: float
-    angle: float = 0.0
-    angular_velocity: float = 0.0
+    time: float  #: time of the sample [s]
+    depth: float  #: insertion depth [m]
+    velocity: float  #: insertion velocity [m/s], positive into the tissue
+    angle: float = 0.0  #: rotation of the base about x [rad]
+    angular_velocity: float = 0.0  #: its velocity [rad/s]
+    #: Axial force on the needle as reported by the robot [N]; NaN if not reported.
     force: float = nan
 
     def is_finite(self) -> bool:
@@ -150,29 +137,13 @@ NO_SETPOINT: Final = Setpoint(nan)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerOutput:
-    """
-    Command of a controller in response to a measurement.
+    """Command of a controller in response to a measurement."""
 
-    Attributes
-    ----------
-    force : float
-        f_y [N], positive into the tissue.
-    torque : float
-        tau about x [N m].
-    setpoint : Setpoint
-        Reference of the insertion depth at the time of the measurement; NaN without a reference.
-    fault : str or None
-        Why no force is commanded.
-    notice : str or None
-        A message for the user.
-
-    """
-
-    force: float
-    torque: float = 0.0
-    setpoint: Setpoint = NO_SETPOINT
-    fault: str | None = None
-    notice: str | None = None
+    force: float  #: f_y [N], positive into the tissue
+    torque: float = 0.0  #: tau about x [N m]
+    setpoint: Setpoint = NO_SETPOINT  #: of the measurement; NaN without a reference
+    fault: str | None = None  #: why no force is commanded
+    notice: str | None = None  #: message for the user
 
     def is_finite(self) -> bool:
         """Return whether force and torque are finite."""
@@ -200,19 +171,6 @@ class Controller:
         Limits of the reference.
     uncertainty : Uncertainty, optional
         Uncertainty of the nominal constants; the gains must be stable within it.
-
-    Attributes
-    ----------
-    parameters, law, settings
-        As given.
-    guide : ReferenceGenerator
-        The reference generator: targets, paths, pauses.
-    limits : dict of str to Limit
-        Stability limit of each axis.
-    period : float
-        Sample period [s].
-    delay : int
-        Periods from a measurement to the effect of its command.
 
     Raises
     ------
@@ -246,11 +204,15 @@ class Controller:
     ) -> None:
         self._uncertainty = uncertainty or Uncertainty()
         self.settings = settings = settings or ControllerSettings()
+        #: Sample period [s], and periods from a measurement to the effect of its command.
         self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
+        #: Targets, paths and pauses.
         self.guide = ReferenceGenerator(
             reference, limits or ReferenceLimits(), settings.depths(parameters)
         )
         self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
+        #: Stability limit of each axis.
+        self.limits: dict[str, Limit]
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
@@ -452,8 +414,8 @@ class Controller:
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
         torque = 0.0
         if self.settings.rotation:
-            still = Setpoint(0.0)
-            torque = self._rotation.command(measured.angle, measured.angular_velocity, still)
+            angle, rest = measured.angle, Setpoint(0.0)
+            torque = self._rotation.command(angle, measured.angular_velocity, rest)
         return ControllerOutput(
             force=self._insertion.command(measured.depth, measured.velocity, ahead, load),
             torque=torque,

@@ -14,7 +14,7 @@ from needle_ros.status import ObserverStatus
 import numpy as np
 
 #: Samples between two consistency checks of the observer.
-_LOOK: Final = 25
+_CHECK_INTERVAL: Final = 25
 
 
 def build_observer(
@@ -31,28 +31,8 @@ class LoadEstimator:
     """
     Load of the bent needle: estimated by an observer, from the simulation, or zero.
 
-    Stamps are integers in ns.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle and tissue.
-    observer : Observer, optional
-        Estimates the bending from tip and wrench.
-    largest : float
-        Largest plausible load [N]; the observer is restarted above it.
-
-    Attributes
-    ----------
-    load : float
-        Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
-    warning : str or None
-        Why the observer is inconsistent.
-    model : NeedleModel
-        The needle, for the load of a true state.
-    observer : Observer or None
-        As given.
-
+    Stamps are integers in ns. The observer is restarted above ``largest``, the largest plausible
+    load [N].
     """
 
     def __init__(
@@ -67,7 +47,9 @@ class LoadEstimator:
 
     def forget(self) -> None:
         """Discard all measurements."""
+        #: Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
         self.load = 0.0
+        #: Why the observer is inconsistent.
         self.warning: str | None = None
         self._updates = 0
         #: Stamp, lateral force and moment of the last wrench that waits for the encoders.
@@ -123,7 +105,7 @@ class LoadEstimator:
         self.load = 0.0
         observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1
-        if self._updates % _LOOK == 0:
+        if self._updates % _CHECK_INTERVAL == 0:
             self._judge(observer)
         if not abs(observer.load) <= self._largest:
             load = observer.load

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import floor, inf, log10
+from math import inf
 from typing import Final
 
 from needle_controller.compiled.laws import (
@@ -49,29 +49,13 @@ _MOST_RATE: Final = 1e3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limit:
-    """
-    Stability limit of a loop: the critical axis, its poles and its limit cycle.
+    """Stability limit of a loop: the critical axis, its poles and its limit cycle."""
 
-    Attributes
-    ----------
-    radius : float
-        Spectral radius: the largest modulus of the poles.
-    bound : float
-        Largest valid radius: 1 - margin, or with the reserve just below 1.
-    unmodeled : int
-        Periods of delay that the law does not model: 0 or RESERVE.
-    plant : Axis
-        The true axis.
-    cycle : float
-        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 without a cycle.
-
-    """
-
-    radius: float
-    bound: float
-    unmodeled: int
-    plant: Axis
-    cycle: float = 0.0
+    radius: float  #: spectral radius: the largest modulus of the poles
+    bound: float  #: largest valid radius: 1 - margin, or with the reserve just below 1
+    unmodeled: int  #: periods of delay that the law does not model: 0 or RESERVE
+    plant: Axis  #: the true axis
+    cycle: float = 0.0  #: amplitude of a limit cycle of dry friction [m] or [rad]; 0 without
 
     @property
     def stable(self) -> bool:
@@ -131,7 +115,7 @@ def transition_matrix(
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None) -> float:
     """
-    Return the largest modulus of the poles; see `transition_matrix`. Below 1 is stable.
+    Return the largest modulus of the poles; below 1 is stable.
 
     Parameters
     ----------
@@ -159,16 +143,10 @@ def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iter
             key = plant.inertia, plant.viscous, unmodeled
             if key not in radii:
                 radii[key] = spectral_radius(law, delay, unmodeled, plant)
-            radius = radii[key]
-            cycle = 0.0
+            radius, cycle = radii[key], 0.0
             if radius < 1.0 and plant.coulomb in dry and plant.viscous in viscous:
                 cycle = limit_cycle(law, delay, unmodeled, plant, radius)
             yield Limit(radius=radius, bound=bound, unmodeled=unmodeled, plant=plant, cycle=cycle)
-
-
-def _checked_margin(margin: float) -> None:
-    if not 0.0 <= margin < 1.0:
-        raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
 
 
 def stability_limit(
@@ -207,7 +185,8 @@ def stability_limit(
     True
 
     """
-    _checked_margin(margin)
+    if not 0.0 <= margin < 1.0:
+        raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
     found = _limits(law, delay, margin, plants)
     return max(found, key=lambda limit: (limit.cycle, limit.radius - limit.bound))
 
@@ -296,7 +275,7 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
         if accepts(law.scaled(factor)):
             return f'all gains times {factor:g} would be stable{known}'
     for factor in _upwards(_MOST_RATE):
-        rate = _digits(factor / law.period, 3)
+        rate = float(f'{factor / law.period:.3g}')
         if accepts(replace(law, period=1.0 / rate)):
             return f'a rate of {rate:.7g} Hz would be stable{known}'
     c = law.constants
@@ -307,10 +286,6 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
     if missing:
         return f'{" and ".join(missing)} must not be zero'
     return f'no common factor on the gains and no higher rate would be stable{known}'
-
-
-def _digits(value: float, digits: int) -> float:
-    return round(value, digits - 1 - floor(log10(value)))
 
 
 def _upwards(most: float) -> Iterator[float]:
@@ -324,5 +299,5 @@ def _upwards(most: float) -> Iterator[float]:
 def _nearby() -> Iterator[float]:
     """Yield factors of two digits around one, the nearest first."""
     for factor in _upwards(_MOST_GAIN):
-        yield _digits(1.0 / factor, 2)
-        yield _digits(factor, 2)
+        yield float(f'{1.0 / factor:.2g}')
+        yield float(f'{factor:.2g}')

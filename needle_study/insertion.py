@@ -352,7 +352,7 @@ class InsertionProtocol:
         acting = np.concatenate([np.zeros(delay), commands])[:count] + noise[:, 2]
         done = int(batch.completed[0])
         course = _Course(
-            model, batch.courses[0], commands, acting, _padded(noise), batch.goal, 0.0,
+            model, batch.trajectories[0], commands, acting, _padded(noise), batch.goal, 0.0,
             float(done < count),
         )  # fmt: skip
         course = _cut(course, done)

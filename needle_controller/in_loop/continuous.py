@@ -132,33 +132,35 @@ class _Pieces:
         self.scale = np.concatenate([sizes, sizes, sizes[: law.integrals]])
         self.m = m
 
-    def _clamped(self, y: FloatArray, way: int) -> FloatArray:
+    def _clamped(self, y: FloatArray, direction: int) -> FloatArray:
         """Return the state with depth in range and velocity in the direction of sliding."""
         x = y[: 2 * self.m].copy()
         x[0] = min(max(x[0], self.low), self.high)
-        if way == 0:
+        if direction == 0:
             x[self.m] = 0.0
-        elif -way * x[self.m] <= 0.0:
-            x[self.m] = -way * _AT_REST
+        elif -direction * x[self.m] <= 0.0:
+            x[self.m] = -direction * _AT_REST
         return x
 
-    def forces(self, time: float, y: FloatArray, way: int | None = None) -> FloatArray:
-        x = y[: 2 * self.m] if way is None else self._clamped(y, way)
-        now = self.goal(time) if callable(self.goal) else self.goal
-        return self.law.forces(x, now, y[2 * self.m :], time)
+    def forces(self, time: float, y: FloatArray, direction: int | None = None) -> FloatArray:
+        x = y[: 2 * self.m] if direction is None else self._clamped(y, direction)
+        return self.law.forces(x, self._goal(time), y[2 * self.m :], time)
 
-    def rate(self, time: float, y: FloatArray, way: int) -> FloatArray:
-        m, x = self.m, self._clamped(y, way)
-        now = self.goal(time) if callable(self.goal) else self.goal
+    def _goal(self, time: float) -> ArrayLike:
+        return self.goal(time) if callable(self.goal) else self.goal
+
+    def rate(self, time: float, y: FloatArray, direction: int) -> FloatArray:
+        m, x = self.m, self._clamped(y, direction)
+        now = self._goal(time)
         forces = self.law.forces(x, now, y[2 * m :], time)
         result = acceleration(self.plant, x, forces, time)
         errors = self.law.errors(x, now)[0][: self.law.integrals]
         rates = y[m : 2 * m].copy()
-        if way == 0:
+        if direction == 0:
             rates[0] = result[0] = 0.0
         return np.concatenate([rates, result, errors])
 
-    def jacobian(self, time: float, y: FloatArray, way: int) -> FloatArray:
+    def jacobian(self, time: float, y: FloatArray, direction: int) -> FloatArray:
         """
         Return the derivative of `rate` by central differences of the size of the state.
 
@@ -174,7 +176,7 @@ class _Pieces:
             high, low = y.copy(), y.copy()
             high[i] += step
             low[i] -= step
-            change = self.rate(time, high, way) - self.rate(time, low, way)
+            change = self.rate(time, high, direction) - self.rate(time, low, direction)
             columns.append(change / (high[i] - low[i]))
         return np.array(columns).T
 
@@ -185,10 +187,12 @@ class _Pieces:
         bearable = self.plant.friction.force(0.0, side * inf)
         return float(side * (drive - bearable) - _ROUNDING * (abs(drive) + abs(bearable)))
 
-    def _way(self, time: float, y: FloatArray) -> int:
+    def _at_hub(self, y: FloatArray) -> bool:
+        return self.plant.parameters.hub_stop and bool(y[0] <= 0.0)
+
+    def _direction(self, time: float, y: FloatArray) -> int:
         """Return the direction of motion: 1 into the tissue, -1 out of it, 0 at rest."""
-        velocity = -y[self.m]
-        at_hub = self.plant.parameters.hub_stop and y[0] <= 0.0
+        velocity, at_hub = -y[self.m], self._at_hub(y)
         if velocity != 0.0 and not (at_hub and velocity > 0.0):
             return 1 if velocity > 0.0 else -1
         if self._excess(time, y, 1) > 0.0 and not at_hub:
@@ -201,8 +205,7 @@ class _Pieces:
         """Solve to the next change or the last time; return time, state, samples and change."""
         from scipy.integrate import solve_ivp
 
-        way, m = self._way(time, y), self.m
-        at_hub = self.plant.parameters.hub_stop and y[0] <= 0.0
+        direction, m = self._direction(time, y), self.m
         names: list[str] = []
         events: list[Callable[[float, FloatArray], float]] = []
 
@@ -211,18 +214,18 @@ class _Pieces:
             names.append(name)
             events.append(event)
 
-        if way == 0:
-            if not at_hub:
+        if direction == 0:
+            if not self._at_hub(y):
                 watch('breaks away inward', lambda t, z: self._excess(t, z, 1))
             watch('breaks away outward', lambda t, z: self._excess(t, z, -1))
         else:
-            watch('stops', lambda _, z: float(way * z[m]))
+            watch('stops', lambda _, z: float(direction * z[m]))
             watch('leaves its range', lambda _, z: float(z[0] - self.high))
             end_stop = 'touches the hub' if self.plant.parameters.hub_stop else 'leaves its range'
             watch(end_stop, lambda _, z: self.low - float(z[0]))
-        implicit = {'jac': lambda t, z: self.jacobian(t, z, way)}
+        implicit = {'jac': lambda t, z: self.jacobian(t, z, direction)}
         run = solve_ivp(
-            lambda t, z: self.rate(t, z, way),
+            lambda t, z: self.rate(t, z, direction),
             (time, float(wanted[-1])),
             y,
             method=self.method,
@@ -237,16 +240,13 @@ class _Pieces:
         samples = np.array(run.y).reshape(len(y), -1).T
         # Exactly at rest, and within the hub, without rounding of the solver.
         samples[:, 0] = np.maximum(samples[:, 0], self.low)
-        if way == 0:
+        if direction == 0:
             samples[:, 0], samples[:, m] = y[0], 0.0
         if run.status == 0:
             return float(wanted[-1]), samples[-1].copy(), samples, ''
         which = next(i for i, at in enumerate(run.t_events) if len(at))
-        time, end, what = (
-            float(run.t_events[which][0]),
-            run.y_events[which][0].copy(),
-            names[which],
-        )
+        time, end = float(run.t_events[which][0]), run.y_events[which][0].copy()
+        what = names[which]
         if what == 'leaves its range':
             depth = self.plant.parameters.length - end[0]
             raise InsertionDepthError(
@@ -254,7 +254,7 @@ class _Pieces:
             )
         if what == 'touches the hub':
             end[0] = 0.0
-        if way != 0:
+        if direction != 0:
             end[m] = 0.0
         else:
             end[0] = y[0]

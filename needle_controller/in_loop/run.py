@@ -10,29 +10,15 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopRun:
-    """
-    Result of a closed-loop run.
+    """Result of a closed-loop run."""
 
-    Attributes
-    ----------
-    model : NeedleModel
-        The plant.
-    time : ndarray, shape (k,)
-        Times [s].
-    states : ndarray, shape (k, 2 (2 + n))
-        States X = [d, theta, q1, ..., qn] and rates.
-    forces : ndarray, shape (k, 2 + n)
-        f_y [N], tau [N m] and generalized forces: of a continuous law at the times, of a sampled
-        law over the periods that start there.
-    events : tuple of (float, str)
-        Time [s] and kind of each stop, break-away and hub contact; continuous laws only.
-
-    """
-
-    model: NeedleModel
-    time: FloatArray
-    states: FloatArray
+    model: NeedleModel  #: the plant
+    time: FloatArray  #: times [s], shape (k,)
+    states: FloatArray  #: states X = [d, theta, q1, ..., qn] and rates, shape (k, 2 (2 + n))
+    #: f_y [N], tau [N m] and generalized forces, shape (k, 2 + n): of a continuous law at the
+    #: times, of a sampled law over the periods that start there.
     forces: FloatArray
+    #: Time [s] and kind of each stop, break-away and hub contact; continuous laws only.
     events: tuple[tuple[float, str], ...] = ()
 
     @property

@@ -147,36 +147,21 @@ def run_controller(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopBatch:
-    """
-    Results of many runs of sampled laws.
+    """Results of many runs of sampled laws."""
 
-    Attributes
-    ----------
-    final, largest, rms : ndarray, shape (runs,)
-        Goal minus insertion depth [m]: at the end, largest in modulus, and root mean square.
-    states : ndarray, shape (runs, 2 (2 + n))
-        States at the end.
-    completed : ndarray, shape (runs,)
-        Periods completed before the needle left its range.
-    goal : ndarray, shape (k + 1,)
-        Positions of the reference at the times of the measurements [m].
-    depths : ndarray, shape (runs, k + 1) or (runs, 0)
-        Insertion depths at these times [m], with ``keep``.
-    courses : ndarray, shape (runs, k + 1, 2 (2 + n)) or (runs, 0, 2 (2 + n))
-        States at these times, with ``record``; NaN after a needle has left its range.
-    commands : ndarray, shape (runs, k) or (runs, 0)
-        Command for each measurement [N], with ``record``.
-
-    """
-
-    final: FloatArray
-    largest: FloatArray
-    rms: FloatArray
-    states: FloatArray
-    completed: FloatArray
+    final: FloatArray  #: goal minus insertion depth at the end [m], shape (runs,)
+    largest: FloatArray  #: the largest in modulus [m]
+    rms: FloatArray  #: its root mean square [m]
+    states: FloatArray  #: states at the end, shape (runs, 2 (2 + n))
+    completed: FloatArray  #: periods completed before the needle left its range
+    #: Positions of the reference at the times of the measurements [m], shape (k + 1,).
     goal: FloatArray
+    #: Insertion depths at these times [m], shape (runs, k + 1) or (runs, 0), with ``keep``.
     depths: FloatArray
-    courses: FloatArray
+    #: States at these times, shape (runs, k + 1, 2 (2 + n)) or (runs, 0, 2 (2 + n)), with
+    #: ``record``; NaN after a needle has left its range.
+    trajectories: FloatArray
+    #: Command for each measurement [N], shape (runs, k) or (runs, 0), with ``record``.
     commands: FloatArray
 
 
@@ -287,7 +272,7 @@ def run_batch(
     )
     errors, completed = np.empty((runs, 3)), np.empty(runs)
     depths = np.full((runs, count + 1 if keep else 0), np.nan)
-    courses = np.full((runs, count + 1 if record else 0, ends.shape[1]), np.nan)
+    trajectories = np.full((runs, count + 1 if record else 0, ends.shape[1]), np.nan)
     commands = np.full((runs, count if record else 0), np.nan)
 
     def run(share: range) -> None:
@@ -296,7 +281,7 @@ def run_batch(
             completed[i] = run_loop(
                 needles[i % len(needles)], ends[i], law.packed, float(limit), setpoints,
                 goal, np.zeros(delay + late), delay, blurred, along, float(step), depths[i],
-                courses[i], commands[i], errors[i],
+                trajectories[i], commands[i], errors[i],
             )  # fmt: skip
             if progress is not None:
                 progress()
@@ -314,7 +299,7 @@ def run_batch(
         completed=completed,
         goal=goal,
         depths=depths,
-        courses=courses,
+        trajectories=trajectories,
         commands=commands,
     )
 

@@ -35,12 +35,6 @@ class Adaptive(InverseDynamics):
     In each direction it estimates corrections of dry friction, viscous friction and dry friction
     per insertion depth. They enter the feed-forward of the modeled motion only and are bounded for
     every measurement: a bounded external force on the loop of inverse dynamics.
-
-    Attributes
-    ----------
-    gains : AdaptiveGains
-        Gains.
-
     """
 
     gains: AdaptiveGains

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from math import inf
 from typing import NamedTuple
 
@@ -25,34 +25,20 @@ class Response(NamedTuple):
     """
     Linear response of an axis over a time, under a constant force.
 
-    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force.
-
-    Attributes
-    ----------
-    pv, vv : float
-        Response to the velocity [s], [1].
-    pf, vf : float
-        Response to the force [m/N], [m/(N s)]; for rotation, angles and torques.
-
+    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force;
+    for rotation these are angles and torques.
     """
 
-    pv: float
-    vv: float
-    pf: float
-    vf: float
+    pv: float  #: [s]
+    vv: float  #: [1]
+    pf: float  #: [m/N]
+    vf: float  #: [m/(N s)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis(Friction):
     """
     Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction.
-
-    Attributes
-    ----------
-    inertia : float
-        Inertia.
-    law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed
-        As for `Friction`; without friction by default.
 
     Raises
     ------
@@ -61,7 +47,7 @@ class Axis(Friction):
 
     """
 
-    inertia: float
+    inertia: float  #: [kg] or [kg m^2]
     coulomb: float = 0.0
     viscous: float = 0.0
 
@@ -87,9 +73,7 @@ class Axis(Friction):
             Moving mass [kg] and friction.
 
         """
-        friction = parameters.friction
-        constants = {item.name: getattr(friction, item.name) for item in fields(friction)}
-        return cls(inertia=parameters.moving_mass, **constants)
+        return cls(inertia=parameters.moving_mass, **asdict(parameters.friction))
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:

@@ -49,20 +49,11 @@ def _gain_matrix(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousLaw(ABC):
-    """
-    Control law in continuous time: a function of state, goal and integral of the error.
+    """Control law in continuous time: a function of state, goal and integral of the error."""
 
-    Attributes
-    ----------
-    model : NeedleModel
-        Nominal model of needle and tissue; the plant may differ.
-    actuation : str
-        ``physical``: f_y and tau only. ``modal``: a generalized force on every coordinate, as
-        in the gain matrices of the paper.
-
-    """
-
-    model: NeedleModel
+    model: NeedleModel  #: nominal model of needle and tissue; the plant may differ
+    #: ``physical``: f_y and tau only. ``modal``: a generalized force on every coordinate, as in
+    #: the gain matrices of the paper.
     actuation: str = 'physical'
 
     @property
@@ -150,20 +141,14 @@ class ContinuousInverseDynamics(ContinuousLaw):
 
     N' are the bias forces with friction. At rest, friction is compensated in the direction of the
     desired acceleration, so that the law breaks away.
-
-    Attributes
-    ----------
-    kp, kv : array_like, shape (driven,) or (driven, driven)
-        Gains [1/s^2] and [1/s], positive definite.
-    breakaway_speed : float
-        If positive, dry friction is compensated in proportion to the desired velocity
-        BREAKAWAY_TIME later, up to this speed [m/s]: the limit of the sampled law for short
-        periods. 0 is the law of the paper.
-
     """
 
+    #: Gains [1/s^2] and [1/s], positive definite, shape (driven,) or (driven, driven).
     kp: ArrayLike
     kv: ArrayLike
+    #: If positive, dry friction is compensated in proportion to the desired velocity
+    #: BREAKAWAY_TIME later, up to this speed [m/s]: the limit of the sampled law for short
+    #: periods. 0 is the law of the paper.
     breakaway_speed: float = 0.0
     _gains: tuple[FloatArray, FloatArray] = field(init=False, repr=False)
 
@@ -179,20 +164,6 @@ class ContinuousInverseDynamics(ContinuousLaw):
     def forces(
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
-        """
-        Return the forces; see `ContinuousLaw.forces`. There is no integral.
-
-        Parameters
-        ----------
-        state, goal, integral, time
-            As for `ContinuousLaw.forces`.
-
-        Returns
-        -------
-        ndarray
-            As from `ContinuousLaw.forces`.
-
-        """
         del integral
         model, k, m = self.model, self.driven, self.model.coordinates
         x = model.checked_state(state)
@@ -257,20 +228,6 @@ class ContinuousPid(ContinuousLaw):
     def forces(
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
-        """
-        Return the forces; see `ContinuousLaw.forces`. They do not depend on time.
-
-        Parameters
-        ----------
-        state, goal, integral, time
-            As for `ContinuousLaw.forces`.
-
-        Returns
-        -------
-        ndarray
-            As from `ContinuousLaw.forces`.
-
-        """
         del time
         x, k = self.model.checked_state(state), self.driven
         error, rate, _ = self.errors(x, goal)

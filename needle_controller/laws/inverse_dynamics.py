@@ -69,11 +69,6 @@ class InverseDynamics(Law):
     ``bandwidth=0`` the law equals the law of the paper: the modeled motion restarts in each
     period.
 
-    Attributes
-    ----------
-    gains : InverseDynamicsGains
-        Gains.
-
     Examples
     --------
     The force that starts a needle of 0.2 kg at rest towards a target 1 mm away:

@@ -60,27 +60,13 @@ class LawGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Law:
-    """
-    Sampled control law on one axis; its memory is stored by its loop.
+    """Sampled control law on one axis; its memory is stored by its loop."""
 
-    Attributes
-    ----------
-    axis : Axis
-        Nominal model of the axis.
-    gains : LawGains
-        Gains.
-    period : float
-        Sample period h [s].
-    constants : LawConstants
-        Constants of the law for compiled functions.
-
-    """
-
-    axis: Axis
+    axis: Axis  #: nominal model of the axis
     gains: LawGains
-    period: float
+    period: float  #: sample period h [s]
+    #: Constants for compiled functions, and the same as a plain tuple.
     constants: LawConstants = field(init=False, repr=False, compare=False)
-    #: ``constants`` as a plain tuple.
     packed: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
@@ -179,25 +165,15 @@ class SampledLoop:
         Periods from measurement to effect.
     limit : float
         Largest force [N].
-
-    Attributes
-    ----------
-    law, limit
-        As given.
-    pending : deque of float
-        Commands without effect so far [N].
-    memory : ndarray, shape (MEMORY,)
-        Memory of the law.
-    last : float
-        Last command [N].
-
     """
 
     def __init__(self, law: Law, delay: int, limit: float) -> None:
         self.law = law
         self.limit = float(limit)
+        #: Commands without effect so far [N].
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
+        #: Last command [N].
         self.last = 0.0
         #: Force of the period that starts now [N].
         self._acts = 0.0
@@ -248,8 +224,8 @@ class SampledLoop:
             return {}
         blocks = self.memory[LEARNED:].reshape(2, BLOCK)
         return {
-            f'{term}, {way} [{unit}]': (float(block[i]), sqrt(float(variance)))
-            for way, block in zip(('insertion', 'withdrawal'), blocks, strict=True)
+            f'{term}, {direction} [{unit}]': (float(block[i]), sqrt(float(variance)))
+            for direction, block in zip(('insertion', 'withdrawal'), blocks, strict=True)
             for i, (term, unit) in enumerate(_TERMS.items())
             if (variance := block[TERMS + i * (TERMS + 1)]) > 0.0
         }

@@ -54,11 +54,6 @@ class Pid(Law):
     increase the excess. Coulomb friction is compensated by the integral, or by the feed-forward:
     the force that moves the modeled axis exactly along the reference.
 
-    Attributes
-    ----------
-    gains : PidGains
-        Gains.
-
     Examples
     --------
     The force on a needle of 0.2 kg at rest, 1 mm from its target:

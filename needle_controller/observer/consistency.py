@@ -17,24 +17,12 @@ def _far(degrees: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
-    """
-    Consistency of errors with their variances: mean normalized squared error.
+    """Consistency of errors with their variances: mean normalized squared error."""
 
-    Attributes
-    ----------
-    ratio : float
-        Mean squared error over variance per degree of freedom; 1 for a consistent filter.
-    low, high : float
-        95 % band of chi^2 for the ratio.
-    degrees : int
-        Degrees of freedom; with 0 the ratio is nan.
-
-    """
-
-    ratio: float
-    low: float
-    high: float
-    degrees: int
+    ratio: float  #: mean squared error over variance per degree of freedom; 1 if consistent
+    low: float  #: lower end of the 95 % band of chi^2 for the ratio
+    high: float  #: upper end
+    degrees: int  #: degrees of freedom; with 0 the ratio is nan
 
     @classmethod
     def of(cls, total: float, degrees: int) -> Consistency:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import ceil, inf, isfinite, nan
 from operator import index
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_controller.compiled.filter import (
     begin,
@@ -56,6 +56,24 @@ _WAITING: Final = 16
 _OVERLAP: Final = 0.1
 
 
+class _Encoders(NamedTuple):
+    """Sample of the encoders: time since the first sample [s], insertion depth, velocity."""
+
+    time: float
+    depth: float
+    velocity: float
+
+
+class _Estimate(NamedTuple):
+    """Estimate at the present depth."""
+
+    modal: FloatArray  #: q [m^3/2] and q_dot [m^3/2 / s], shape (2 n,)
+    jacobian: FloatArray  #: derivative by the normal coordinates of the filter, shape (2 n, 2 n)
+    deflection: float  #: tip deflection [m]
+    deviation: float  #: its standard deviation [m]
+    load: float  #: force against insertion [N]
+
+
 class Observer:
     """
     Estimator of q1 to qn and their rates during the motion.
@@ -68,17 +86,6 @@ class Observer:
         Noise and sensors.
     period : float
         Sample period of encoders and wrench [s].
-
-    Attributes
-    ----------
-    refused : int
-        Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
-        that are not finite, repeated, older than the history, far ahead of the encoders, or
-        (a wrench) between encoder samples.
-    restarts : int
-        Number of automatic restarts.
-    warning : str or None
-        Reason of the last restart; None without a restart since construction or `reset`.
 
     Raises
     ------
@@ -103,15 +110,13 @@ class Observer:
                 f'to {100.0 * _NEAR:g} %, got {settings.filter_rate:g} Hz'
             )
         settings = replace(settings, filter_rate=ticks / period)
-        self.period = float(period)
-        self.settings = settings
-        self.model = NeedleModel(parameters)
-        needle, n = self.model.compiled, parameters.modes
+        self.period, self.settings = float(period), settings
+        self.model, n = NeedleModel(parameters), parameters.modes
         low_pass = settings.low_pass(ticks)
         size = 2 * n + LOADS + 2 * len(low_pass.steady) + 1
         slots = ceil(settings.history / period) + 2
         self._filter = Filter(
-            needle=needle,
+            needle=self.model.compiled,
             noise=settings.noise(),
             low_pass=low_pass,
             samples=np.zeros(slots, SAMPLE),
@@ -127,35 +132,34 @@ class Observer:
         )
         from needle_dynamics.compiled.boxed import Boxed
 
-        self._held = Boxed(self._filter)
-        self._slots = slots
-        self._modal, self._jacobian = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
-        #: Tip deflection, its standard deviation, and load at the present depth, once computed.
-        self._estimate: tuple[float, float, float] | None = None
+        self._boxed = Boxed(self._filter)
+        #: Computed when it is needed.
+        self._estimate: _Estimate | None = None
         #: Stamp of the first sample [ns]: times of the filter are relative to it.
         self._origin: int | None = None
-        self._time = self._depth = self._velocity = 0.0
+        #: Newest and oldest slot of the filter, and number of exposures of the tip.
         self._slot = self._oldest = self._count = 0
         self.reset()
-        self._warm_up()
+        # Compile or load the kernels before time is critical.
+        first = round(self.period * NANOSECONDS)
+        self.update(0, parameters.length, 0.0)
+        self.update(first, parameters.length, 0.0)
+        self.add_tip(first, 0.0)
+        self._estimated()
+        self._origin = None
+        self.reset()
 
     def reset(self) -> None:
         """Discard all measurements; the next encoder sample restarts the observer."""
-        self.refused = self.restarts = 0
+        #: Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
+        #: that are not finite, repeated, older than the history, far ahead of the encoders, or (a
+        #: wrench) between encoder samples.
+        self.refused = 0
+        #: Number of automatic restarts, and reason of the last one.
+        self.restarts = 0
         self.warning: str | None = None
-        self._begun = False
+        self._last: _Encoders | None = None
         self._waiting: list[tuple[int, float, float]] = []
-
-    def _warm_up(self) -> None:
-        """Compile or load the kernels before time is critical."""
-        depth = self.model.parameters.length
-        period = round(self.period * NANOSECONDS)
-        self.update(0, depth, 0.0)
-        self.update(period, depth, 0.0)
-        self.add_tip(period, 0.0)
-        self._look()
-        self._origin = None
-        self.reset()
 
     # Measurements.
 
@@ -210,29 +214,26 @@ class Observer:
             self._origin = _checked(stamp)
         time = self._seconds(stamp)
         # An integer would trigger a compilation for its type.
-        depth, velocity = min(float(depth), needle.maximum_depth), float(velocity)
-        elapsed, history = time - self._time, self.settings.history
-        if self._begun:
-            if -history <= elapsed <= 0.0:
+        sample = _Encoders(time, min(float(depth), needle.maximum_depth), float(velocity))
+        history, last = self.settings.history, self._last
+        if last is not None:
+            if -history <= time - last.time <= 0.0:
                 self.refused += 1
                 return
-            if not 0.0 < elapsed <= history:
-                self._restart(f'encoders went from {self._time:g} to {time:g} s')
-            elif abs(depth - self._depth) > self.settings.jump:
-                self._restart(f'depth jumped from {self._depth:g} to {depth:g} m')
-        if self._begun:
-            lateral = moment = nan
-            if wrench is not None:
-                lateral = float(wrench[0]) if isfinite(wrench[0]) else nan
-                moment = float(wrench[1]) if isfinite(wrench[1]) else nan
-            self._go_on(time, depth, velocity, lateral, moment)
+            if not 0.0 < time - last.time <= history:
+                self._restart(f'encoders went from {last.time:g} to {time:g} s')
+            elif abs(sample.depth - last.depth) > self.settings.jump:
+                self._restart(f'depth jumped from {last.depth:g} to {sample.depth:g} m')
+        if self._last is None:
+            self._slot = self._oldest = self._count = 0
+            begin(self._boxed, time, self.period, sample.depth)
         else:
-            self._begin(time, depth)
-        self._time, self._depth, self._velocity = time, depth, velocity
-        if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            for earlier, lateral, moment in waiting:
-                self.add_wrench(earlier, lateral, moment)
+            lateral, moment = wrench or (nan, nan)
+            self._advance(self._last, sample, _finite(lateral), _finite(moment))
+        self._last, self._estimate = sample, None
+        waiting, self._waiting = self._waiting, []
+        for earlier, lateral, moment in waiting:
+            self.add_wrench(earlier, lateral, moment)
 
     def _seconds(self, stamp: int) -> float:
         """Return a time relative to the first sample [s]; exact for any epoch of the clock."""
@@ -252,24 +253,23 @@ class Observer:
 
         """
         time = self._seconds(stamp)
-        if not (self._begun and (isfinite(lateral) or isfinite(moment))):
+        if self._last is None or not (isfinite(lateral) or isfinite(moment)):
             self.refused += 1
             return
         slack = _SAME * self.period
-        if time > self._time + slack and len(self._waiting) < _WAITING:
+        if time > self._last.time + slack and len(self._waiting) < _WAITING:
             self._waiting.append((stamp, lateral, moment))
             return
         samples, slot = self._filter.samples, self._slot
         while slot != self._oldest and samples[slot]['time'] > time + slack:
-            slot = (slot or self._slots) - 1
+            slot = (slot or len(samples)) - 1
         sample = samples[slot]
         taken = isfinite(sample['lateral']) or isfinite(sample['moment'])
         if slot == self._oldest or abs(sample['time'] - time) > slack or taken:
             self.refused += 1
             return
-        sample['lateral'] = lateral if isfinite(lateral) else nan
-        sample['moment'] = moment if isfinite(moment) else nan
-        self._replay(float(samples[(slot or self._slots) - 1]['time']))
+        sample['lateral'], sample['moment'] = _finite(lateral), _finite(moment)
+        self._replay(float(samples[(slot or len(samples)) - 1]['time']))
 
     def add_tip(self, stamp: int, deflection: float) -> None:
         """
@@ -285,12 +285,11 @@ class Observer:
 
         """
         end = self._seconds(stamp) - self.settings.tip_latency
-        if not (self._begun and isfinite(deflection)):
+        if self._last is None or not isfinite(deflection):
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
-        start = end - exposure
-        slack = _OVERLAP * exposure
+        start, slack = end - exposure, _OVERLAP * exposure
         oldest = float(self._filter.samples[self._oldest]['time'])
         tips, count = self._filter.exposures, self._count
         place = count
@@ -298,7 +297,7 @@ class Observer:
             place -= 1
         floor = max(oldest, float(tips[place - 1, 1])) if place > 0 else oldest
         ceiling = float(tips[place, 0]) if place < count else inf
-        late, ahead = start < floor - slack, end > self._time + self.settings.history
+        late, ahead = start < floor - slack, end > self._last.time + self.settings.history
         if late or ahead or end > ceiling + slack:
             self.refused += 1
             return
@@ -313,30 +312,23 @@ class Observer:
         tips[place + 1 : count + 1] = tips[place:count].copy()
         tips[place] = start, end, deflection
         self._count = count + 1
-        if start < self._time:
+        if start < self._last.time:
             self._replay(start)
 
     def _replay(self, since: float) -> None:
-        replay(self._held, self._count, self._oldest, self._slot, since)
+        replay(self._boxed, self._count, self._oldest, self._slot, since)
         self._estimate = None
 
     def _restart(self, reason: str) -> None:
         self.warning = f'{reason}; the observer restarted'
         self._waiting.clear()
         self.restarts += 1
-        self._begun = False
+        self._last = None
 
-    def _begin(self, time: float, depth: float) -> None:
-        self._begun, self._estimate = True, None
-        self._slot = self._oldest = self._count = 0
-        begin(self._held, time, self.period, depth)
-
-    def _go_on(
-        self, time: float, depth: float, velocity: float, lateral: float, moment: float
-    ) -> None:
+    def _advance(self, last: _Encoders, sample: _Encoders, lateral: float, moment: float) -> None:
         """Step to the next sample, or over a gap in steps without measurements but the last."""
-        start, elapsed, period = self._time, time - self._time, self.period
-        before, advance = self._depth, depth - self._depth
+        (start, before, _), (time, depth, velocity) = last, sample
+        elapsed, advance, period = time - start, depth - before, self.period
         count = max(1, round(elapsed / period))
         span = elapsed / count
         if abs(span - period) < _EVEN * period:
@@ -346,65 +338,58 @@ class Observer:
             self._step(start + elapsed * k / count, span, middle, advance / elapsed, nan, nan)
         if count == 1:
             # Mean of the cubic through both ends, limited to their range.
-            mean = before + 0.5 * advance + span * (self._velocity - velocity) / 12.0
+            mean = before + 0.5 * advance + span * (last.velocity - velocity) / 12.0
             mean = min(max(mean, min(before, depth)), max(before, depth))
-            pace = 0.5 * (self._velocity + velocity)
+            velocity = 0.5 * (last.velocity + velocity)
         else:
-            mean, pace = depth - 0.5 * advance / count, advance / elapsed
-        self._step(time, span, mean, pace, lateral, moment)
+            mean, velocity = depth - 0.5 * advance / count, advance / elapsed
+        self._step(time, span, mean, velocity, lateral, moment)
 
-    def _step(
-        self,
-        time: float,
-        span: float,
-        depth: float,
-        velocity: float,
-        lateral: float,
-        moment: float,
-    ) -> None:
-        old, slots = self._slot, self._slots
-        new = old + 1 if old + 1 < slots else 0
-        if new == self._oldest:
-            self._oldest = new + 1 if new + 1 < slots else 0
-        observe(self._held, self._count, old, new, time, span, depth, velocity, lateral, moment)
-        self._slot, self._estimate = new, None
+    def _step(self, *sample: float) -> None:
+        """Process time, span, mean depth, mean velocity, and the wrench, in a new slot."""
+        old, slots = self._slot, len(self._filter.samples)
+        self._slot = (old + 1) % slots
+        if self._slot == self._oldest:
+            self._oldest = (self._oldest + 1) % slots
+        observe(self._boxed, self._count, old, self._slot, *sample)
 
     # Estimates.
 
-    def _look(self) -> tuple[float, float, float]:
-        """Return present tip deflection, its standard deviation and load, cached per sample."""
-        if not self._begun:
+    def _estimated(self) -> _Estimate:
+        """Return the present estimate, computed once for each sample."""
+        if self._last is None:
             raise NeedleError('the observer has no estimate before the first encoder sample')
         if self._estimate is None:
-            self._estimate = estimate(
-                self._held, self._slot, self._depth, self.period, self._modal, self._jacobian
-            )
+            size = 2 * self.model.modes.count
+            modal, jacobian = np.zeros(size), np.zeros((size, size))
+            depth = self._last.depth
+            found = estimate(self._boxed, self._slot, depth, self.period, modal, jacobian)
+            self._estimate = _Estimate(modal, jacobian, *found)
         return self._estimate
 
     @property
     def ready(self) -> bool:
         """Whether there is an estimate; without it the properties below raise `NeedleError`."""
-        return self._begun
+        return self._last is not None
 
     @property
     def modal(self) -> tuple[FloatArray, FloatArray]:
         """Estimate of q1 to qn [m^3/2] and of their rates [m^3/2 / s], shape (n,) each."""
-        n = self.model.modes.count
-        self._look()
-        return self._modal[:n].copy(), self._modal[n:].copy()
+        q, rates = self._estimated().modal.reshape(2, -1).copy()
+        return q, rates
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance of the modal coordinates and their rates, SI units; shape (2 n, 2 n)."""
-        self._look()
-        matrix = self._jacobian @ self._normal_covariance() @ self._jacobian.T
+        jacobian = self._estimated().jacobian
+        matrix = jacobian @ self._normal_covariance() @ jacobian.T
         return np.asarray(0.5 * (matrix + matrix.T))
 
     @property
     def tip_deflection(self) -> tuple[float, float]:
         """Estimate of the present tip deflection, and its standard deviation [m]."""
-        deflection, spread, _ = self._look()
-        return deflection, spread
+        now = self._estimated()
+        return now.deflection, now.deviation
 
     @property
     def load(self) -> float:
@@ -415,14 +400,12 @@ class Observer:
         are left out: the estimates of their rates are noise, and the load depends on the square of
         the rates.
         """
-        return self._look()[2]
+        return self._estimated().load
 
     @property
     def tip_force(self) -> tuple[float, float]:
         """Estimate of the lateral force at the tip, and its standard deviation [N]."""
-        if not self._begun:
-            raise NeedleError('the observer has no estimate before the first encoder sample')
-        entry = len(self._jacobian)
+        entry = len(self._estimated().modal)
         variance = self._filter.covariances[self._slot, entry, entry]
         return float(self._filter.states[self._slot, entry]), float(np.sqrt(variance))
 
@@ -433,11 +416,11 @@ class Observer:
 
         Each innovation is relative to all measurements of earlier times, including late arrivals.
         """
-        if not self._begun:
+        if self._last is None:
             return Consistency.of(0.0, 0)
-        first, last = self._oldest, self._slot
-        kept = np.arange(first, last + 1 if last >= first else last + 1 + self._slots)
-        samples = self._filter.samples[kept % self._slots]
+        slots, first = len(self._filter.samples), self._oldest
+        count = (self._slot - first) % slots + 1
+        samples = self._filter.samples[np.arange(first, first + count) % slots]
         return Consistency.of(float(samples['nis'].sum()), round(samples['degrees'].sum()))
 
     def nees(self, modal: ArrayLike, rates: ArrayLike) -> float:
@@ -461,20 +444,23 @@ class Observer:
 
         """
         truth = np.concatenate([np.asarray(modal, dtype=float), np.asarray(rates, dtype=float)])
-        if truth.shape != (len(self._jacobian),):
+        estimated = self._estimated()
+        if truth.shape != estimated.modal.shape:
             raise ShapeError(
                 f'modal and rates must have shape ({self.model.modes.count},) each, got '
                 f'{np.shape(modal)} and {np.shape(rates)}'
             )
-        self._look()
-        error = truth - self._modal
         # In normal coordinates, where the covariance is well conditioned.
-        normal = np.linalg.solve(self._jacobian, error)
+        normal = np.linalg.solve(estimated.jacobian, truth - estimated.modal)
         return float(normal @ np.linalg.solve(self._normal_covariance(), normal))
 
     def _normal_covariance(self) -> FloatArray:
-        modal = len(self._jacobian)
+        modal = 2 * self.model.modes.count
         return self._filter.covariances[self._slot, :modal, :modal]
+
+
+def _finite(value: float) -> float:
+    return float(value) if isfinite(value) else nan
 
 
 def _checked(stamp: int) -> int:

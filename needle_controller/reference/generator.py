@@ -23,26 +23,8 @@ class ReferenceGenerator:
     Reference generator: moves to a target or along a path, and can be paused.
 
     Every change starts at the present setpoint, with the next call of `at`: the reference is
-    continuous.
-
-    Parameters
-    ----------
-    kind : str
-        Motion to a target, a key of `REFERENCES`.
-    limits : ReferenceLimits
-        Limits.
-    depths : tuple of float
-        Least and largest insertion depth [m].
-
-    Attributes
-    ----------
-    paused : bool
-        Whether the reference is paused.
-    waits : bool
-        Whether the reference waits for a plant that does not follow.
-    target : float or None
-        Insertion depth at the end of the motion [m]; None without a target or path.
-
+    continuous. ``kind`` is a key of `REFERENCES`, and ``depths`` are the least and largest
+    insertion depth [m].
     """
 
     def __init__(self, kind: str, limits: ReferenceLimits, depths: tuple[float, float]) -> None:
@@ -51,7 +33,6 @@ class ReferenceGenerator:
         self._kind = REFERENCES[kind]
         self._limits, self._depths = limits, depths
         self._motion: Reference | None = None
-        self._motion_path: Path | None = None
         self._start = self._now = 0.0
         #: Elapsed time of the path at the last change [s].
         self._passed = 0.0
@@ -59,20 +40,22 @@ class ReferenceGenerator:
 
     def forget(self) -> None:
         """Discard target, path and pause."""
+        #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
         self._path: Path | None = None
+        #: Whether it is paused, and whether it waits for a plant that does not follow.
         self.paused = self.waits = False
         self.release()
 
     def release(self) -> None:
         """Discard the motion: the next motion starts at the needle, to the same target."""
         self._mark()
-        self._motion = self._motion_path = None
+        self._motion = None
         self._change: Callable[[Setpoint], Reference] | None = self._plan
 
     def _mark(self) -> None:
         """Store the elapsed time of the path."""
-        if isinstance(self._motion, Joined) and self._motion_path is self._path:
+        if isinstance(self._motion, Joined) and self._motion.path is self._path:
             self._passed = max(self._now - self._start - self._motion.offset, self._passed)
 
     @property
@@ -100,17 +83,17 @@ class ReferenceGenerator:
 
     def pause(self) -> None:
         """Brake to rest within the limits and hold the position."""
-        self._still(True, self.waits)
+        self._set_pause(True, self.waits)
 
     def resume(self) -> None:
         """Continue to the target, or along the path from the position of the pause."""
-        self._still(False, self.waits)
+        self._set_pause(False, self.waits)
 
     def wait(self, waits: bool) -> None:
         """Brake and hold while the plant does not follow (``waits``), or continue."""
-        self._still(self.paused, waits)
+        self._set_pause(self.paused, waits)
 
-    def _still(self, paused: bool, waits: bool) -> None:
+    def _set_pause(self, paused: bool, waits: bool) -> None:
         before = self.paused or self.waits
         self.paused, self.waits = paused, waits
         if before != (paused or waits):
@@ -130,7 +113,7 @@ class ReferenceGenerator:
             now = Setpoint(depth) if anew else self.ahead(time)
             self._mark()
             change, self._change = self._change, None
-            self._motion, self._motion_path, self._start = change(now), self._path, time
+            self._motion, self._start = change(now), time
         return self.ahead(time)
 
     def ahead(self, time: float) -> Setpoint:

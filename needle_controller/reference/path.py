@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from math import copysign, isfinite, sqrt
 
 from needle_controller.reference.quintic import halt, MinimumJerk, Quintic
@@ -27,35 +26,8 @@ class Path:
     Path through given points: straight lines between positions, or cubics if velocities are given.
 
     Corners between lines are rounded by parabolas at the acceleration limit. The points define the
-    duration of the path. It ends at rest.
-
-    Parameters
-    ----------
-    times : sequence of float
-        Times of the points [s], not negative, increasing.
-    positions : sequence of float
-        Insertion depths [m].
-    velocities : sequence of float, optional
-        Insertion velocities [m/s], zero at the end.
-    limits : ReferenceLimits
-        Limits.
-    depths : tuple of float
-        Least and largest insertion depth [m].
-
-    Attributes
-    ----------
-    begin, end : float
-        Times of the first point and of the end [s].
-    last : float
-        Insertion depth at the end [m].
-    depths : tuple of float
-        As given [m].
-
-    Raises
-    ------
-    ParameterError
-        If numbers are missing, not finite or beyond a limit, or times do not increase.
-
+    duration of the path: times [s] increase from 0 or later, with an insertion depth [m] each, and
+    the last velocity [m/s] is zero.
     """
 
     def __init__(
@@ -66,53 +38,72 @@ class Path:
         limits: ReferenceLimits,
         depths: tuple[float, float],
     ) -> None:
-        _check(times, positions, velocities, depths)
+        self._check(times, positions, velocities, depths)
         #: Start time, position, velocity, acceleration and jerk of each piece.
         self._pieces: list[tuple[float, float, float, float, float]] = []
+        #: Times of the first point and of the end [s], and insertion depth at the end [m].
+        self.begin, self.end, self.last = float(times[0]), float(times[-1]), float(positions[-1])
+        self.depths = depths
         if velocities is None:
             self._join_lines(times, positions, limits)
         else:
             self._join_cubics(times, positions, velocities, limits)
-            self._check_depths(*depths)
-        self._starts, self.depths = np.array([piece[0] for piece in self._pieces]), depths
-        self.begin, self.last = float(times[0]), float(positions[-1])
+        self._starts = np.array([piece[0] for piece in self._pieces])
+
+    @staticmethod
+    def _check(
+        times: Sequence[float],
+        positions: Sequence[float],
+        velocities: Sequence[float] | None,
+        depths: tuple[float, float],
+    ) -> None:
+        """Reject points that are missing, not finite, out of order or out of range."""
+        if not times or len(times) != len(positions):
+            raise ParameterError(
+                f'path needs one position for each of at least one time, got {len(positions)} '
+                f'positions and {len(times)} times'
+            )
+        if velocities is not None and len(velocities) != len(times):
+            raise ParameterError(
+                f'path needs a velocity for each of its {len(times)} points or none, '
+                f'got {len(velocities)}'
+            )
+        if not all(map(isfinite, (*times, *positions, *(velocities or ())))):
+            raise ParameterError('times, positions and velocities must be finite')
+        check_times(times)
+        low, high = depths
+        if not all(low <= at <= high for at in positions):
+            raise ParameterError(
+                f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
+            )
 
     def _join_lines(
         self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
     ) -> None:
         """Build the pieces from lines joined by parabolas."""
-        ramp = limits.acceleration
-        velocity, free = 0.0, times[0]
+        slopes = [*(np.diff(positions) / np.diff(times)).tolist(), 0.0]
         # At the first point the velocity equals the slope of the first line.
-        if len(times) > 1:
-            velocity = (positions[1] - positions[0]) / (times[1] - times[0])
-            self._pieces.append((times[0], positions[0], velocity, 0.0, 0.0))
-        for k in range(len(times)):
-            following = 0.0
-            if k + 1 < len(times):
-                following = (positions[k + 1] - positions[k]) / (times[k + 1] - times[k])
+        velocity, free = slopes[0], times[0]
+        for time, position, following in zip(times, positions, slopes, strict=True):
             if abs(following) > limits.speed * (1.0 + ROUNDING):
                 raise ParameterError(
-                    f'velocity after {times[k]:g} s must be within {limits.speed:g} m/s, got '
+                    f'velocity after {time:g} s must be within {limits.speed:g} m/s, got '
                     f'{following:g} m/s'
                 )
-            if k > 0:
-                half = 0.5 * abs(following - velocity) / ramp
-                start = times[k] - half
-                if start < free - ROUNDING:
-                    raise ParameterError(
-                        f'velocity changes from {velocity:g} to {following:g} m/s at {times[k]:g} '
-                        f's faster than the acceleration limit {ramp:g} m/s^2 allows'
-                    )
-                turn = copysign(ramp, following - velocity)
-                self._pieces.append((start, positions[k] - half * velocity, velocity, turn, 0.0))
-                free = times[k] + half
-                at = positions[k] + half * following
-                self._pieces.append((free, at, following, 0.0, 0.0))
-            velocity = following
+            half = 0.5 * abs(following - velocity) / limits.acceleration
+            start = time - half
+            if start < free - ROUNDING:
+                raise ParameterError(
+                    f'velocity changes from {velocity:g} to {following:g} m/s at {time:g} s '
+                    f'faster than the acceleration limit {limits.acceleration:g} m/s^2 allows'
+                )
+            turn = copysign(limits.acceleration, following - velocity)
+            self._pieces.append((start, position - half * velocity, velocity, turn, 0.0))
+            free, velocity = time + half, following
+            self._pieces.append((free, position + half * velocity, velocity, 0.0, 0.0))
         self.end = free
         # Exactly at the last position, and at rest.
-        self._pieces[len(self._pieces) - 1 :] = [(free, positions[-1], 0.0, 0.0, 0.0)]
+        self._pieces[-1] = (free, positions[-1], 0.0, 0.0, 0.0)
 
     def _join_cubics(
         self,
@@ -124,9 +115,10 @@ class Path:
         """Build the pieces from cubics."""
         if velocities[-1] != 0.0:
             raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
+        low, high = self.depths
         for k in range(len(times) - 1):
             t = times[k + 1] - times[k]
-            d, v0, v1 = positions[k + 1] - positions[k], velocities[k], velocities[k + 1]
+            p, d, v0, v1 = positions[k], positions[k + 1] - positions[k], *velocities[k : k + 2]
             a = (6.0 * d / t - 4.0 * v0 - 2.0 * v1) / t
             jerk = (6.0 * (v0 + v1) - 12.0 * d / t) / (t * t)
             inside = -a / jerk if jerk else -1.0
@@ -142,21 +134,15 @@ class Path:
                         f'{name} after {times[k]:g} s must be within {bound:g} {unit}, got '
                         f'{found:g} {unit}'
                     )
-            self._pieces.append((times[k], positions[k], v0, a, jerk))
-        self._pieces.append((times[-1], positions[-1], 0.0, 0.0, 0.0))
-        self.end = float(times[-1])
-
-    def _check_depths(self, low: float, high: float) -> None:
-        """Reject cubics that leave the range of depths between their points."""
-        for (start, p, v, a, jerk), after in pairwise(self._pieces):
-            span = after[0] - start
-            for turn in np.roots([0.5 * jerk, a, v]):
-                t = float(turn.real)
-                at = p + t * (v + t * (0.5 * a + t * jerk / 6.0))
-                if turn.imag == 0.0 and 0.0 < t < span and not low <= at <= high:
+            for turn in np.roots([0.5 * jerk, a, v0]):
+                x = float(turn.real)
+                at = p + x * (v0 + x * (0.5 * a + x * jerk / 6.0))
+                if turn.imag == 0.0 and 0.0 < x < t and not low <= at <= high:
                     raise ParameterError(
                         f'path must stay in [{low:g}, {high:g}] m, got {at:g} m between its points'
                     )
+            self._pieces.append((times[k], p, v0, a, jerk))
+        self._pieces.append((times[-1], positions[-1], 0.0, 0.0, 0.0))
 
     def at(self, time: float) -> Setpoint:
         """Return the setpoint at a time since the start [s], at least of the first point."""
@@ -170,62 +156,17 @@ class Path:
         )
 
 
-def _check(
-    times: Sequence[float],
-    positions: Sequence[float],
-    velocities: Sequence[float] | None,
-    depths: tuple[float, float],
-) -> None:
-    """Reject points that are missing, not finite, out of order or out of range."""
-    if not times or len(times) != len(positions):
-        raise ParameterError(
-            f'path needs one position for each of at least one time, got {len(positions)} '
-            f'positions and {len(times)} times'
-        )
-    if velocities is not None and len(velocities) != len(times):
-        raise ParameterError(
-            f'path needs a velocity for each of its {len(times)} points or none, '
-            f'got {len(velocities)}'
-        )
-    if not all(map(isfinite, (*times, *positions, *(velocities or ())))):
-        raise ParameterError('times, positions and velocities must be finite')
-    check_times(times)
-    low, high = depths
-    if not all(low <= at <= high for at in positions):
-        raise ParameterError(
-            f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
-        )
-
-
-class Joined:
+class Joined(Reference):
     """
     Motion that joins a path without a jump in position, velocity or acceleration.
 
     If limits and range of depths allow it, the motion reaches the path at its first point in time.
-    Otherwise it reaches the path later, with a delay of half of the additional time.
-
-    Parameters
-    ----------
-    start : Setpoint
-        Start of the motion.
-    path : Path
-        Path to join.
-    since : float
-        Present time on the path [s].
-    limits : ReferenceLimits
-        Limits of the joining motion.
-
-    Attributes
-    ----------
-    duration : float
-        Duration of the whole motion [s].
-    offset : float
-        Time of this motion at time zero of the path [s].
-
+    Otherwise it reaches the path later, with a delay of half of the additional time. ``since`` is
+    the present time on the path [s].
     """
 
     def __init__(self, start: Setpoint, path: Path, since: float, limits: ReferenceLimits) -> None:
-        self._path = path
+        self.path = path
         self._halt: Reference | None = None
         depths = around(path.depths, start)
         if start.acceleration:
@@ -242,18 +183,18 @@ class Joined:
         self._joining = joining
         self._halting = self._halt.duration if self._halt else 0.0
         self._joined = self._halting + (joining.duration if joining else 0.0)
+        #: Time of this motion at time zero of the path [s].
         self.offset = self._joined - entry
         self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
         if time >= self.duration:
-            return Setpoint(self._path.last)
+            return Setpoint(self.path.last)
         if self._halt is not None and time < self._halting:
             return self._halt.at(time)
         if self._joining is not None and time < self._joined:
             return self._joining.at(time - self._halting)
-        return self._path.at(time - self.offset)
+        return self.path.at(time - self.offset)
 
 
 def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float]) -> Reference:

@@ -8,6 +8,7 @@ from needle_controller.compiled.quintic import quintic_extremes
 from needle_controller.reference.setpoint import (
     around,
     LONGER,
+    Reference,
     ReferenceLimits,
     ROUNDING,
     Setpoint,
@@ -17,12 +18,11 @@ from needle_dynamics import FloatArray
 import numpy as np
 
 
-class Quintic:
+class Quintic(Reference):
     """Motion of least integrated squared jerk between two setpoints in a given duration [s]."""
 
     def __init__(self, start: Setpoint, end: Setpoint, duration: float) -> None:
-        t = duration
-        self.duration = t
+        self.duration = t = duration
         self.start, self.end = start, end
         v0, a0 = start.velocity * t, start.acceleration * t * t
         v1, a1 = end.velocity * t, end.acceleration * t * t
@@ -34,7 +34,6 @@ class Quintic:
         self._c = start.position, v0, 0.5 * a0, c3, c4, c5
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time since the start [s]; outside the motion its nearer end."""
         if time >= self.duration:
             return self.end
         if time <= 0.0:
@@ -81,7 +80,7 @@ def shortest(distance: float, limits: ReferenceLimits) -> float:
     )
 
 
-class MinimumJerk:
+class MinimumJerk(Reference):
     """
     Fastest quintic motion to a target within the limits.
 
@@ -95,12 +94,6 @@ class MinimumJerk:
         Limits; values that the start already exceeds are allowed.
     depths : tuple of float
         Lowest and highest position of the motion [m]; the start is always allowed.
-
-    Attributes
-    ----------
-    duration : float
-        Duration of the motion [s].
-
     """
 
     def __init__(
@@ -124,35 +117,18 @@ class MinimumJerk:
 
         while not fits() and motion.duration < 100.0 * least:
             motion = Quintic(start, end, LONGER * motion.duration)
-        self._halt: Quintic | None = None
-        self._motion = motion
+        self._halt = Quintic(start, start, 0.0)
         if not fits():
             # No single quintic is within the limits: stop first.
             self._halt = halt(start, limits, depths)
-            distance = abs(target - self._halt.end.position)
-            self._motion = Quintic(self._halt.end, end, shortest(distance, limits))
-        self.duration = self._motion.duration + (self._halt.duration if self._halt else 0.0)
+            rest = self._halt.end
+            motion = Quintic(rest, end, shortest(abs(target - rest.position), limits))
+        self._motion = motion
+        self.duration = motion.duration + self._halt.duration
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; see `Reference.at`.
-
-        Parameters
-        ----------
-        time : float
-            As for `Reference.at`.
-
-        Returns
-        -------
-        Setpoint
-            As from `Reference.at`.
-
-        """
-        if self._halt is not None:
-            if time < self._halt.duration:
-                return self._halt.at(time)
-            time -= self._halt.duration
-        return self._motion.at(time)
+        halting = self._halt.duration
+        return self._halt.at(time) if time < halting else self._motion.at(time - halting)
 
 
 def halt(

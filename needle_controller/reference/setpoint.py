@@ -18,21 +18,11 @@ LONGER: Final = 1.1
 
 
 class Setpoint(NamedTuple):
-    """
-    Desired position, velocity and acceleration of an axis.
+    """Desired position, velocity and acceleration of an axis."""
 
-    Attributes
-    ----------
-    position : float
-        Insertion depth [m] or angle [rad].
-    velocity, acceleration : float
-        First and second derivative in time.
-
-    """
-
-    position: float
-    velocity: float = 0.0
-    acceleration: float = 0.0
+    position: float  #: insertion depth [m] or angle [rad]
+    velocity: float = 0.0  #: its rate
+    acceleration: float = 0.0  #: rate of the velocity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,9 +41,8 @@ class ReferenceLimits:
 class Reference(Protocol):
     """Motion that ends at rest, with times from its start [s]."""
 
-    @property
-    def duration(self) -> float:
-        """Duration of the motion [s]."""
+    #: Duration of the motion [s].
+    duration: float
 
     def at(self, time: float) -> Setpoint:
         """

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from math import copysign, sqrt
-from typing import Final
 
-from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
+from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
 
 
-class Step:
+class Step(Reference):
     """Step to the target [m], as in the paper; start and limits are ignored."""
 
-    duration: Final = 0.0
+    duration = 0.0
 
     def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
         del start, limits
         self._target = target
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
         del time
         return Setpoint(self._target)
 
 
-class Trapezoid:
+class Trapezoid(Reference):
     """
     Fastest motion within the limits: accelerate, constant speed, brake.
 
@@ -35,11 +33,6 @@ class Trapezoid:
         Position of the end, at rest [m].
     limits : ReferenceLimits
         Limits. If the start is faster than the limit, the motion first brakes.
-
-    Attributes
-    ----------
-    duration : float
-        Duration of the motion [s].
 
     Examples
     --------
@@ -77,26 +70,10 @@ class Trapezoid:
         parts.append((max(0.0, peak - v0) / ramp, sign * ramp))
         parts.append((max(0.0, cruise) / peak if peak > 0.0 else 0.0, 0.0))
         parts.append((peak / ramp, -sign * ramp))
-        self._start = start
-        self._target = target
-        self._parts = parts
+        self._start, self._target, self._parts = start, target, parts
         self.duration = sum(part[0] for part in parts)
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time [s]; see `Reference.at`.
-
-        Parameters
-        ----------
-        time : float
-            As for `Reference.at`.
-
-        Returns
-        -------
-        Setpoint
-            As from `Reference.at`.
-
-        """
         if time >= self.duration:
             return Setpoint(self._target)
         position, velocity = self._start.position, self._start.velocity

@@ -94,7 +94,7 @@ class GuardedLaw:
 
     def update(self, look: TipMeasurements, at: int, depth: float | None = None) -> None:
         """Pass a measurement at a depth number to the law; it may have no readings."""
-        self.seen = seen = look.seen(self._noise)
+        self.seen = seen = look.average(self._noise)
         if seen is None:
             self._check_sensor(None)
             with _guarded():

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from math import isfinite
-from typing import Final, NamedTuple, Protocol
+from math import isfinite, nan
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
@@ -40,20 +40,10 @@ class SteeringFaultError(JobError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TipEstimate:
-    """
-    Estimated or predicted position of the tip.
+    """Estimated or predicted position of the tip."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (2,)
-        Position in x and z in the frame of the sensor [m].
-    covariance : ndarray, shape (2, 2)
-        Its covariance [m^2].
-
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
+    mean: FloatArray  #: position in x and z in the frame of the sensor [m], shape (2,)
+    covariance: FloatArray  #: its covariance [m^2], shape (2, 2)
 
     @property
     def half_width(self) -> FloatArray:
@@ -75,21 +65,11 @@ class TipEstimate:
 
 
 class GuideSetpoint(NamedTuple):
-    """
-    Guide setpoint for the next step: guide and roll move while the tip rests.
+    """Guide setpoint for the next step: guide and roll move while the tip rests."""
 
-    Attributes
-    ----------
-    x, z : float
-        Position of the guide [m].
-    roll : float
-        Roll of the needle [rad].
-
-    """
-
-    x: float
-    z: float
-    roll: float = 0.0
+    x: float  #: position of the guide along x [m]
+    z: float  #: position of the guide along z [m]
+    roll: float = 0.0  #: roll of the needle [rad]
 
 
 class SteeringLaw(Protocol):
@@ -141,14 +121,16 @@ class SteeringLaw(Protocol):
         tip : array_like of shape (2,) or None
             Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
         at : int
-            Number of its depth: the present or, if the needle does not rest, the one before.
+            Number of its depth, not greater than `step`: the present or, if the needle does not
+            rest, the depth before.
         noise : float
             Standard deviation of the measurement along each axis, if above the configured one [m].
 
         Raises
         ------
         SteeringFaultError
-            If the needle must stop.
+            If the needle must stop, because the measurements are missing for too long, have
+            frozen, or are implausible.
 
         """
 
@@ -162,17 +144,8 @@ class SteeringLaw(Protocol):
         """Return values for the status by name: turns_left, hit_probability, or others."""
 
 
-class LawClass(Protocol):
-    """Constructor of a steering law."""
-
-    def __call__(
-        self,
-        model: SteeringModel,
-        target: ArrayLike,
-        limits: SteeringLimits,
-        roll: float,
-    ) -> SteeringLaw:
-        """Create a law; parameters as for `build_law`."""
+#: Constructor of a steering law: model, target, limits and roll, as for `build_law`.
+LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float], SteeringLaw]
 
 
 def find_law(name: str) -> LawClass:
@@ -237,15 +210,11 @@ def build_law(
     # The constructor is any code of the user.
     except Exception as error:
         raise ParameterError(f'law {name!r} cannot be constructed: {error}') from error
-    missing = [one for one in _MEMBERS if not hasattr(law, one)]
+    members = 'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status'
+    missing = [name for name in members if not hasattr(law, name)]
     if missing:
         raise ParameterError(f'law {name!r} has no {", ".join(missing)}')
     return law
-
-
-_MEMBERS: Final = (
-    'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status',
-)  # fmt: skip
 
 
 def checked_roll(roll: float) -> float:
@@ -253,6 +222,14 @@ def checked_roll(roll: float) -> float:
     if not isfinite(roll):
         raise ParameterError(f'roll must be finite, got {roll!r} rad')
     return roll
+
+
+def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
+    """Return a tip measurement x, z [m] as an array, nan if it is missing."""
+    found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
+    if found.shape != (2,):
+        raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
+    return found
 
 
 def checked_target(target: ArrayLike) -> FloatArray:

@@ -16,12 +16,6 @@ class SteeringLimits:
     Limits of the guide setpoints of a steering law.
 
     The defaults are for a robot: a force on tissue and a motion without a limit are never implied.
-
-    Raises
-    ------
-    ParameterError
-        If a limit is not a number or is outside its range.
-
     """
 
     guide_limit: float = constant(

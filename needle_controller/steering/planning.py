@@ -2,100 +2,38 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from threading import Event, Thread
-from typing import Final, Generic, Protocol, TypeVar
+from threading import Thread
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from needle_ros.errors import JobError
 
 _Result = TypeVar('_Result')
-_Result_co = TypeVar('_Result_co', covariant=True)
 
 #: Called by a job between its parts with the number of parts done and of all parts; it raises
 #: `CancelledError` if the job has been cancelled.
-Progress = Callable[[int, int], None]
-
-_NOT_DONE: Final = 'the job is not done'
+Progress: TypeAlias = Callable[[int, int], None]
 
 
 class CancelledError(JobError):
     """A job was cancelled."""
 
 
-class Job(Protocol[_Result_co]):
-    """A computation with a result."""
-
-    @property
-    def done(self) -> bool:
-        """Whether it has ended, with a result or an error."""
-
-    @property
-    def fraction(self) -> float:
-        """Fraction that is done, 0 to 1."""
-
-    def result(self) -> _Result_co:
-        """Return the result, or raise the error of the computation."""
-
-    def cancel(self) -> None:
-        """Cancel it; its result is not used."""
-
-
-class StartJob(Protocol):
-    """Starts a job: `ComputedJob`, `ThreadJob`, or another class with the same constructor."""
-
-    def __call__(self, work: Callable[[Progress], _Result]) -> Job[_Result]:
-        """Start a job that calls ``work``."""
-
-
-class ComputedJob(Generic[_Result]):
-    """
-    A job that is computed synchronously, for simulations.
-
-    Parameters
-    ----------
-    work : callable
-        Computes the result.
-
-    """
-
-    done: Final = True
-    fraction: Final = 1.0
-
-    def __init__(self, work: Callable[[Progress], _Result]) -> None:
-        self._error: Exception | None = None
-        try:
-            self._result = work(lambda _done, _parts: None)
-        # Raised again by `result`.
-        except Exception as error:  # noqa: BLE001
-            self._error = error
-
-    def result(self) -> _Result:
-        if self._error is not None:
-            raise self._error
-        return self._result
-
-    def cancel(self) -> None:
-        """Do nothing: the job has ended."""
-
-
-class ThreadJob(Generic[_Result]):
-    """
-    A job in its own thread.
-
-    Parameters
-    ----------
-    work : callable
-        Computes the result; it calls its argument between its parts.
-
-    """
+class Job(ABC, Generic[_Result]):
+    """A computation with a result; ``work`` calls its argument between its parts."""
 
     def __init__(self, work: Callable[[Progress], _Result]) -> None:
         self._work = work
-        self._cancelled, self._ended = Event(), Event()
-        self._fraction = 0.0
-        self._error: Exception | None = JobError(_NOT_DONE)
-        # A daemon: the end of the process does not wait for it.
-        Thread(target=self._run, name='plan', daemon=True).start()
+        #: Fraction that is done, 0 to 1, and whether it has ended, with a result or an error.
+        self.fraction, self.done = 0.0, False
+        self.cancelled = False
+        self._error: Exception | None = JobError('the job is not done')
+        self._start()
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Call `_run`."""
 
     def _run(self) -> None:
         try:
@@ -104,26 +42,38 @@ class ThreadJob(Generic[_Result]):
         # Raised again by `result`, in the thread of the caller.
         except Exception as error:  # noqa: BLE001
             self._error = error
-        self._ended.set()
+        self.done = True
 
     def _progress(self, done: int, parts: int) -> None:
-        if self._cancelled.is_set():
+        if self.cancelled:
             raise CancelledError('the job was cancelled')
-        self._fraction = done / parts
-
-    @property
-    def done(self) -> bool:
-        return self._ended.is_set()
-
-    @property
-    def fraction(self) -> float:
-        return self._fraction
+        self.fraction = done / parts
 
     def result(self) -> _Result:
+        """Return the result, or raise the error of the computation."""
         if self._error is not None:
             raise self._error
         return self._result
 
     def cancel(self) -> None:
         """Cancel it before its next part; its result is not used."""
-        self._cancelled.set()
+        self.cancelled = True
+
+
+#: Starts a job: `ComputedJob`, `ThreadJob`, or another class with the same constructor.
+StartJob: TypeAlias = Callable[[Callable[[Progress], Any]], Job[Any]]
+
+
+class ComputedJob(Job[_Result]):
+    """A job that is computed synchronously, for simulations."""
+
+    def _start(self) -> None:
+        self._run()
+
+
+class ThreadJob(Job[_Result]):
+    """A job in its own thread."""
+
+    def _start(self) -> None:
+        # A daemon: the end of the process does not wait for it.
+        Thread(target=self._run, name='plan', daemon=True).start()

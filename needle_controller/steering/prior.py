@@ -9,15 +9,7 @@ from needle_ros.settings import check_constants, constant
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringPrior:
-    """
-    Prior uncertainty of needle, tissue, guide, path and sensor.
-
-    Raises
-    ------
-    ParameterError
-        If a constant is not a number or is outside its range.
-
-    """
+    """Prior uncertainty of needle, tissue, guide, path and sensor."""
 
     spread: float = constant(
         0.3, '1', 'relative uncertainty of bending length and skin stiffness',

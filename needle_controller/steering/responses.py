@@ -87,31 +87,23 @@ class SteeringModel:
 
     Attributes
     ----------
-    depths : ndarray, shape (n + 1,)
-        The depths [m].
-    needle, steering, prior : NeedleParameters, SteeringParameters, SteeringPrior
+    needle, steering, depths, prior
         As given.
     lengths, skins : ndarray, shape (h,)
         Bending length and skin stiffness of each hypothesis, relative to the nominal values.
-    guide : ndarray, shape (h, n + 1, n)
-        Shift of the tip at each depth per position of the guide in each step.
-    causes : ndarray, shape (h, n + 1, 5 + n)
-        The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without
-        roll, and curvature of the path at each depth [1/m].
-    bevel : ndarray, shape (h, n + 1, n + 1)
-        The same per load of the bevel [N] on the skin, and in each step.
-    elastic : ndarray, shape (h, n + 1)
-        Elastic shift of the resting tip per load of the bevel [m/N].
-    guide_load, causes_load, bevel_load : ndarray, shape (h, n, n), (h, n, 5 + n), (h, n, n + 1)
-        The same for the force on the guide at its position of each step [N].
     push : float
         Nominal load of the bevel, along z at zero roll [N].
-    between : ndarray, shape (2, h, n + 1, n)
-        Change of `guide` from one hypothesis to the next in bending length, and in skin.
     prior_covariance : ndarray, shape (7 + n, 7 + n)
         Prior covariance of the causes, and of the position between two hypotheses.
     responses : HypothesisResponses
-        All responses, as arguments of compiled functions.
+        Shifts of the tip at each depth: ``guide``, shape (h, n + 1, n), per position of the guide
+        in each step; ``causes``, shape (h, n + 1, 5 + n), per origin [m], turn of the frame [rad],
+        tilt, load of the bevel [N] without roll, and curvature of the path at each depth [1/m];
+        ``bevel``, shape (h, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
+        step; ``elastic``, shape (h, n + 1), of the resting tip per load of the bevel [m/N];
+        ``between``, shape (2, h, n + 1, n), change of ``guide`` from one hypothesis to the next in
+        bending length, and in skin. ``guide_load``, ``causes_load`` and ``bevel_load``, with n
+        rows, are the same for the force on the guide at its position of each step [N].
 
     Raises
     ------
@@ -144,84 +136,75 @@ class SteeringModel:
             )
         self.needle, self.steering = needle, steering
         self.depths, self.prior = at, prior or SteeringPrior()
-        self._together = together
-        width = _BEYOND * self.prior.spread
+        self.push = most = max(steering.bevel_load)
+        b, n = self.prior, self.steps
+        width = _BEYOND * b.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
         skins = np.ones(1)
         if width and steering.skin_stiffness > 0.0:
             skins = np.linspace(1.0 - width, 1.0 + width, _SKINS)
         self.lengths, self.skins = (grid.ravel() for grid in np.meshgrid(lengths, skins))
-        pairs = list(zip(self.lengths.tolist(), self.skins.tolist(), strict=True))
-        n, h = self.steps, len(pairs)
-        self.guide, self.guide_load = np.empty((h, n + 1, n)), np.empty((h, n, n))
-        self.causes, self.causes_load = np.empty((h, n + 1, n + 5)), np.empty((h, n, n + 5))
-        self.bevel, self.bevel_load = np.empty((h, n + 1, n + 1)), np.empty((h, n, n + 1))
-        self.elastic = np.empty((h, n + 1))
         # The responses are per load in the layer with the largest load of the bevel.
-        most = max(steering.bevel_load)
         loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
-        beyond = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
-        shortest = with_lengths(needle, beyond, float(lengths[0]))
+        unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
+        shortest = with_lengths(needle, unit, float(lengths[0]))
         rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
-        for i, pair in enumerate(pairs):
+        found = []
+        for i, pair in enumerate(zip(self.lengths.tolist(), self.skins.tolist(), strict=True)):
             if progress is not None:
-                progress(i, h)
-            self._respond(i, steered(*with_lengths(needle, beyond, *pair)), beyond, rows)
-        self.push = max(steering.bevel_load)
-        grid = self.guide.reshape(len(skins), len(lengths), *self.guide.shape[1:])
-        self.between = np.array(
-            [
-                (np.gradient(grid, axis=axis) if grid.shape[axis] > 1 else 0.0 * grid).reshape(
-                    self.guide.shape
-                )
-                for axis in (1, 0)
-            ]
-        )
-        b = self.prior
-        size = 7 + self.steps
-        self.prior_covariance = np.diag(
-            np.array([b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (size - 6), _EVEN, _EVEN]) ** 2
-        )
+                progress(i, len(self.lengths))
+            found.append(_respond(steered(*with_lengths(needle, unit, *pair)), unit, at, rows))
+        arrays = [np.array(each) for each in zip(*found, strict=True)]
+        guide, _, bevel, *_ = arrays
+        grid = guide.reshape(len(skins), len(lengths), *guide.shape[1:])
+        between = [
+            np.gradient(grid, axis=axis) if grid.shape[axis] > 1 else 0.0 * grid for axis in (1, 0)
+        ]
+        arrays.append(np.array(between).reshape(2, *guide.shape))
+        arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
+        self.responses = HypothesisResponses(*arrays)
+        deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN]
+        self.prior_covariance = np.diag(np.array(deviations) ** 2)
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
         variance = b.path_noise / (2.0 * b.path_noise_length)
         self.prior_covariance[4:-2, 4:-2] = variance * np.exp(-apart)
-        self.responses = HypothesisResponses(
-            self.guide, self.causes, self.bevel, self.elastic,
-            self.guide_load, self.causes_load, self.bevel_load, self.between,
-            _sums_from(self.guide[:, -1], self.steps + 1),
-            _sums_from(self.bevel[:, -1], self.steps + 3),
-        )  # fmt: skip
 
     @property
     def steps(self) -> int:
         """Number of steps n."""
         return len(self.depths) - 1
 
-    def _respond(self, i: int, base: Steered, steering: SteeringParameters, rows: _Rows) -> None:
-        """Insert the needle of a hypothesis once for each cause."""
-        n = self.steps
-        guide, bevel, curvature = slice(n), slice(n + 1, 2 * n + 2), slice(2 * n + 2, None)
-        loads = rows.bevel * base.bevel[rows.layers, np.newaxis]
-        turning = np.array([turning_load(base.ei, k) for k in base.stiffness.tolist()])
-        loads[:, curvature] = rows.curvature * turning[rows.layers_ahead, np.newaxis]
-        tips, felt = np.empty((2, *loads.shape))
-        insert_causes(
-            base.ei, base.skin, steering.free_length, rows.depths, base.stiffness[rows.layers],
-            rows.tilt, rows.guide, loads, tips, felt,
-        )  # fmt: skip
-        tip, moved = tips[rows.ends[::2]], tips[rows.ends[1::2]]
-        force = felt[rows.ends[2 if self._together else 1 :: 2]]
-        # The frame of the sensor has no effect on the force on the guide.
-        for found, origin, turn, to in (
-            (tip, 1.0, self.depths, (self.guide[i], self.causes[i], self.bevel[i])),
-            (force, 0.0, 0.0, (self.guide_load[i], self.causes_load[i], self.bevel_load[i])),
-        ):
-            to[0][:], to[2][:] = found[:, guide], found[:, bevel]
-            to[1][:, 0], to[1][:, 1], to[1][:, 2] = origin, turn, found[:, n]
-            to[1][:, 3], to[1][:, 4:] = found[:, bevel].sum(axis=1), found[:, curvature]
-        # A turn of the bevel at rest moves the tip elastically.
-        self.elastic[i, :n] = (moved - tip[:-1])[:, n + 2 : 2 * n + 2].diagonal()
-        self.elastic[i, n] = self.elastic[i, n - 1]
+
+def _respond(
+    base: Steered, steering: SteeringParameters, depths: FloatArray, rows: _Rows
+) -> tuple[FloatArray, ...]:
+    """Insert a needle once for each cause; return its row of the first seven responses."""
+    n = len(depths) - 1
+    loads = rows.bevel * base.bevel[rows.layers, np.newaxis]
+    turning = np.array([turning_load(base.ei, k) for k in base.stiffness.tolist()])
+    loads[:, 2 * n + 2 :] = rows.curvature * turning[rows.layers_ahead, np.newaxis]
+    tips, forces = np.empty((2, *loads.shape))
+    insert_causes(
+        base.ei, base.skin, steering.free_length, rows.depths, base.stiffness[rows.layers],
+        rows.tilt, rows.guide, loads, tips, forces,
+    )  # fmt: skip
+    tip, turned = tips[rows.inserted], tips[rows.turned]
+    # A turn of the bevel at rest moves the tip elastically.
+    elastic = (turned - tip[:-1])[:, n + 2 : 2 * n + 2].diagonal()
+    of_tip = _by_cause(tip, np.ones(n + 1), depths)
+    # The frame of the sensor has no effect on the force on the guide.
+    of_guide = _by_cause(forces[rows.guided], np.zeros(n), np.zeros(n))
+    return *of_tip, np.append(elastic, elastic[-1]), *of_guide
+
+
+def _by_cause(
+    found: FloatArray, origin: FloatArray, turn: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Split responses, shape (k, 3 n + 3), into those of guide, constant causes and bevel."""
+    n = found.shape[1] // 3 - 1
+    bevel = found[:, n + 1 : 2 * n + 2]
+    constants = origin, turn, found[:, n], bevel.sum(axis=1), found[:, 2 * n + 2 :]
+    return found[:, :n], np.column_stack(constants), bevel
 
 
 class _Rows:
@@ -230,8 +213,9 @@ class _Rows:
 
     Causes are the guide in each step, its tilt, the bevel on the skin and in each step, and the
     curvature of the path at each depth. A row is the end of an element, of a motion at rest, or of
-    a layer, where the load of the bevel changes at rest. `ends` are the rows at the end of a pose:
-    pose 2k is the needle at depth k, and in pose 2k + 1 guide and roll have changed there.
+    a layer, where the load of the bevel changes at rest. Pose 2k is the needle at depth k, and in
+    pose 2k + 1 guide and roll have changed there. `inserted`, `turned` and `guided` are the rows
+    at which the needle is at a depth, the bevel has been turned, and the guide is in position.
     """
 
     def __init__(
@@ -256,8 +240,9 @@ class _Rows:
                         found.append((stop, before, int(_layers(borders, stop))))
             ends.append(len(found) - 1)
         depths, poses, layers = zip(*found, strict=True)
-        self.ends, self.depths = np.array(ends), np.array(depths)
-        self.layers = np.array(layers)
+        self.inserted, self.turned = np.array(ends[::2]), np.array(ends[1::2])
+        self.guided = np.array(ends[2 if together else 1 :: 2])
+        self.depths, self.layers = np.array(depths), np.array(layers)
         posed = np.zeros((2, 2 * n + 1, 3 * n + 3))
         posed[1, 0, n + 1] = 1.0
         for k in range(n):

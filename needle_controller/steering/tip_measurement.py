@@ -19,26 +19,12 @@ _FEW: Final = 3
 
 
 class AveragedTipMeasurement(NamedTuple):
-    """
-    Result of an averaged tip measurement.
+    """Result of an averaged tip measurement."""
 
-    Attributes
-    ----------
-    tip : ndarray, shape (3,)
-        Position of the tip, x, y, z [m].
-    error : float
-        Standard error along x or z, from the scatter of the readings [m]; 0 for few readings.
-    readings : int
-        Number of valid readings.
-    frozen : bool
-        Whether at least three readings are identical in x and z.
-
-    """
-
-    tip: FloatArray
-    error: float
-    readings: int
-    frozen: bool
+    tip: FloatArray  #: position of the tip, x, y, z [m]
+    error: float  #: standard error along x or z, from the scatter of the readings [m]; 0 for few
+    readings: int  #: number of valid readings
+    frozen: bool  #: whether at least three readings are identical in x and z
 
 
 class TipMeasurements:
@@ -51,7 +37,7 @@ class TipMeasurements:
         """Add a reading of the tip, x, y, z [m], at a distance before the depth [m]."""
         self._readings.append((*tip, before))
 
-    def seen(self, noise: float) -> AveragedTipMeasurement | None:
+    def average(self, noise: float) -> AveragedTipMeasurement | None:
         """
         Return the mean without outliers, or during motion a fitted line at the depth; or None.
 

@@ -19,7 +19,7 @@ def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
         completed=np.array([completed]),
         goal=np.zeros(len(depths)),
         depths=path,
-        courses=np.empty((1, 0, 8)),
+        trajectories=np.empty((1, 0, 8)),
         commands=np.empty((1, 0)),
     )
 

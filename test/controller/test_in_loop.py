@@ -236,7 +236,7 @@ def test_batch_equals_the_controller_of_the_node(name: str, delay: int) -> None:
         assert_allclose(batch.states[i], run.states[-1], rtol=1e-9, atol=1e-12)
         # Relative to the range of each coordinate: rates oscillate at kilohertz.
         reached = np.abs(run.states).max(axis=0) + 1e-12
-        assert_allclose(batch.courses[i] / reached, run.states / reached, atol=1e-9)
+        assert_allclose(batch.trajectories[i] / reached, run.states / reached, atol=1e-9)
         # A command takes effect after its delay.
         acted = run.forces[delay:-1, 0]
         assert_allclose(batch.commands[i, : len(acted)], acted, rtol=1e-9, atol=1e-9)
@@ -311,7 +311,7 @@ def test_batch_noise_is_encoder_noise() -> None:
     controller.guide.at(0.0, 0.02)
     run = run_controller(Blurred(controller, noise), NOMINAL, START, duration=DURATION, step=1e-4)
     reached = np.abs(run.states).max(axis=0) + 1e-12
-    assert_allclose(batch.courses[0] / reached, run.states / reached, atol=1e-9)
+    assert_allclose(batch.trajectories[0] / reached, run.states / reached, atol=1e-9)
     beside = np.array([0.0, 0.0, 0.1])
     pushed = run_batch(law, NOMINAL, START, REFERENCE, noise=noise + beside, **options)
     plain = run_batch(law, NOMINAL, START, REFERENCE, noise=noise, **options)

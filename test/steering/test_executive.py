@@ -472,17 +472,17 @@ def test_noisy_readings_give_a_warning() -> None:
 def test_averaged_measurement_rejects_outliers() -> None:
     """Many readings with two outliers; and no readings."""
     look = TipMeasurements()
-    assert look.seen(1e-5) is None
+    assert look.average(1e-5) is None
     rng = np.random.default_rng(1)
     tips = np.array([1e-3, 0.05, -2e-3]) + 1e-4 * rng.standard_normal((20, 3))
     for tip in tips:
         look.take(tuple(tip))
     look.take((0.02, 0.05, 0.0))
     look.take((1e300, 0.05, 0.0))
-    seen = look.seen(1e-5)
-    assert seen.readings == 20
-    assert_allclose(seen.tip, tips.mean(axis=0), atol=1e-12)
-    assert seen.error == pytest.approx(1e-4 / np.sqrt(20.0), rel=0.5)
+    average = look.average(1e-5)
+    assert average.readings == 20
+    assert_allclose(average.tip, tips.mean(axis=0), atol=1e-12)
+    assert average.error == pytest.approx(1e-4 / np.sqrt(20.0), rel=0.5)
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)

@@ -58,14 +58,14 @@ class Plain:
 
     def tip(self, at: int, guide: ComplexArray) -> tuple[ComplexArray, FloatArray, ComplexArray]:
         """Return means, variances, and covariances with the constants."""
-        model = self.model
-        causes = model.causes[:, at].astype(complex)
-        causes[:, 3] = model.bevel[:, at] @ self.turned
-        rows = np.concatenate([causes, (model.between[:, :, at] @ guide).T], axis=1)
-        means = model.guide[:, at] @ guide + np.einsum('hm,hm->h', rows, self.mean)
+        r = self.model.responses
+        causes = r.causes[:, at].astype(complex)
+        causes[:, 3] = r.bevel[:, at] @ self.turned
+        rows = np.concatenate([causes, (r.between[:, :, at] @ guide).T], axis=1)
+        means = r.guide[:, at] @ guide + np.einsum('hm,hm->h', rows, self.mean)
         shared = np.einsum('hml,hl->hm', self.covariance, rows.conj())
         variances = np.einsum('hm,hm->h', rows, shared).real
-        return means, variances + (0.03 * model.elastic[:, at] * abs(self.mean[:, 3])) ** 2, shared
+        return means, variances + (0.03 * r.elastic[:, at] * abs(self.mean[:, 3])) ** 2, shared
 
     def held(self) -> ComplexArray:
         """Return the guide at rest at its last position."""
@@ -91,7 +91,7 @@ class Plain:
     def ends(self, turns: int, first: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
         """Return means, standard deviations, and the range of later turns."""
         means, variances, _ = self.tip(-1, self.guide)
-        later, turned = self.model.bevel[:, -1, first:], np.zeros(len(means))
+        later, turned = self.model.responses.bevel[:, -1, first:], np.zeros(len(means))
         if turns:
             means = means - self.mean[:, 3] * (later @ self.turned[first:])
             turned = 0.8 * sqrt(0.5) * abs(self.mean[:, 3]) * abs(later).sum(axis=1)
@@ -104,10 +104,10 @@ class Plain:
         return (low + high) / 2.0, (high - low) / 2.0
 
     @property
-    def chance(self) -> float:
+    def hit_probability(self) -> float:
         """Return the probability of a hit near the target."""
         means, errors, turned = self.ends(self.turns, self.step + 1)
-        shifts, chance = self.model.guide[:, -1, self.step :], 1.0
+        shifts, chance = self.model.responses.guide[:, -1, self.step :], 1.0
         there = self.guide[self.step - 1] if 0 < self.step <= self.model.steps else 0j
         for need, at in (
             ((self.goal - means).real, there.real), ((self.goal - means).imag, there.imag),
@@ -128,12 +128,12 @@ class Plain:
 
     def costs(self, ends: tuple[Any, ...], tried: FloatArray) -> FloatArray:
         """Return the distance of the target from the reachable set for positions, (2, count)."""
-        (means, errors, turned), k, w, model = ends, self.step, self.weights, self.model
-        now, after = model.guide[:, -1, k], model.guide[:, -1, k + 1 :]
-        push = (model.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
-        causes = model.causes_load[:, k] * self.mean[:, :-2]
+        (means, errors, turned), k, w, r = ends, self.step, self.weights, self.model.responses
+        now, after = r.guide[:, -1, k], r.guide[:, -1, k + 1 :]
+        push = (r.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
+        causes = r.causes_load[:, k] * self.mean[:, :-2]
         causes[:, 3] = push
-        force = w @ (model.guide_load[:, k] @ self.guide + causes.sum(axis=1))
+        force = w @ (r.guide_load[:, k] @ self.guide + causes.sum(axis=1))
         found, need = np.zeros(tried.shape), self.goal - means
         for plane, (at, felt) in enumerate(((need.real, force.real), (need.imag, force.imag))):
             to = tried[plane]
@@ -143,13 +143,13 @@ class Plain:
             for a, weight in ((-sqrt(3), 1 / 6), (0.0, 4 / 6), (sqrt(3), 1 / 6)):
                 short = np.maximum(0.0, abs(left + a * errors[:, None]) - later)
                 found[plane] += weight * (w @ short**2)
-            load = abs(felt + w @ model.guide_load[:, k, k] * to)
+            load = abs(felt + w @ r.guide_load[:, k, k] * to)
             found[plane] += np.maximum(0.0, load - self.load_limit) ** 2
         return found
 
     def best(self, ends: tuple[Any, ...], tried: FloatArray) -> tuple[float, complex]:
         """Return the least distance from the reachable set, and its position."""
-        w, shifts = self.weights, self.model.guide[:, -1, self.step :]
+        w, shifts = self.weights, self.model.responses.guide[:, -1, self.step :]
         normal = (w * shifts.T) @ shifts + 1e-2 * np.eye(shifts.shape[1])
         plan = np.linalg.solve(normal, (w * shifts.T) @ (self.goal - ends[0]))[0]
         costs = self.costs(ends, tried)
@@ -166,7 +166,7 @@ class Plain:
             return guide
         means, errors, turned = self.ends(self.turns - 1, k + 2)
         until = k + 2 if self.turns > 1 else None
-        load = self.mean[:, 3] * self.model.bevel[:, -1, k + 1 : until].sum(axis=1)
+        load = self.mean[:, 3] * self.model.responses.bevel[:, -1, k + 1 : until].sum(axis=1)
         rolls = self.roll + tau * np.arange(-7, 9) / 16
         ways, now = np.exp(-1j * rolls), np.exp(-1j * self.roll)
         others = [(means + load * (way - now), errors, turned) for way in ways]
@@ -209,7 +209,7 @@ class Compared(MultiHypothesisLaw):
         assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
         assert_allclose(self.weights, plain.weights, rtol=1e-6, atol=1e-12)
         # Sums in another order.
-        assert self.chance == pytest.approx(plain.chance, abs=1e-12)
+        assert self.hit_probability == pytest.approx(plain.hit_probability, abs=1e-12)
         return to
 
 

@@ -223,22 +223,17 @@ def test_lost_stop_is_repeated_and_supersedes_the_motion() -> None:
 # Planning.
 
 
-class Manual:
+class Manual(Job[Any]):
     """A job that is ended by the test."""
 
     made: list[Manual]
 
-    def __init__(self, work: Callable[[Progress], Any]) -> None:
-        self.done = self.cancelled = False
+    def _start(self) -> None:
         self.fraction = 0.25
-        self._work = work
         Manual.made.append(self)
 
     def result(self) -> Any:
         return self._work(lambda _done, _parts: None)
-
-    def cancel(self) -> None:
-        self.cancelled = True
 
 
 class Planning(Robot):

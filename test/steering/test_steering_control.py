@@ -78,12 +78,12 @@ def test_predictions_agree_with_the_simulated_needle(length: float, skin: float)
     """The tip at each depth agrees with `SteeredNeedle`, for any guide, tilt and bevel."""
     needle, steering = other(length, skin)
     alone = SteeringModel(needle, steering, DEPTHS, SteeringPrior(spread=0.0))
-    assert alone.guide.shape == (1, 21, 20)
+    assert alone.responses.guide.shape == (1, 21, 20)
     rng = np.random.default_rng(2)
     guide, tilt = 3e-3 * rng.standard_normal((20, 2)), np.array([0.02, -0.01])
     one = SteeredNeedle(needle, replace(steering, bevel_load=(0.3,)), tilt=tilt.tolist(), roll=0.7)
     causes = np.array([[0.0, 0.0], [0.0, 0.0], tilt, 0.3 * np.array([np.sin(0.7), np.cos(0.7)])])
-    expected = alone.guide[0] @ guide + alone.causes[0, :, :4] @ causes
+    expected = alone.responses.guide[0] @ guide + alone.responses.causes[0, :, :4] @ causes
     for k, depth in enumerate(DEPTHS[1:].tolist()):
         one.move(guide=guide[k].tolist())
         one.move(depth=depth)
@@ -96,7 +96,11 @@ def test_path_curvature_is_linear_between_depths() -> None:
     alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(spread=0.0))
     load = NEEDLE.bending_stiffness / 0.035
     # Loads by cells of 1.25 mm, against one load of all cells.
-    assert_allclose(alone.causes[0, :, 4:].sum(axis=1), load * alone.causes[0, :, 3], atol=2e-5)
+    assert_allclose(
+        alone.responses.causes[0, :, 4:].sum(axis=1),
+        load * alone.responses.causes[0, :, 3],
+        atol=2e-5,
+    )
 
 
 @settings(max_examples=12, deadline=None)
@@ -381,13 +385,13 @@ def test_tip_and_load_are_linear_in_guide_roll_and_bevel() -> None:
     push = 0.3j * np.concatenate([[1.0], np.exp(-1j * rolls)])
     for k, depth in enumerate(DEPTHS[1:].tolist()):
         one.move(guide=guide[k].tolist(), roll=float(rolls[k]))
-        load = alone.guide_load[0, k] @ at + alone.causes_load[0, k, 2] * tilt
-        load += alone.bevel_load[0, k] @ push
+        load = alone.responses.guide_load[0, k] @ at + alone.responses.causes_load[0, k, 2] * tilt
+        load += alone.responses.bevel_load[0, k] @ push
         # Elements of 1 and 1.25 mm; loads are newtons.
         assert load == pytest.approx(complex(*one.guide_load[0]), abs=2e-3)
         one.move(depth=depth)
-        tip = alone.guide[0, k + 1] @ at + alone.causes[0, k + 1, 2] * tilt
-        tip += alone.bevel[0, k + 1] @ push
+        tip = alone.responses.guide[0, k + 1] @ at + alone.responses.causes[0, k + 1, 2] * tilt
+        tip += alone.responses.bevel[0, k + 1] @ push
         assert tip == pytest.approx(complex(*one.tip[[0, 2]]), abs=5e-6)
 
 
@@ -403,7 +407,7 @@ def test_bevel_is_turned_towards_the_target(
     the distance and a rotated sensor.
     """
     rng = np.random.default_rng(seed)
-    reach = 0.8 * np.abs(BEVEL_MODEL.bevel[26, -1]).sum()
+    reach = 0.8 * np.abs(BEVEL_MODEL.responses.bevel[26, -1]).sum()
     target = 0.5 * reach * rng.uniform(-1.0, 1.0, 2)
     needle, steering = other(1.0 + 0.2 * rng.uniform(-1.0, 1.0))
     steering = replace(steering, bevel_load=(0.8 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0)),))

@@ -48,10 +48,11 @@ def test_each_response_equals_an_insertion_with_one_cause(cause: str, together: 
             loads.append(needle.guide_load[0])
         tips.append(needle.tip)
     axis = 1 if kind == 'bevel' else 0
+    responses = model.responses
     tip, load = {
-        'guide': (model.guide[0, :, j], model.guide_load[0, :, j]),
-        'tilt': (model.causes[0, :, 2], model.causes_load[0, :, 2]),
-        'bevel': (model.bevel[0, :, j], model.bevel_load[0, :, j]),
+        'guide': (responses.guide[0, :, j], responses.guide_load[0, :, j]),
+        'tilt': (responses.causes[0, :, 2], responses.causes_load[0, :, 2]),
+        'bevel': (responses.bevel[0, :, j], responses.bevel_load[0, :, j]),
     }[kind]
     # Rounding over 64 elements, and in the nodes of `SteeredNeedle`, which are sums of elements.
     found, force = np.array(tips)[:, 2 * axis], np.array(loads)[:, axis]
@@ -67,9 +68,9 @@ def test_elements_end_at_steps_and_layers() -> None:
     halved = np.sort(np.append(uneven, 0.5 * (uneven[:-1] + uneven[1:])))
     fine = SteeringModel(needle, STEERING, halved, EXACT)
     # A position of the guide in both halves of a step equals the position in the step.
-    pairs = fine.guide[0, ::2].reshape(len(uneven), -1, 2).sum(axis=2)
+    pairs = fine.responses.guide[0, ::2].reshape(len(uneven), -1, 2).sum(axis=2)
     # A path that is straight in an element is straight in its parts: rounding only.
-    assert_allclose(whole.guide[0], pairs, atol=1e-12)
+    assert_allclose(whole.responses.guide[0], pairs, atol=1e-12)
 
 
 def test_two_hundred_steps_take_less_than_a_second() -> None:
@@ -77,7 +78,7 @@ def test_two_hundred_steps_take_less_than_a_second() -> None:
     begun = time.process_time()
     model = SteeringModel(*STEERING_PRESETS['bending_35mm'][:2], np.linspace(0.0, 0.1, 201))
     taken = time.process_time() - begun
-    assert model.guide.shape == (13, 201, 200)
+    assert model.responses.guide.shape == (13, 201, 200)
     # 0.2 s on the machine for which the bar was set; five times that for a slower one.
     assert taken < 1.0
 

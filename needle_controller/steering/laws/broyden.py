@@ -27,8 +27,8 @@ from scipy.optimize import lsq_linear
 #: Fraction of a prediction error that corrects the matrix.
 _ALPHA: Final = 0.65
 
-#: Depth at which tissue holds the needle [m].
-_HELD: Final = 0.02
+#: Depth from which tissue holds the needle [m]; the guide is fixed before.
+_FIXED_BELOW: Final = 0.02
 
 
 class BroydenLaw(GuideLaw):
@@ -63,9 +63,9 @@ class BroydenLaw(GuideLaw):
     def _learn(self, tip: FloatArray, at: FloatArray) -> None:
         """Correct the matrix by a tip [m] at a position of guide and depth [m], shape (3,)."""
         if self._before is not None:
-            seen, was = self._before
-            moved = at - was
-            off = (tip - seen) - self._matrix @ moved
+            tip_before, at_before = self._before
+            moved = at - at_before
+            off = (tip - tip_before) - self._matrix @ moved
             self._matrix += _ALPHA * np.outer(off, moved) / (moved @ moved)
         self._before = tip.copy(), at
 
@@ -73,7 +73,7 @@ class BroydenLaw(GuideLaw):
         """Return the position of the guide with the least predicted distance."""
         guide, depth = self.guides[at], self.depths[at]
         self._learn(tip, np.array([*guide, depth]))
-        if depth < _HELD:
+        if depth < _FIXED_BELOW:
             return self.guides[-1]
         ahead = self.depths[self.step + 1] - depth
         limit = self.limits.guide_limit

@@ -5,11 +5,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
-from needle_controller.steering.law import checked_roll, checked_target, GuideSetpoint, TipEstimate
+from needle_controller.steering.law import (
+    checked_roll,
+    checked_target,
+    checked_tip,
+    GuideSetpoint,
+    TipEstimate,
+)
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
-from needle_ros.errors import ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -54,13 +59,9 @@ class GuideLaw(ABC):
         noise: float = 0.0,  # noqa: ARG002
     ) -> None:
         """Process a tip measurement, x and z [m], or None; see `SteeringLaw`."""
-        if tip is None:
-            return
-        found = np.array(tip, dtype=np.float64)
-        if found.shape != (2,):
-            raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
-        if np.isfinite(found).all():
-            self._newest = found, at
+        measured = checked_tip(tip)
+        if np.isfinite(measured).all():
+            self._newest = measured, at
 
     def plan(self) -> GuideSetpoint:
         """Return guide and roll for the next step, and advance to it; unchanged at the end."""

@@ -44,14 +44,16 @@ from needle_controller.compiled.steering import (
 from needle_controller.steering.law import (
     checked_roll,
     checked_target,
+    checked_tip,
     GuideSetpoint,
     SteeringFaultError,
+    SteeringLaw,
     TipEstimate,
 )
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
-from needle_ros.errors import JobError, ParameterError, ShapeError
+from needle_ros.errors import JobError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -61,44 +63,22 @@ _REFUSED, _WARNED = 0.05, 0.5
 
 
 class Reach(NamedTuple):
-    """
-    Reachable set of the tip, for each hypothesis.
+    """Reachable set of the tip, for each hypothesis."""
 
-    Attributes
-    ----------
-    middles : ndarray of complex, shape (h,)
-        Final position without further motion, x + i z [m].
-    sizes : ndarray of complex, shape (h,)
-        Half width of the reachable set, along x + i along z [m].
-    weights : ndarray, shape (h,)
-        Weight (probability) of each hypothesis.
-
-    """
-
-    middles: ComplexArray
-    sizes: ComplexArray
-    weights: FloatArray
+    middles: ComplexArray  #: final position without further motion, x + i z [m]
+    sizes: ComplexArray  #: half width of the reachable set, along x + i along z [m]
+    weights: FloatArray  #: hypothesis weights
 
 
 class OutOfReachError(JobError):
-    """
-    No motion of guide and roll brings the tip to the target.
-
-    Parameters
-    ----------
-    why : str
-        Description for the user.
-    reach : Reach
-        The reachable set.
-
-    """
+    """No motion of guide and roll brings the tip to the target; it has the reachable set."""
 
     def __init__(self, why: str, reach: Reach) -> None:
         super().__init__(why)
         self.reach = reach
 
 
-class MultiHypothesisLaw:
+class MultiHypothesisLaw(SteeringLaw):
     """
     Steer the tip to a target: one tip measurement and one guide setpoint for each step.
 
@@ -112,17 +92,6 @@ class MultiHypothesisLaw:
         Limits of the guide setpoints.
     roll : float
         Roll of the needle at the start [rad].
-
-    Attributes
-    ----------
-    target : ndarray, shape (2,)
-        The target [m].
-    step : int
-        Number of tip measurements so far.
-    turns : int
-        Number of turns left.
-    weights : ndarray, shape (h,)
-        Weight (probability) of each hypothesis.
 
     Raises
     ------
@@ -193,26 +162,10 @@ class MultiHypothesisLaw:
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
-        """
-        Continue to another target at the same depth.
-
-        Parameters
-        ----------
-        target : array_like, shape (2,)
-            Target position of the tip at the last depth, x and z in the frame of the sensor [m].
-
-        Raises
-        ------
-        ShapeError, ParameterError
-            If the target is not two finite numbers.
-        OutOfReachError
-            If the target is out of reach. The target is then unchanged.
-
-        """
         new = checked_target(target)
         before = self.target
         self._now.target[:] = new
-        if self.chance < _REFUSED:
+        if self.hit_probability < _REFUSED:
             error = OutOfReachError(self._unreachable(), self.reach)
             self._now.target[:] = before
             raise error
@@ -264,7 +217,7 @@ class MultiHypothesisLaw:
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
-    def chance(self) -> float:
+    def hit_probability(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
         return chance(self._held)
 
@@ -278,14 +231,14 @@ class MultiHypothesisLaw:
         """Return values for the status, by name."""
         return {
             'turns_left': self.turns,
-            'hit_probability': self.chance,
+            'hit_probability': self.hit_probability,
             'bending_length_ratio': self.bending,
         }
 
     @property
     def warning(self) -> str:
         """Warning if the target is probably out of reach, '' otherwise."""
-        return '' if self.chance >= _WARNED else self._unreachable()
+        return '' if self.hit_probability >= _WARNED else self._unreachable()
 
     def _unreachable(self) -> str:
         middles, sizes, w = self.reach
@@ -302,39 +255,11 @@ class MultiHypothesisLaw:
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
-        """
-        Update the hypotheses by a tip measurement at the present or an earlier depth.
-
-        Parameters
-        ----------
-        tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
-        at : int
-            Number of the depth, not greater than `step`.
-        noise : float
-            Standard deviation of the measurement along each axis, if above the configured one [m].
-
-        Raises
-        ------
-        ParameterError
-            If there is no such depth yet.
-        ShapeError
-            If the measurement does not have two numbers.
-        JobError
-            If all steps are done.
-        SteeringFaultError
-            If the measurements are missing for too long, have frozen, or are implausible. The
-            needle must then stop.
-
-        """
         if self.step > self._model.steps:
             raise JobError(f'all {self._model.steps} steps are done')
         if not 0 <= at <= self.step:
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
-        seen = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
-        if seen.shape != (2,):
-            raise ShapeError(f'a tip measurement must be x and z, got shape {seen.shape}')
-        x, z = seen.tolist()
+        x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
         kind, off_x, off_z = see(self._held, at, x, z, variance)
         if kind == FINE:
@@ -351,15 +276,6 @@ class MultiHypothesisLaw:
         )
 
     def plan(self) -> GuideSetpoint:
-        """
-        Return guide and roll for the next step, and advance to it.
-
-        Returns
-        -------
-        GuideSetpoint
-            Guide and roll; unchanged after the last measurement.
-
-        """
         now, k, last = self._now, self.step, self._model.steps - 1
         if k <= last:
             now.guide[k] = self._choose()
