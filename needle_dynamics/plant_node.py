@@ -92,6 +92,7 @@ class PlantNode(ModelNode):
     KERNELS = (
         'needle_dynamics.compiled.axis',
         'needle_dynamics.compiled.cut',
+        'needle_dynamics.compiled.cutting_needle',
         'needle_dynamics.compiled.force_sensor',
         'needle_dynamics.compiled.friction',
         'needle_dynamics.compiled.integrals',

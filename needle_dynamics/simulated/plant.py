@@ -307,7 +307,7 @@ class Plant:
         start = None
         if base is None:
             wrench = self._felt
-            wrench[:, 1:4] = seen.felt
+            wrench[:, 1:4] = seen.loads
         else:
             # Force and velocity that are recorded together must refer to one instant.
             wrench, start = np.zeros((2, 6))

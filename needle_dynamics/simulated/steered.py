@@ -205,7 +205,7 @@ class SteeredPlant:
         if push is None:
             velocity = base.velocity(self.time, self.depth, insertion.velocity, interval)
             forces = np.empty(self._sensor.samples)
-            insertion.carry(interval, velocity, felt=forces, **across)
+            insertion.carry(interval, velocity, forces=forces, **across)
             self._felt[:, 1] = forces
             return
         self._felt[:, 1] = 0.0

@@ -24,21 +24,19 @@ from collections.abc import Mapping, Sequence
 from math import cos, nan, sin
 from typing import NamedTuple
 
-from needle_controller.compiled.steering import (
+from needle_controller.compiled.guide_plan import choose_guide, hit_probability, reachable_set
+from needle_controller.compiled.hypotheses import (
     BEVEL,
-    chance,
-    choose,
-    expect,
-    FINE,
     FROZEN,
     LOST,
     MISSING,
-    reach,
+    predict,
     SAME,
-    see,
     Steering,
     STEP,
     TURNS,
+    update,
+    VALID,
     weights,
 )
 from needle_controller.steering.law import (
@@ -178,7 +176,7 @@ class MultiHypothesisLaw:
             responses=model.responses,
             limit=float(limit),
             load_limit=float(limits.load_limit),
-            ways=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
+            ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
             covariance=covariance,
@@ -189,7 +187,7 @@ class MultiHypothesisLaw:
             last=np.full(2, nan),
             counts=np.array([0, turns, 0, 0, 0]),
         )
-        self._held = Boxed(self._now)
+        self._boxed = Boxed(self._now)
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
@@ -260,18 +258,18 @@ class MultiHypothesisLaw:
             Mean and covariance over all hypotheses.
 
         """
-        x, z, xx, xz, zz = expect(self._held, range(self._model.steps + 1)[at])
+        x, z, xx, xz, zz = predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
     def chance(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
-        return chance(self._held)
+        return hit_probability(self._boxed)
 
     @property
     def reach(self) -> Reach:
         """Reachable set of the tip."""
-        middles, sizes, _ = reach(self._held)
+        middles, sizes, _ = reachable_set(self._boxed)
         return Reach(middles, sizes, self.weights)
 
     def status(self) -> Mapping[str, float]:
@@ -336,8 +334,8 @@ class MultiHypothesisLaw:
             raise ShapeError(f'a tip measurement must be x and z, got shape {seen.shape}')
         x, z = seen.tolist()
         variance = max(self._model.prior.noise, noise) ** 2
-        kind, off_x, off_z = see(self._held, at, x, z, variance)
-        if kind == FINE:
+        kind, off_x, off_z = update(self._boxed, at, x, z, variance)
+        if kind == VALID:
             return
         if kind == LOST:
             missing = self._now.counts[MISSING]
@@ -369,4 +367,4 @@ class MultiHypothesisLaw:
 
     def _choose(self) -> complex:
         """Return the next position of the guide, x + i z [m]."""
-        return choose(self._held)
+        return choose_guide(self._boxed)
