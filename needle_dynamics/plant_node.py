@@ -281,7 +281,7 @@ class PlantNode(ModelNode):
 
     # Services.
 
-    def _answer(self, response: Any, what: str, act: Callable[[PlantRun], str]) -> Any:
+    def _answer(self, response: Any, request: str, act: Callable[[PlantRun], str]) -> Any:
         """Execute a service request, or report the reason for its rejection."""
         try:
             if self._run is None or not self.is_active:
@@ -289,7 +289,7 @@ class PlantNode(ModelNode):
             response.message = act(self._run)
             response.success = True
         except (JobError, ParameterError) as error:
-            response.message = f'{what} refused: {error}'
+            response.message = f'{request} refused: {error}'
         self.publish_diagnostics()
         return response
 

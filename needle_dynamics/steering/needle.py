@@ -321,6 +321,8 @@ class SteeredNeedle:
 
         """
         now = self._placement
+        if guide is None and tilt is None and roll is None and tissue is None:
+            return now
         shift = now.tissue if tissue is None else _numbers('tissue', tissue, 3)
         if self.steering.free_length + shift[1] < 0.0 or self.depth < shift[1]:
             raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
