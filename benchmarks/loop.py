@@ -121,7 +121,7 @@ class Loop:
         self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.run.commands.count_commanders(self.publishers['wrench_command'])
         self.depth = self.run.plant.depth
-        self.acting = self.run.commands.held.force
+        self.acting = self.run.commands.acting.force
 
     def _written(self, name: str, sent: Sent) -> bytes:
         topic, _ = self._ends[name]

@@ -74,7 +74,11 @@ class SteeringNode(CompiledNode):
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
 
-    KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.superposition')
+    KERNELS = (
+        'needle_controller.compiled.guide_plan',
+        'needle_controller.compiled.hypotheses',
+        'needle_dynamics.compiled.superposition',
+    )
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('steering', **node_options)

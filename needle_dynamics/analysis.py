@@ -14,15 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_dynamics.linearization import linearize, LinearSystem, operating_point
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import ShapeError
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-ComplexArray = NDArray[np.complex128]
+from numpy.typing import ArrayLike
 
 #: Relative tolerance of the rank decision, in natural units.
 RANK_TOLERANCE: Final = 1e-10
@@ -30,39 +28,19 @@ RANK_TOLERANCE: Final = 1e-10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
-    """
-    Controllable or observable part of the state space.
+    """Controllable or observable part of the state space."""
 
-    Attributes
-    ----------
-    order : int
-        Number of states N.
-    rank : int
-        Dimension of the controllable or observable part.
-    lost : tuple of str
-        States that are entirely uncontrollable or unobservable.
-    combined : tuple of str
-        States of which only combinations are lost.
-    eigenvalues : ndarray, shape (N,)
-        Eigenvalues of A, in its unit of time.
-    distances : ndarray, shape (N,)
-        Smallest singular value of the PBH pencil at each eigenvalue.
-    margin : float
-        Least distance within the controllable or observable part: the perturbation that reduces
-        the rank further.
-    weakest : str
-        Leading state of the direction with the least margin.
-
-    """
-
-    order: int
-    rank: int
-    lost: tuple[str, ...]
-    combined: tuple[str, ...]
-    eigenvalues: ComplexArray
+    order: int  #: number of states N
+    rank: int  #: dimension of the controllable or observable part
+    lost: tuple[str, ...]  #: states that are entirely uncontrollable or unobservable
+    combined: tuple[str, ...]  #: states of which only combinations are lost
+    eigenvalues: ComplexArray  #: eigenvalues of A, in its unit of time, shape (N,)
+    #: Smallest singular value of the PBH pencil at each eigenvalue, shape (N,).
     distances: FloatArray
+    #: Least distance within the controllable or observable part: the perturbation that reduces the
+    #: rank further.
     margin: float
-    weakest: str
+    weakest: str  #: leading state of the direction with the least margin
 
     @property
     def deficiency(self) -> int:
@@ -125,11 +103,11 @@ def controllability(
     return Structure(
         order=order,
         rank=kept.shape[1],
-        lost=tuple(name for name, held in zip(names, reached, strict=True) if not held),
+        lost=tuple(name for name, whole in zip(names, reached, strict=True) if not whole),
         combined=tuple(
             name
-            for name, held, mixed in zip(names, reached, involved, strict=True)
-            if held and mixed
+            for name, whole, mixed in zip(names, reached, involved, strict=True)
+            if whole and mixed
         ),
         eigenvalues=eigenvalues,
         distances=distances,
@@ -247,35 +225,20 @@ def analyze(system: LinearSystem) -> Analysis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllabilityMap:
-    """
-    Results of `Analysis` over depth and tip deflection.
+    """Results of `Analysis` over depth and tip deflection."""
 
-    Attributes
-    ----------
-    parameters : NeedleParameters
-        Constants.
-    velocity : float
-        Insertion velocity [m/s].
-    depths, deflections : ndarray, shapes (I,) and (J,)
-        Insertion depths and tip deflections [m].
-    rank, distance : ndarray, shape (I, J)
-        State controllability: rank, and distance to a loss of rank.
-    observed_rank, observed_margin : ndarray, shape (I, J)
-        Observability: rank, and distance to a further loss of rank.
-    output_gain : ndarray, shape (I, J)
-        Tip deflection per base travel.
-
-    """
-
-    parameters: NeedleParameters
-    velocity: float
+    parameters: NeedleParameters  #: constants
+    velocity: float  #: insertion velocity [m/s]
+    #: Insertion depths, shape (I,), and tip deflections, shape (J,) [m].
     depths: FloatArray
     deflections: FloatArray
+    #: State controllability: rank, and distance to a loss of rank, shape (I, J).
     rank: FloatArray
     distance: FloatArray
+    #: Observability: rank, and distance to a further loss of rank, shape (I, J).
     observed_rank: FloatArray
     observed_margin: FloatArray
-    output_gain: FloatArray
+    output_gain: FloatArray  #: tip deflection per base travel, shape (I, J)
 
 
 def controllability_map(

@@ -268,11 +268,13 @@ class NeedleModel(NeedleStatics):
         layer, layers = tissue.layer(now.depth), self.layers
         integrals = np.array([now.at.area, now.at.moment])
         above = np.array([layers.area[layer], layers.moment[layer]])
-        held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
+        elastic = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
         # The entering part carries the momentum of the tip, with the depth as lever arm.
         entering = -now.d_rate * (now.at.value @ now.rate) * np.array([1.0, now.depth])
         inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
-        lateral, about_entry = inertia + held @ now.modal + p.tissue_damping * integrals @ now.rate
+        lateral, about_entry = (
+            inertia + elastic @ now.modal + p.tissue_damping * integrals @ now.rate
+        )
         axial = force + p.carriage_mass * acceleration[0]
         return np.array([axial, lateral, about_entry + now.state[0] * lateral + torque])
 

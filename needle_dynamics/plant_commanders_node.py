@@ -8,15 +8,16 @@ from time import monotonic_ns
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.publishers_node import Publishers
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import NANOSECONDS, RateCounter
 from needle_ros.wire import Reading
 
 
 class PlantCommanders:
     """
-    Subscribe to `wrench_command` and `joint_commands`, and count their publishers.
+    Subscribe to `wrench_command` and `joint_commands`, and count commands and publishers.
 
-    `on_change` is called when publishers appear or disappear; see `BaseNode.listen`.
+    `on_change` is called when publishers appear or disappear; see `BaseNode.listen`. ``rate`` is
+    the rate of the commands.
     """
 
     def __init__(
@@ -32,6 +33,8 @@ class PlantCommanders:
         self._joints = node.listen(contract.JOINT_COMMANDS, on_joints, on_change)
         #: Number of publishers matched by DDS, including stale entries, and time of change [ns].
         self._matched, self._matched_at = 0, 0
+        #: On a steady clock.
+        self.rate = RateCounter()
 
     def _count_matched(self) -> tuple[int, int]:
         """Return the publishers of each topic matched by DDS, including stale entries."""
@@ -42,9 +45,9 @@ class PlantCommanders:
         """Whether publishers appeared or disappeared since the last `update`."""
         return sum(self._count_matched()) != self._matched
 
-    def update(self, came: int) -> bool:
+    def update(self, new: int) -> bool:
         """
-        Update the matched publishers after `came` new ones.
+        Update the matched publishers after the appearance of ``new`` publishers.
 
         Return whether there may have been several, if only while this process was blocked.
         """
@@ -52,7 +55,7 @@ class PlantCommanders:
         if matched != before:
             self._matched, self._matched_at = matched, monotonic_ns()
         several = max(before, matched) > 1
-        return bool((several and matched != before) or (before and came))
+        return bool((several and matched != before) or (before and new))
 
     def count(self) -> int:
         """Return the number of live publishers."""

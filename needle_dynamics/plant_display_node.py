@@ -18,6 +18,9 @@ from visualization_msgs.msg import Marker
 _WIDTH: Final = 1e-3
 _PATH_WIDTH: Final = 5e-4
 
+#: Rate of the messages [Hz].
+_RATE: Final = 30.0
+
 
 def time_message(stamp: int) -> TimeMessage:
     """Convert a stamp [ns] to a message."""
@@ -35,9 +38,9 @@ def _line(name: str, width: float, shade: float) -> Marker:
     return line
 
 
-def _transform(seen: MeasuredShape, stamp: int) -> TransformStamped:
+def _transform(shape: MeasuredShape, stamp: int) -> TransformStamped:
     """Return the transform from the base to the tip."""
-    (x, y, z), (i, j, k, w) = seen.tip
+    (x, y, z), (i, j, k, w) = shape.tip
     made = TransformStamped(child_frame_id=contract.TIP)
     made.header.frame_id, made.header.stamp = contract.BASE, time_message(stamp)
     made.transform.translation = Vector3(x=x, y=y, z=z)
@@ -58,6 +61,10 @@ class PlantDisplay:
         self._poses = PoseArray()
         self._poses.header.frame_id = contract.ENTRY
 
+    def begin(self, rate: float) -> None:
+        """Restart the count of samples, of which there are ``rate`` per second [Hz]."""
+        self._samples, self._every = 0, max(1, round(rate / _RATE))
+
     def offer_transform(self, mode: str) -> None:
         """Create the publisher of transforms, or raise ParameterError if that is not possible."""
         try:
@@ -74,26 +81,29 @@ class PlantDisplay:
             self._tf = None
 
     def publish(self, plant: SimulatedPlant, stamp: int) -> None:
-        """Publish the shape of the needle from base to tip, and the path that it cut."""
+        """Publish the shape of the needle from base to tip, and the path that it cut, if due."""
+        self._samples += 1
+        if self._samples % self._every:
+            return
         lines = self._needle_shape.get_subscription_count()
         poses = self._needle_poses.get_subscription_count()
         wanted = lines or poses or self._tf is not None
-        seen = plant.outline() if wanted else None
-        if seen is None:
+        shape = plant.outline() if wanted else None
+        if shape is None:
             return
         if self._tf is not None:
             kind: Any = self._tf.msg_type
-            self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
+            self._tf.publish(kind(transforms=[_transform(shape, stamp)]))
         if lines:
-            self._publish_line(self._shape, [seen.base.tolist(), *seen.points.tolist()], stamp)
-            if len(seen.path):
-                self._publish_line(self._path, seen.path.tolist(), stamp)
+            self._publish_line(self._shape, [shape.base.tolist(), *shape.points.tolist()], stamp)
+            if len(shape.path):
+                self._publish_line(self._path, shape.path.tolist(), stamp)
         if poses:
             self._poses.header.stamp = time_message(stamp)
             self._poses.poses = [
                 Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
                 for (x, y, z), (i, j, k, w) in zip(
-                    seen.points.tolist(), seen.turns.tolist(), strict=True
+                    shape.points.tolist(), shape.turns.tolist(), strict=True
                 )
             ]
             self._needle_poses.publish(self._poses)

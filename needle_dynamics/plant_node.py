@@ -10,7 +10,7 @@ from typing import Any
 
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.plant_commanders_node import PlantCommanders
-from needle_dynamics.plant_display_node import PlantDisplay, time_message
+from needle_dynamics.plant_display_node import PlantDisplay
 from needle_dynamics.plant_reports_node import SampleReports
 from needle_dynamics.plant_samples_node import SamplePublishers
 from needle_dynamics.plant_trajectories_node import PlantTrajectories
@@ -24,27 +24,22 @@ from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, PlantPhase, PlantStatus
-from needle_ros.timing import NANOSECONDS, RateCounter
+from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
 from rclpy.clock_type import ClockType
-from rclpy.publisher import Publisher
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 #: Period of the graph checks [s]; number of checks after which an unanswered sample is repeated,
 #: and after which the missing answer is reported.
-_WATCH = 0.1
+_CHECK = 0.1
 _REPEAT, _LONG = 5, 20
 
 #: Commands per sample above which a warning is reported.
 _TOO_MANY = 3.0
 
 _NO_FAULT = 'none'
-
-#: Rate of the visualization messages [Hz].
-_PICTURES = 30.0
 
 
 def _exhausted(plant_run: PlantRun) -> str:
@@ -92,6 +87,7 @@ class PlantNode(ModelNode):
     KERNELS = (
         'needle_dynamics.compiled.axis',
         'needle_dynamics.compiled.cut',
+        'needle_dynamics.compiled.cutting_needle',
         'needle_dynamics.compiled.force_sensor',
         'needle_dynamics.compiled.friction',
         'needle_dynamics.compiled.integrals',
@@ -137,19 +133,14 @@ class PlantNode(ModelNode):
         #: Number of samples taken before the latest configuration.
         self._number = 0
         self._halted: str | None = None
-        #: Graph checks during which the same sample has waited for its answers, and its stamp.
-        self._looks = 0
-        self._awaited: int | None = None
-        self._sampled = self._made_up = 0
-        #: On a steady clock.
-        self._command_rate, self._sample_rate = RateCounter(), RateCounter()
+        #: Number of samples computed later than due.
+        self._late = 0
 
         offer_lease(self, contract.MEASURER)
         self._samples = SamplePublishers(self)
         self._display = PlantDisplay(self)
-        self._clock_topic: Publisher | None = None
         self._commanders = PlantCommanders(
-            self, self._on_command, self._on_joint_commands, self._look_who_commands
+            self, self._on_command, self._on_joint_commands, self._check_commanders
         )
         self._trajectories = PlantTrajectories(
             self, lambda: self._time.simulated(self.now()), self._follow
@@ -178,12 +169,11 @@ class PlantNode(ModelNode):
         # Load or compile functions before the first sample.
         constants.make().take(0.0, 0.0)
         self._samples.configure(plant_run)
-        self._patience = 0.25 * own.backlog * NANOSECONDS
         if self.get_parameter('publish_tf').value:
             self._display.offer_transform(constants.mode)
         self._run = plant_run
         if publishes:
-            self._clock_topic = self.publisher(contract.CLOCK, always=True)
+            self._samples.offer_clock()
         # With simulated time, the plant waits for recorders.
         recorded = publishes or own.real_time_factor != 1.0
         self._reports.configure(self._time, processed=lockstep, recorded=recorded)
@@ -194,9 +184,7 @@ class PlantNode(ModelNode):
         if self._run is not None:
             self._number = self._run.number
         self._run = None
-        if self._clock_topic is not None:
-            self.destroy_publisher(self._clock_topic)
-            self._clock_topic = None
+        self._samples.cleanup()
         self._display.cleanup()
         self._trajectories.cleanup()
         self._reports.cleanup()
@@ -224,17 +212,18 @@ class PlantNode(ModelNode):
         if self._run is None:
             return
         self._halted = None
-        self._sampled = self._made_up = 0
+        self._late = 0
         self._samples.begin()
         self._run.begin()
-        self._look_who_commands()
+        self._check_commanders()
         own = self._run.constants.own
-        #: Samples between two visualization messages.
-        self._picture = max(1, round(own.rate * max(1.0, own.real_time_factor) / _PICTURES))
+        self._display.begin(own.rate * max(1.0, own.real_time_factor))
         self._time.begin(self.now(), paused=bool(self.get_parameter('paused').value))
-        self._timer = self.create_timer(self._time.tick, self._on_timer)
         steady = NodeClock(clock_type=ClockType.STEADY_TIME)
-        self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)
+        self._active_timers = (
+            self.create_timer(self._time.tick, self._on_timer),
+            self.create_timer(_CHECK, self._on_check, clock=steady),
+        )
 
     def about(self) -> str:
         """Describe mode, constants, rate and topics."""
@@ -253,8 +242,8 @@ class PlantNode(ModelNode):
 
     def deactivate(self) -> None:
         """Stop sampling."""
-        self.destroy_timer(self._timer)
-        self.destroy_timer(self._watch)
+        for timer in self._active_timers:
+            self.destroy_timer(timer)
 
     # Commands.
 
@@ -273,10 +262,10 @@ class PlantNode(ModelNode):
         plant_run = self._run
         if plant_run is None or not self.is_active:
             return
-        self._command_rate.add(monotonic_ns())
+        self._commanders.rate.add(monotonic_ns())
         if self._commanders.changed:
             # The match event may be pending: no command of a second node may act.
-            self._look_who_commands()
+            self._check_commanders()
         counts, complaint = offer(plant_run, self._time.simulated(self.now()))
         if complaint:
             self.get_logger().error(printable(complaint), throttle_duration_sec=1.0)
@@ -292,7 +281,7 @@ class PlantNode(ModelNode):
 
     # Services.
 
-    def _answer(self, response: Any, what: str, act: Callable[[PlantRun], str]) -> Any:
+    def _answer(self, response: Any, request: str, act: Callable[[PlantRun], str]) -> Any:
         """Execute a service request, or report the reason for its rejection."""
         try:
             if self._run is None or not self.is_active:
@@ -300,7 +289,7 @@ class PlantNode(ModelNode):
             response.message = act(self._run)
             response.success = True
         except (JobError, ParameterError) as error:
-            response.message = f'{what} refused: {error}'
+            response.message = f'{request} refused: {error}'
         self.publish_diagnostics()
         return response
 
@@ -342,34 +331,32 @@ class PlantNode(ModelNode):
 
     def _on_timer(self) -> None:
         """Take all due samples, each stamped with its own time."""
+        if self._run is None:
+            return
         due = self._time.due(self.now())
-        self._made_up += max(0, due - 1)
-        end = monotonic_ns() + self._patience
+        self._late += max(0, due - 1)
+        end = monotonic_ns() + 0.25 * self._run.constants.own.backlog * NANOSECONDS
         for _ in range(due):
             self._sample(self._time.take())
             if monotonic_ns() > end:
                 # Commands are waiting: they must not become too old on an overloaded machine.
                 break
 
-    def _on_watch(self) -> None:
+    def _on_check(self) -> None:
         """Check for command publishers, and repeat a sample that is not answered."""
         if self._run is None:
             return
-        self._look_who_commands()
+        self._check_commanders()
         self._trajectories.publish_answers()
-        awaited, before = self._time.awaited, self._awaited
-        self._looks = self._looks + 1 if awaited is not None and awaited == before else 0
-        self._awaited = awaited
-        if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
-            if self._clock_topic is not None:
-                # An older clock message may have arrived late: the sample would be ahead of time.
-                self._clock_topic.publish(Clock(clock=time_message(self._samples.newest)))
+        self._reports.check()
+        checks = self._reports.checks
+        if checks and checks % _REPEAT == 0 and not self._time.paused:
             self._samples.repeat()
         self.report_change()
 
-    def _look_who_commands(self, came: int = 0) -> None:
+    def _check_commanders(self, new: int = 0) -> None:
         """Count the command publishers; no force acts while there are several."""
-        several = self._commanders.update(came)
+        several = self._commanders.update(new)
         if self._run is None:
             return
         # A publisher may have appeared and disappeared while this process was blocked.
@@ -386,9 +373,7 @@ class PlantNode(ModelNode):
     def _sample(self, stamp: int) -> None:
         """Take a sample and publish it."""
         plant_run = self._run
-        if self._clock_topic is not None:
-            # Published before the sample, so that subscribers have the time of the sample.
-            self._clock_topic.publish(Clock(clock=time_message(stamp)))
+        self._samples.publish_clock(stamp)
         if plant_run is None or self._halted is not None:
             return
         was_exhausted = plant_run.commands.exhausted
@@ -399,15 +384,12 @@ class PlantNode(ModelNode):
             self.get_logger().error(f'{error}; the plant has stopped')
             self.report_change()
             return
-        self._sampled += 1
-        self._sample_rate.add(monotonic_ns())
         if plant_run.commands.exhausted and not was_exhausted:
             self.get_logger().error(_exhausted(plant_run), throttle_duration_sec=1.0)
         events = plant_run.events()
         if events:
             self._samples.publish_events(events, stamp, plant_run.number)
-        if self._sampled % self._picture == 0:
-            self._display.publish(plant_run.plant, stamp)
+        self._display.publish(plant_run.plant, stamp)
         self._samples.publish(stamp, measured)
 
     @property
@@ -420,17 +402,17 @@ class PlantNode(ModelNode):
 
     def _status(self, plant_run: PlantRun) -> PlantStatus:
         clock, given, now = self._time, plant_run.commands, monotonic_ns()
-        late, samples = self._looks >= _LONG, self._samples
+        late, samples = self._reports.checks >= _LONG, self._samples
         return replace(
             plant_run.plant.report,
             phase=self._phase,
             halt=self._halted or '',
             time=clock.stamp / NANOSECONDS,
-            real_time_factor=self._sample_rate.rate(now) / plant_run.constants.own.rate,
-            command_rate=self._command_rate.rate(now),
+            real_time_factor=samples.rate.rate(now) / plant_run.constants.own.rate,
+            command_rate=self._commanders.rate.rate(now),
             commanders=given.duplicates + 1 if given.duplicates else 0,
             exhausted=given.exhausted,
-            computed_later=self._made_up,
+            computed_later=self._late,
             skipped=clock.lost,
             waited=clock.waited / NANOSECONDS,
             awaited=clock.missing if late else '',

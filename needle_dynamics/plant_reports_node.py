@@ -15,19 +15,25 @@ from std_msgs.msg import Header
 
 
 class SampleReports:
-    """Pass the reports to a clock; `advance` takes the samples that are due afterwards."""
+    """
+    Pass the reports to a clock; `advance` takes the samples that are due afterwards.
+
+    ``checks`` counts the successive checks at which the same sample has waited for its answers.
+    """
 
     def __init__(self, node: BaseNode, advance: Callable[[], None]) -> None:
         self._node, self._advance = node, advance
         self._subscriptions: list[Subscription] = []
+        self.checks = 0
+        self._awaited: int | None = None
 
     def configure(self, clock: SampleClock, *, processed: bool, recorded: bool) -> None:
         """Subscribe to the reports of processed samples, of recorded samples, or both."""
         self._clock = clock
         if processed:
-            self._hear(contract.PROCESSED, self._on_processed, self._on_participant)
+            self._subscribe(contract.PROCESSED, self._on_processed, self._on_participant)
         if recorded:
-            self._hear(contract.RECORDED, self._on_recorded, self._on_recorder)
+            self._subscribe(contract.RECORDED, self._on_recorded, self._on_recorder)
 
     def cleanup(self) -> None:
         """Unsubscribe."""
@@ -35,7 +41,13 @@ class SampleReports:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
 
-    def _hear(
+    def check(self) -> None:
+        """Count the checks of the sample that waits for its answers."""
+        awaited, before = self._clock.awaited, self._awaited
+        self.checks = self.checks + 1 if awaited is not None and awaited == before else 0
+        self._awaited = awaited
+
+    def _subscribe(
         self, topic: contract.Topic, take: Callable[[Header], None], matched: Callable[[Any], None]
     ) -> None:
         events = SubscriptionEventCallbacks(matched=matched)

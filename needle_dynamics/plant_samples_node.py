@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 import json
 from math import ceil
+from time import monotonic_ns
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.plant_display_node import time_message
@@ -15,12 +16,17 @@ from needle_dynamics.simulated.measured import Measurement
 from needle_dynamics.simulated.run import Event, PlantRun
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import NANOSECONDS, RateCounter
 from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
 
 
 class SamplePublishers:
-    """Publishers of all measurements, with the fault of one of them, and of the events."""
+    """
+    Publishers of all measurements, with the fault of one of them, of the events and of the time.
+
+    ``rate`` is the rate of the samples, ``saturated`` counts saturated values of the force sensor.
+    """
 
     def __init__(self, node: BaseNode) -> None:
         streams = (
@@ -29,13 +35,16 @@ class SamplePublishers:
         )  # fmt: skip
         self._streams = {topic.name: node.publisher(topic) for topic in streams}
         self._events = node.publisher(contract.EVENTS)
-        self._name = node.get_fully_qualified_name()
+        self._clock: Publisher | None = None
+        self._node = node
         #: Publish functions for the values of a sample, by topic.
         self._publish: dict[str, Callable[[int, list[float]], None]] = {}
         #: Fault, and topic of the sensor with the fault.
         self.fault: SensorFault | None = None
         self.faulty = ''
         self.saturated = 0
+        #: On a steady clock.
+        self.rate = RateCounter()
 
     def configure(self, plant_run: PlantRun) -> None:
         """Publish the measurements of a plant."""
@@ -52,6 +61,16 @@ class SamplePublishers:
         #: Stamps of the latest samples, for measurements that are published with a delay.
         self._stamps: deque[int] = deque(maxlen=ceil(constants.tip.delay * rate) + 1)
 
+    def offer_clock(self) -> None:
+        """Create the publisher of the time."""
+        self._clock = self._node.publisher(contract.CLOCK, always=True)
+
+    def cleanup(self) -> None:
+        """Destroy the publisher of the time."""
+        if self._clock is not None:
+            self._node.destroy_publisher(self._clock)
+            self._clock = None
+
     @property
     def topics(self) -> tuple[str, ...]:
         """Names of the published topics."""
@@ -61,8 +80,14 @@ class SamplePublishers:
         """Restart the count of saturated values of the force sensor."""
         self.saturated = 0
 
+    def publish_clock(self, stamp: int) -> None:
+        """Publish the time, before its sample: subscribers then have the time of the sample."""
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=time_message(stamp)))
+
     def publish(self, stamp: int, measured: list[Measurement]) -> None:
         """Publish a sample."""
+        self.rate.add(monotonic_ns())
         for value, limit in zip(measured[0][2], self._full_scale, strict=True):
             if abs(value) >= limit:
                 self.saturated += 1
@@ -79,14 +104,11 @@ class SamplePublishers:
                 for late, left in fault.leaves(at, values, FAULTY[topic]):
                     publish[topic](late, left)
 
-    @property
-    def newest(self) -> int:
-        """Stamp of the newest sample [ns]."""
-        return self._last[0]
-
     def repeat(self) -> None:
         """Publish the newest `joint_states` again."""
         stamp, (topic, _, values) = self._last
+        # An older clock message may have arrived late: the sample would be ahead of time.
+        self.publish_clock(stamp)
         self._publish[topic](stamp, values)
 
     def publish_events(self, events: list[Event], stamp: int, number: int) -> None:
@@ -97,7 +119,7 @@ class SamplePublishers:
             values = {'sample': number, **content}
             array.status.append(
                 DiagnosticStatus(
-                    name=self._name,
+                    name=self._node.get_fully_qualified_name(),
                     message=kind,
                     values=[
                         KeyValue(key=key, value=json.dumps(value)) for key, value in values.items()

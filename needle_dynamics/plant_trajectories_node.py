@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
+from needle_dynamics.simulated.joint_commands import moved_joints
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import ParameterError, printable
@@ -14,15 +15,6 @@ from needle_ros.timing import nanoseconds, seconds
 from needle_ros.trajectories import MOST_POINTS
 from rclpy.subscription import Subscription
 from trajectory_msgs.msg import JointTrajectory
-
-
-def _moved_joints(mode: str, *, steered: bool) -> tuple[str, ...]:
-    """Return the joints that follow trajectories."""
-    if mode == 'indenter':
-        return PRESS_JOINTS
-    insertion = (contract.INSERTION,) if mode == 'robot' else ()
-    guide = tuple(joint.name for joint in contract.STEERING_JOINTS) if steered else ()
-    return (*insertion, *guide)
 
 
 class PlantTrajectories:
@@ -47,11 +39,12 @@ class PlantTrajectories:
 
     def configure(self, mode: str, *, steered: bool) -> None:
         """Subscribe, if any joint follows trajectories."""
-        if mode != 'simulation' or steered:
-            # In mode `simulation`, `insertion` is the reference of a controller.
+        # In mode `simulation`, `insertion` is the reference of a controller.
+        is_indenter = mode == 'indenter'
+        self._moved = PRESS_JOINTS if is_indenter else moved_joints(mode, steered=steered)
+        if self._moved:
             topic = contract.JOINT_TRAJECTORY
             self._subscription = self._node.subscribe(topic, self._on_trajectory)
-            self._moved = _moved_joints(mode, steered=steered)
             self.requests = RequestLog({topic: self._moved})
 
     def cleanup(self) -> None:

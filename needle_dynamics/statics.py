@@ -114,8 +114,8 @@ class NeedleStatics:
     def _stiffness(self, at: ModeIntegrals, depth: float, time: float) -> FloatArray:
         tissue, layer = self.tissue, self.tissue.layer(depth)
         above = self.layers.gram[layer]
-        held = tissue.growth(time) * (tissue.stiffnesses[layer] * at.gram + above)
-        return np.asarray(self.parameters.bending_stiffness * at.curvature_gram + held)
+        elastic = tissue.growth(time) * (tissue.stiffnesses[layer] * at.gram + above)
+        return np.asarray(self.parameters.bending_stiffness * at.curvature_gram + elastic)
 
     def state_at(
         self, depth: float, tip_deflection: float = 0.0, modal: Sequence[float] = ()

@@ -44,10 +44,8 @@ MAY_IMPORT = {
     },
     'tools': set(),
 }
-#: Largest number of lines of a file, and files with a reason for more.
+#: Largest number of lines of a file.
 MOST_LINES = 500
-#: Compiled functions that call each other and share their arguments.
-LONGER = {'needle_controller/compiled/steering.py', 'needle_dynamics/compiled/cut.py'}
 #: Packages without nodes.
 NO_NODES = {'needle_study'}
 #: These packages may import any external package.
@@ -212,9 +210,8 @@ def test_names_of_public_classes_are_unique() -> None:
 
 
 def test_files_are_short() -> None:
-    """One concept per file; an exception that is short enough again must be removed."""
-    found = long_files(sources())
-    assert {line.partition(':')[0] for line in found} == LONGER, '\n'.join(found)
+    """One concept per file."""
+    assert long_files(sources()) == []
 
 
 def test_no_file_mentions_a_forbidden_word() -> None:

@@ -8,6 +8,7 @@ Compiled functions of control laws, closed loops, observer and steering controll
 `bending`             bending at a frozen depth, in the coordinates of the observer
 `kalman`              steps of the Kalman filter
 `filter`              observer: filter and its history
-`steering`            steering controller: measurement update and plan
+`hypotheses`          steering controller: hypotheses, and their update by tip measurements
+`guide_plan`          steering controller: reachable set, and next position of the guide
 ====================  ============================================================================
 """

@@ -21,32 +21,14 @@ import numpy as np
 
 
 class Frozen(NamedTuple):
-    """
-    Needle constants and modes at a frozen depth.
+    """Needle constants and modes at a frozen depth."""
 
-    Attributes
-    ----------
-    depth : float
-        Insertion depth [m].
-    growth : float
-        Stiffness factor of swelling.
-    layer : int
-        Index of the layer that contains the tip.
-    stiffness : float
-        Stiffness of the tissue at the tip [N/m^2].
-    at : ModeIntegrals
-        Shape modes and their integrals.
-    modes : NormalModes
-        Normal modes.
-
-    """
-
-    depth: float
-    growth: float
-    layer: int
-    stiffness: float
-    at: ModeIntegrals
-    modes: NormalModes
+    depth: float  #: insertion depth [m]
+    growth: float  #: stiffness factor of swelling
+    layer: int  #: index of the layer that contains the tip
+    stiffness: float  #: stiffness of the tissue at the tip [N/m^2]
+    at: ModeIntegrals  #: shape modes and their integrals
+    modes: NormalModes  #: normal modes
 
 
 @inlined
@@ -89,11 +71,7 @@ def _means(rate: float, since: float, until: float) -> tuple[float, float]:
 
 @inlined
 def change_basis(
-    old: NormalModes,
-    new: NormalModes,
-    since: float,
-    until: float,
-    change: FloatArray,
+    old: NormalModes, new: NormalModes, since: float, until: float, change: FloatArray
 ) -> None:
     """
     Compute the change of c and b from the normal modes of one depth to the modes of another depth.
@@ -158,13 +136,13 @@ def base_impulse(needle: CompiledNeedle, f: Frozen, velocity: float, rows: Float
                 tip += f.at.value[i] * f.modes.shapes[i, k]
             entering -= rho * rho * velocity * area * tip
         for k in range(n):
-            inertia, held, carried = 0.0, 0.0, 0.0
+            inertia, elastic, carried = 0.0, 0.0, 0.0
             for i in range(n):
                 shape = f.modes.shapes[i, k]
                 inertia += rho * weight[i] * shape
-                held += (f.stiffness * weight[i] + f.growth * extra[f.layer, i]) * shape
+                elastic += (f.stiffness * weight[i] + f.growth * extra[f.layer, i]) * shape
                 carried += (damping * weight[i] + entering * f.at.value[i]) * shape
-            compliance = held / f.modes.squares[k]
+            compliance = elastic / f.modes.squares[k]
             rows[channel, k] = (carried - compliance * rate) / sqrt(f.modes.squares[k])
             rows[channel, n + k] = inertia - compliance
     outside = needle.length - f.depth
@@ -191,10 +169,10 @@ def tip_response(needle: CompiledNeedle, f: Frozen, rest: FloatArray, direct: Fl
     for channel in range(2):
         direct[channel] = -arms[channel]
         for k in range(n):
-            held = 0.0
+            elastic = 0.0
             for i in range(n):
                 tissue = f.stiffness * integrals[channel][i]
                 tissue += f.growth * above[channel][f.layer, i]
-                held += tissue * f.modes.shapes[i, k]
-            direct[channel] += held / sqrt(f.modes.squares[k]) * rest[k]
+                elastic += tissue * f.modes.shapes[i, k]
+            direct[channel] += elastic / sqrt(f.modes.squares[k]) * rest[k]
     direct[1] += (needle.length - f.depth) * direct[0]

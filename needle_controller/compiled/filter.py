@@ -43,29 +43,13 @@ SAMPLE = np.dtype(
 
 
 class LowPass(NamedTuple):
-    """
-    Low-pass of a channel of the wrench with f entries: its memory and its reading.
+    """Low-pass of a channel of the wrench with f entries: its memory and its reading."""
 
-    Attributes
-    ----------
-    ticks : int
-        Samples of the force sensor in a sample of the filter.
-    transition : ndarray, shape (f, f)
-        Transition over a sample of the filter.
-    noise : ndarray, shape (2, f, f)
-        Covariance of the noise over a sample, for force and moment.
-    response : ndarray, shape (ticks, f)
-        Response to a unit input after a number of ticks.
-    steady : ndarray, shape (f,)
-        Steady response to a constant unit input.
-
-    """
-
-    ticks: int
-    transition: Matrix
-    noise: Array3
-    response: Matrix
-    steady: Vector
+    ticks: int  #: samples of the force sensor in a sample of the filter
+    transition: Matrix  #: transition over a sample of the filter, shape (f, f)
+    noise: Array3  #: covariance of the noise over a sample, for force and moment, shape (2, f, f)
+    response: Matrix  #: response to a unit input after a number of ticks, shape (ticks, f)
+    steady: Vector  #: steady response to a constant unit input, shape (f,)
 
 
 #: Entries of the state after c and b of the modes: lateral force at the tip [N], and the offsets
@@ -74,76 +58,40 @@ LOADS: Final = 3
 
 
 class Noise(NamedTuple):
-    """
-    Noise model of the filter.
+    """Noise model of the filter."""
 
-    Attributes
-    ----------
-    force : float
-        Spectral density of the distributed lateral force [N^2 s/m].
-    prior : float
-        Variance of the tip deflection at the start [m^2].
-    tip : float
-        Variance of a sample of the tip deflection [m^2].
-    reading : tuple of float
-        Variances of the readings of lateral force [N^2] and moment [N^2 m^2], behind the low-pass.
-    wrench : tuple of float
-        Variances of their white noise before the low-pass.
-    loads, rates : tuple of float
-        Variances of the `LOADS`, and their decorrelation rates [1/s].
-
-    """
-
-    force: float
-    prior: float
-    tip: float
+    force: float  #: spectral density of the distributed lateral force [N^2 s/m]
+    prior: float  #: variance of the tip deflection at the start [m^2]
+    tip: float  #: variance of a sample of the tip deflection [m^2]
+    #: Variances of the readings of lateral force [N^2] and moment [N^2 m^2], behind the low-pass.
     reading: tuple[float, float]
-    wrench: tuple[float, float]
+    wrench: tuple[float, float]  #: variances of their white noise before the low-pass
+    #: Variances of the `LOADS`, and their decorrelation rates [1/s].
     loads: tuple[float, float, float]
     rates: tuple[float, float, float]
 
 
 class Filter(NamedTuple):
-    """
-    Filter and its history: arrays with one row per stored sample.
+    """Filter and its history: arrays with one row per stored sample."""
 
-    Attributes
-    ----------
-    needle : CompiledNeedle
-        Nominal model of needle and tissue.
-    noise : Noise
-        Noise model.
-    low_pass : LowPass
-        Low-pass of the wrench.
-    samples : ndarray of `SAMPLE`, shape (slots,)
-        Scalars of each sample.
-    states : ndarray, shape (slots, N)
-        State after the sample, see `kalman`.
-    covariances, transitions : ndarray, shape (slots, N, N)
-        Its covariance, and the transition over the sample.
-    shapes, inverses : ndarray, shape (slots, n, n)
-        Normal modes at the mean depth, as in `NormalModes`.
-    squares, tips : ndarray, shape (slots, n)
-        Squares of their frequencies, and their values at the tip.
-    changes : ndarray, shape (slots, 2 n, 2 n)
-        Change of basis from the previous sample.
-    exposures : ndarray, shape (m, 3)
-        Samples of the tip deflection in order: start and end of the exposure [s], mean [m].
-
-    """
-
-    needle: CompiledNeedle
-    noise: Noise
-    low_pass: LowPass
+    needle: CompiledNeedle  #: nominal model of needle and tissue
+    noise: Noise  #: noise model
+    low_pass: LowPass  #: low-pass of the wrench
+    #: Scalars of each sample, see `SAMPLE`, shape (slots,).
     samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]
-    states: Matrix
+    states: Matrix  #: state after the sample, see `kalman`, shape (slots, N)
+    #: Its covariance, and the transition over the sample, shape (slots, N, N).
     covariances: Array3
     transitions: Array3
+    #: Normal modes at the mean depth, as in `NormalModes`, shape (slots, n, n).
     shapes: Array3
     inverses: Array3
+    #: Squares of their frequencies, and their values at the tip, shape (slots, n).
     squares: Matrix
     tips: Matrix
-    changes: Array3
+    changes: Array3  #: change of basis from the previous sample, shape (slots, 2 n, 2 n)
+    #: Samples of the tip deflection in order: start and end of the exposure [s], mean [m],
+    #: shape (m, 3).
     exposures: Matrix
 
 
@@ -159,14 +107,14 @@ def _growth(needle: CompiledNeedle, time: float) -> float:
 
 
 @kernel
-def begin(held: Boxed[Filter], time: float, span: float, depth: float) -> None:
+def begin(boxed: Boxed[Filter], time: float, span: float, depth: float) -> None:
     """
     Write the prior state at a time [s] and insertion depth [m] into the first slot.
 
     All c and b have the same variance, such that the tip has its prior variance. The prior of the
     low-pass memory is a constant and a white wrench of the size that such a needle exerts.
     """
-    f = held.value
+    f = boxed.value
     needle, low_pass = f.needle, f.low_pass
     n, filters = f.squares.shape[1], low_pass.steady.shape[0]
     frozen = freeze(needle, depth, _growth(needle, time), _modes(f, 0))
@@ -372,7 +320,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
 
 @kernel
 def observe(
-    held: Boxed[Filter],
+    boxed: Boxed[Filter],
     count: int,
     old: int,
     new: int,
@@ -389,7 +337,7 @@ def observe(
     ``count`` is the number of valid exposures, ``depth`` [m] and ``velocity`` [m/s] are means over
     the sample, ``lateral`` [N] and ``moment`` [N m] the readings of the wrench, NaN if missing.
     """
-    f = held.value
+    f = boxed.value
     n = f.squares.shape[1]
     before, sample, change = f.samples[old], f.samples[new], f.changes[new]
     growth = _growth(f.needle, time)
@@ -412,9 +360,9 @@ def observe(
 
 
 @kernel
-def replay(held: Boxed[Filter], count: int, oldest: int, newest: int, since: float) -> None:
+def replay(boxed: Boxed[Filter], count: int, oldest: int, newest: int, since: float) -> None:
     """Recompute the slots later than ``since`` [s], the time of changed measurements."""
-    f = held.value
+    f = boxed.value
     slots, slot = f.samples.shape[0], newest
     while slot != oldest and f.samples[slot]['time'] > since:
         slot = slot - 1 if slot > 0 else slots - 1
@@ -426,7 +374,7 @@ def replay(held: Boxed[Filter], count: int, oldest: int, newest: int, since: flo
 
 @kernel
 def estimate(  # noqa: C901
-    held: Boxed[Filter],
+    boxed: Boxed[Filter],
     slot: int,
     depth: float,
     span: float,
@@ -443,7 +391,7 @@ def estimate(  # noqa: C901
     against insertion [N] by the modes below half the sample rate: the estimated rates of faster
     modes are noise, which their square would add to the force.
     """
-    f = held.value
+    f = boxed.value
     needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]
     n = f.squares.shape[1]
     frozen = freeze(needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))

@@ -33,7 +33,7 @@ INTEGRAL, RATE, OFFSET, POSITION, VELOCITY, FOLLOWS = 0, 1, 2, 3, 4, 5
 
 #: Learned friction, for insertion and then for withdrawal; before it a flag and the last measured
 #: position and velocity, valid if the flag is 1.
-SEEN: Final = 6
+MEASURED: Final = 6
 LEARNED: Final = 9
 MEMORY: Final = LEARNED + 2 * BLOCK
 
@@ -42,61 +42,23 @@ _SLIDES: Final = 5e-4
 
 
 class LawConstants(NamedTuple):
-    """
-    A sampled law on one axis.
+    """A sampled law on one axis."""
 
-    Attributes
-    ----------
-    kind : float
-        `INVERSE_DYNAMICS` or `PID`.
-    period : float
-        Sample period h [s].
-    pv, vv, pf, vf : float
-        Response of the axis over one period of insertion to its velocity and to a constant force;
-        see `Response`.
-    back_pv, back_vv, back_pf, back_vf : float
-        Response on withdrawal.
-    inertia : float
-        Inertia of the axis [kg].
-    friction_law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed : float
-        Friction of the axis; see `FrictionConstants`.
-    breakaway_speed : float
-        Speed above which Coulomb friction is fully compensated [m/s].
-    ahead : float
-        Prediction time of the speed for this compensation [s].
-    kp, ki, kd : float
-        Feedback gains: force per error, integral and rate of the error.
-    model_kp, model_kv : float
-        Gains k_p [1/s^2] and k_v [1/s] of the modeled motion (inverse dynamics).
-    filter_time : float
-        Time constant of the filter of the error rate [s].
-    tolerance : float
-        Error at rest below which the integral is frozen [m].
-    tracking : float
-        Fraction of an excess force that back-calculation removes in one period; 0 for conditional
-        integration.
-    feed_forward : float
-        1 with feed-forward, 0 without.
-    fade : float
-        Factor by which the offset after a switch decreases in one period.
-    bound : float
-        Largest learned friction relative to the model; 0 without learning.
-    noise : float
-        Standard deviation of the force measurement for learning [N]; infinite while frozen.
-
-    """
-
-    kind: float
-    period: float
+    kind: float  #: `INVERSE_DYNAMICS` or `PID`
+    period: float  #: sample period h [s]
+    #: Response of the axis over one period of insertion to its velocity and to a constant force;
+    #: see `Response`.
     pv: float
     vv: float
     pf: float
     vf: float
+    #: Response on withdrawal.
     back_pv: float
     back_vv: float
     back_pf: float
     back_vf: float
-    inertia: float
+    inertia: float  #: inertia of the axis [kg]
+    #: Friction of the axis; see `FrictionConstants`.
     friction_law: float
     coulomb: float
     viscous: float
@@ -104,37 +66,34 @@ class LawConstants(NamedTuple):
     breakaway: float
     stribeck_speed: float
     smoothing_speed: float
-    breakaway_speed: float
-    ahead: float
+    breakaway_speed: float  #: speed above which Coulomb friction is fully compensated [m/s]
+    ahead: float  #: prediction time of the speed for this compensation [s]
+    #: Feedback gains: force per error, integral and rate of the error.
     kp: float
     ki: float
     kd: float
+    #: Gains k_p [1/s^2] and k_v [1/s] of the modeled motion (inverse dynamics).
     model_kp: float
     model_kv: float
-    filter_time: float
-    tolerance: float
+    filter_time: float  #: time constant of the filter of the error rate [s]
+    tolerance: float  #: error at rest below which the integral is frozen [m]
+    #: Fraction of an excess force that back-calculation removes in one period; 0 for conditional
+    #: integration.
     tracking: float
-    feed_forward: float
-    fade: float
-    bound: float
+    feed_forward: float  #: 1 with feed-forward, 0 without
+    fade: float  #: factor by which the offset after a switch decreases in one period
+    bound: float  #: largest learned friction relative to the model; 0 without learning
+    #: Standard deviation of the force measurement for learning [N]; infinite while frozen.
     noise: float
 
 
 class Instant(NamedTuple):
-    """
-    State and setpoint, the inputs of a law.
+    """State and setpoint, the inputs of a law."""
 
-    Attributes
-    ----------
-    position, velocity : float
-        State of the axis.
-    target, target_velocity, target_acceleration : float
-        Setpoint.
-
-    """
-
+    #: State of the axis.
     position: float
     velocity: float
+    #: Setpoint.
     target: float
     target_velocity: float
     target_acceleration: float
@@ -228,15 +187,15 @@ def law_learn(
     """
     Update the learned friction with the last period, if the law learns and the axis was sliding.
 
-    ``constants`` and ``memory`` as in `law_force`; ``position`` and ``speed`` are measured now,
+    ``constants`` and ``memory`` as in `law_force`; ``position`` and ``velocity`` are measured now,
     ``force`` is the force of the period less known loads [N].
     """
     c = LawConstants(*constants)
     if c.bound == 0.0:
         return
-    seen, before, rate = memory[SEEN], memory[SEEN + 1], memory[SEEN + 2]
-    memory[SEEN], memory[SEEN + 1], memory[SEEN + 2] = 1.0, position, velocity
-    if seen != 1.0 or c.noise == inf:
+    valid, before, rate = memory[MEASURED], memory[MEASURED + 1], memory[MEASURED + 2]
+    memory[MEASURED], memory[MEASURED + 1], memory[MEASURED + 2] = 1.0, position, velocity
+    if valid != 1.0 or c.noise == inf:
         return
     mean = (position - before) / c.period
     # Sliding in the same direction at both ends, and no missing measurement between them.
@@ -262,11 +221,11 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     """Set up feed-forward and implicit feedback; see `needle_controller.laws.pid.Pid`."""
     h = c.period
     reached = aim.target_velocity + h * aim.target_acceleration
-    way = aim.target_velocity + reached
-    if way == 0.0:
-        way = aim.target - aim.position
+    direction = aim.target_velocity + reached
+    if direction == 0.0:
+        direction = aim.target - aim.position
     pv, vv, pf, vf = c.pv, c.vv, c.pf, c.vf
-    if way < 0.0:
+    if direction < 0.0:
         pv, vv, pf, vf = c.back_pv, c.back_vv, c.back_pf, c.back_vf
     linear = (reached - vv * aim.target_velocity) / vf
     share = h / (c.filter_time + h)
@@ -335,15 +294,11 @@ def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: 
 
 @kernel
 def law_match(
-    constants: LawTuple,
-    memory: Vector,
-    instant: InstantTuple,
-    load: float,
-    force: float,
+    constants: LawTuple, memory: Vector, instant: InstantTuple, load: float, force: float
 ) -> None:
     """Set the memory such that the force of the law equals ``force`` [N]; else as `law_force`."""
     c, at = LawConstants(*constants), Instant(*instant)
-    memory[:SEEN] = 0.0
+    memory[:MEASURED] = 0.0
     memory[RATE] = at.target_velocity - at.velocity
     form = _implicit(c, memory, _aim(c, memory, at))
     missing = (force - form.forward) * form.divisor - form.push
@@ -357,11 +312,7 @@ def law_match(
 
 @kernel
 def law_step(
-    constants: LawTuple,
-    memory: Vector,
-    instant: InstantTuple,
-    load: float,
-    limit: float,
+    constants: LawTuple, memory: Vector, instant: InstantTuple, load: float, limit: float
 ) -> float:
     """Return the force within its limit [N] and update the memory; else as `law_force`."""
     return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)

@@ -39,7 +39,7 @@ def bounds(share: float, coulomb: float, viscous: float) -> tuple[float, float, 
 
 @compiled
 def correction(
-    block: FloatArray, limits: tuple[float, float, float], depth: float, velocity: float
+    block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
     """
     Return the learned additional friction [N] in the direction of a block, within bounds.
@@ -48,8 +48,8 @@ def correction(
     axis [m] and ``speed`` the modulus of its velocity [m/s].
     """
     dry, viscous, slope = limits
-    held = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
-    return float(min(max(held, -dry), dry) + min(max(block[1], -viscous), viscous) * velocity)
+    dry_part = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
+    return float(min(max(dry_part, -dry), dry) + min(max(block[1], -viscous), viscous) * speed)
 
 
 @compiled
@@ -57,7 +57,7 @@ def learn(
     block: FloatArray,
     limits: tuple[float, float, float],
     depth: float,
-    velocity: float,
+    speed: float,
     missing: float,
     noise: float,
     period: float,
@@ -82,7 +82,7 @@ def learn(
                 covariance[i, j] *= shrink
             for j in range(TERMS):
                 covariance[j, i] *= shrink
-    regressors = (1.0, velocity, depth - LENGTH)
+    regressors = (1.0, speed, depth - LENGTH)
     weights = np.zeros(TERMS)
     variance = noise * noise * max(_CORRELATED / period, 1.0)
     error = missing

@@ -10,11 +10,24 @@ from needle_controller.compiled.laws import (
     LawTuple,
     MEMORY,
 )
-from needle_dynamics.arrays import Matrix, Vector
-from needle_dynamics.compiled.cache import kernel
+from needle_dynamics.arrays import FloatArray, Matrix, Vector
+from needle_dynamics.compiled.cache import inlined, kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
 from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 import numpy as np
+
+
+@inlined
+def _delayed(pending: FloatArray, command: float) -> float:
+    """Append a command to the pending commands; return the command that acts now."""
+    delay = len(pending)
+    if delay == 0:
+        return command
+    force = float(pending[0])
+    for i in range(1, delay):
+        pending[i - 1] = pending[i]
+    pending[delay - 1] = command
+    return force
 
 
 @kernel
@@ -38,42 +51,21 @@ def run_loop(  # noqa: C901
     """
     Run a sampled law of insertion with the simulated needle; return the completed periods.
 
-    Fewer than k periods are completed if the needle leaves its range.
+    Fewer than k periods are completed if the needle leaves its range. Positions are in m,
+    velocities in m/s, forces in N.
 
-    Parameters
-    ----------
-    c : CompiledNeedle
-        Needle.
-    state : ndarray, shape (2 (2 + n),)
-        Initial state; overwritten with the final state.
-    law : tuple of float
-        Fields of `LawConstants`.
-    limit : float
-        Largest force [N].
-    setpoints : ndarray, shape (k, 3)
-        Position, velocity and acceleration of the setpoint for each command.
-    goal : ndarray, shape (k + 1,)
-        Position of the reference at the times of the measurements [m].
-    pending : ndarray, shape (delay,)
-        Commands without effect so far [N]; overwritten.
-    known : int
-        Periods of delay that the law compensates, with the newest pending commands.
-    noise : ndarray, shape (k, 3) or (0, 3)
-        Errors of the measured position [m] and velocity [m/s], and additional force [N].
-    added : ndarray, shape (m, 3)
-        Additional friction by depth: insertion depth [m] above which Coulomb friction [N] and
-        viscous friction [N s/m] are added, until the next row.
-    longest : float
-        Longest step of the integrator [s].
-    depths : ndarray, shape (k + 1,) or (0,)
-        Output: insertion depths at the times of the measurements [m]; unused if empty.
-    states : ndarray, shape (k + 1, 2 (2 + n)) or (0, 2 (2 + n))
-        Output: states at these times; unused if empty.
-    commands : ndarray, shape (k,) or (0,)
-        Output: command for each measurement [N]; unused if empty.
-    errors : ndarray, shape (3,)
-        Output: goal minus insertion depth: last [m], largest in modulus [m] and mean square [m^2].
+    ``state``, shape (2 (2 + n),), takes the final state; ``law`` has the fields of `LawConstants`,
+    ``limit`` is the largest force. For each of k commands ``setpoints``, shape (k, 3), has
+    position, velocity and acceleration; ``goal``, shape (k + 1,), the reference at the times of
+    the measurements. ``pending``, shape (delay,), are commands without effect so far, updated, of
+    which the law compensates the newest ``known``. ``noise``, shape (k, 3) or (0, 3), has errors
+    of the measured position and velocity, and additional force. ``added``, shape (m, 3), has
+    insertion depths above which Coulomb friction [N] and viscous friction [N s/m] are added, until
+    the next row. ``longest`` is the longest step [s].
 
+    Outputs, the first three unused if empty: at the measurements ``depths``, shape (k + 1,), and
+    ``states``, shape (k + 1, 2 (2 + n)); ``commands``, shape (k,); ``errors``, shape (3,), goal
+    minus insertion depth: last, largest in modulus, and mean square [m^2].
     """
     memory, none = np.zeros(MEMORY), np.empty((0, 3))
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
@@ -104,12 +96,7 @@ def run_loop(  # noqa: C901
             commands[k] = command
         # Force of this period according to the law.
         acts = pending[delay - known] if known > 0 else command
-        force = command
-        if delay > 0:
-            force = pending[0]
-            for i in range(1, delay):
-                pending[i - 1] = pending[i]
-            pending[delay - 1] = command
+        force = _delayed(pending, command)
         if noise.shape[0] > 0:
             force += noise[k, 2]
         inputs = Inputs(force, 0.0, 0.0, False)
@@ -144,27 +131,22 @@ def ring(
     """
     memory = np.zeros(MEMORY)
     period, delay = LawConstants(*law).period, pending.shape[0]
-    position, velocity, turns, way = start, 0.0, 0, 0.0
+    position, velocity, turns, direction = start, 0.0, 0, 0.0
     spans = np.zeros(3)
     for part in range(3):
         low, high = position, position
         for _ in range(count):
-            seen, rate = position, velocity
+            measured, rate = position, velocity
             for i in range(delay - known, delay):
-                seen, rate = axis_step(law, seen, rate, pending[i])
-            command = law_step(law, memory, (seen, rate, 0.0, 0.0, 0.0), 0.0, np.inf)
-            force = command
-            if delay > 0:
-                force = pending[0]
-                for i in range(1, delay):
-                    pending[i - 1] = pending[i]
-                pending[delay - 1] = command
+                measured, rate = axis_step(law, measured, rate, pending[i])
+            command = law_step(law, memory, (measured, rate, 0.0, 0.0, 0.0), 0.0, np.inf)
+            force = _delayed(pending, command)
             velocity, moved = friction_flow(friction, inertia, velocity, force, period)
             position = position + moved
             low, high = min(low, position), max(high, position)
-            if velocity * way < 0.0 and part == 2:
+            if velocity * direction < 0.0 and part == 2:
                 turns += 1
             if velocity != 0.0:
-                way = velocity
+                direction = velocity
         spans[part] = high - low
     return float(spans[1]), float(spans[2]), turns

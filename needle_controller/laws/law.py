@@ -16,8 +16,8 @@ from needle_controller.compiled.laws import (
     law_step,
     LawConstants,
     LEARNED,
+    MEASURED,
     MEMORY,
-    SEEN,
 )
 from needle_controller.compiled.learning import BLOCK, TERMS
 from needle_controller.laws.axis import Axis
@@ -183,7 +183,7 @@ class SampledLoop:
         """Discard the pending commands and the modeled motion; the rest of the memory stays."""
         for i in range(len(self.pending)):
             self.pending[i] = 0.0
-        self.memory[FOLLOWS] = self.memory[SEEN] = 0.0
+        self.memory[FOLLOWS] = self.memory[MEASURED] = 0.0
         self.last = 0.0
         self._take_over = False
 

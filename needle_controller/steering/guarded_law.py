@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from math import isfinite, sqrt
 from typing import Final
 
-from needle_controller.compiled.steering import MOST_MISSING, MOST_SAME
+from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
 from needle_controller.steering.law import (
     GuideSetpoint,
     SteeringFaultError,

@@ -23,10 +23,10 @@ from dataclasses import replace
 from math import ceil
 from typing import Final
 
-from needle_controller.compiled.steering import HypothesisResponses
+from needle_controller.compiled.hypotheses import HypothesisResponses
 from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray, IntArray
-from needle_dynamics.compiled.cut import Steered
+from needle_dynamics.compiled.cutting_needle import Steered
 from needle_dynamics.compiled.superposition import insert_causes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import steered

@@ -19,65 +19,32 @@ _HALVINGS: Final = 60
 
 
 class AxisConstants(NamedTuple):
-    """
-    Constants along the insertion axis.
+    """Constants along the insertion axis."""
 
-    Attributes
-    ----------
-    mass : float
-        Moving mass [kg].
-    coulomb, viscous : float
-        Friction that does not depend on the depth: mu_s [N] and mu_v [N s/m].
-    withdrawal : float
-        Friction on withdrawal over that on insertion.
-    reach : float
-        Depth at which the hub stops [m].
-    starts : ndarray, shape (layers,)
-        Depths at which the layers begin [m].
-    coulomb_per_length, viscous_per_length : ndarray, shape (layers,)
-        Friction per length in each layer [N/m] and [N s/m^2].
-    cutting : ndarray, shape (layers,)
-        Cutting force in each layer [N].
-    membranes, strengths, stiffness : ndarray, shape (membranes,)
-        Depth [m], puncture force [N] and stiffness [N/m] of each membrane.
-
-    """
-
-    mass: float
+    mass: float  #: moving mass [kg]
+    #: Friction that does not depend on the depth: mu_s [N] and mu_v [N s/m].
     coulomb: float
     viscous: float
-    withdrawal: float
-    reach: float
-    starts: Vector
+    withdrawal: float  #: friction on withdrawal over that on insertion
+    reach: float  #: depth at which the hub stops [m]
+    starts: Vector  #: depths at which the layers begin [m], shape (layers,)
+    #: Friction per length in each layer [N/m] and [N s/m^2], shape (layers,).
     coulomb_per_length: Vector
     viscous_per_length: Vector
-    cutting: Vector
+    cutting: Vector  #: cutting force in each layer [N], shape (layers,)
+    #: Depth [m], puncture force [N] and stiffness [N/m] of each membrane, shape (membranes,).
     membranes: Vector
     strengths: Vector
     stiffness: Vector
 
 
 class Resistance(NamedTuple):
-    """
-    Forces that resist the motion at a depth.
+    """Forces that resist the motion at a depth."""
 
-    Attributes
-    ----------
-    dry : float
-        Coulomb friction on insertion [N].
-    viscous : float
-        Viscous friction on insertion [N s/m].
-    cutting : float
-        Cutting force, on insertion only [N].
-    elastic : float
-        Force of membranes, out of the tissue [N].
-
-    """
-
-    dry: float
-    viscous: float
-    cutting: float
-    elastic: float
+    dry: float  #: Coulomb friction on insertion [N]
+    viscous: float  #: viscous friction on insertion [N s/m]
+    cutting: float  #: cutting force, on insertion only [N]
+    elastic: float  #: force of membranes, out of the tissue [N]
 
 
 @compiled
@@ -178,14 +145,14 @@ def push(
         _, half = _glide(a, r, velocity, force, 0.5 * t)
         middle = min(max(depth + half, low), high)
         r = resistance(a, middle, touches, punctured)
-        after, way = _glide(a, r, velocity, force, t)
-        if not low < depth + way < high and way != 0.0:
-            at = high if way > 0.0 else low
+        after, moved = _glide(a, r, velocity, force, t)
+        if not low < depth + moved < high and moved != 0.0:
+            at = high if moved > 0.0 else low
             early, late = 0.0, t
             for _ in range(_HALVINGS):
                 between = 0.5 * (early + late)
                 _, gone = _glide(a, r, velocity, force, between)
-                beyond = depth + gone >= at if way > 0.0 else depth + gone <= at
+                beyond = depth + gone >= at if moved > 0.0 else depth + gone <= at
                 if beyond:
                     late = between
                 else:
@@ -194,10 +161,10 @@ def push(
             after, _ = _glide(a, r, velocity, force, t)
             state[DEPTH] = at
         else:
-            state[DEPTH] = depth + way
+            state[DEPTH] = depth + moved
         state[VELOCITY] = after
         left -= t
-        if state[DEPTH] <= 0.0 and way < 0.0:
+        if state[DEPTH] <= 0.0 and moved < 0.0:
             state[DEPTH] = 0.0
             return max(left, 1e-300)
         _arrive(a, state, punctured)
@@ -212,50 +179,50 @@ def carry_on(
     velocity: float,
     duration: float,
     step: float,
-    felt: Vector,
+    forces: Vector,
 ) -> float:
     """
     Advance with a ramp to ``velocity`` [m/s] over ``duration`` [s], at any force, in place.
 
-    ``state`` and ``step`` as in `push`; ``felt``, shape (parts,), takes the mean force in equal
+    ``state`` and ``step`` as in `push`; ``forces``, shape (parts,), takes the mean force in equal
     parts of the duration [N]. Returns the time left when the needle leaves the tissue [s],
     otherwise 0.
     """
     rate = (velocity - state[VELOCITY]) / duration
     left = duration
-    for k in range(len(felt)):
-        begin, end, impulse = left, duration * ((len(felt) - 1 - k) / len(felt)), 0.0
+    for k in range(len(forces)):
+        begin, end, impulse = left, duration * ((len(forces) - 1 - k) / len(forces)), 0.0
         while left > end:
             t = min(step, left - end)
             depth, before = state[DEPTH], state[VELOCITY]
             low, high = _events(a, state, punctured)
             touches = depth >= state[DEEPEST]
-            way = (before + 0.5 * rate * t) * t
-            if not low < depth + way < high and way != 0.0:
-                at = high if way > 0.0 else low
-                way = at - depth
+            moved = (before + 0.5 * rate * t) * t
+            if not low < depth + moved < high and moved != 0.0:
+                at = high if moved > 0.0 else low
+                moved = at - depth
                 # Root without cancellation; rounding can make the square negative.
-                root = sqrt(max(0.0, before * before + 2.0 * rate * way))
-                t = min(t, 2.0 * way / (before + copysign(root, way)))
+                root = sqrt(max(0.0, before * before + 2.0 * rate * moved))
+                t = min(t, 2.0 * moved / (before + copysign(root, moved)))
                 state[DEPTH] = at
             else:
-                state[DEPTH] = depth + way
+                state[DEPTH] = depth + moved
             state[VELOCITY] = velocity if t == left else before + rate * t
-            r = resistance(a, min(max(depth + 0.5 * way, low), high), touches, punctured)
+            r = resistance(a, min(max(depth + 0.5 * moved, low), high), touches, punctured)
             mean = before + 0.5 * rate * t
-            impulse += t * (a.mass * rate + r.elastic + _held(a, r, mean))
+            impulse += t * (a.mass * rate + r.elastic + _resisting(a, r, mean))
             left = end if t == left - end else left - t
             state[DEPTH] = max(state[DEPTH], 0.0)
-            if (state[DEPTH] == 0.0 and way < 0.0) or (state[DEPTH] >= a.reach and way > 0.0):
-                felt[k:] = impulse / (begin - left)
+            if (state[DEPTH] == 0.0 and moved < 0.0) or (state[DEPTH] >= a.reach and moved > 0.0):
+                forces[k:] = impulse / (begin - left)
                 return max(left, 1e-300)
             _arrive(a, state, punctured)
-        felt[k] = impulse / (begin - end)
+        forces[k] = impulse / (begin - end)
     return 0.0
 
 
 @inlined
-def _held(a: AxisConstants, r: Resistance, velocity: float) -> float:
+def _resisting(a: AxisConstants, r: Resistance, velocity: float) -> float:
     """Return friction and cutting force [N]; at rest the static friction of least force."""
     if velocity > 0.0:
         return r.dry + r.cutting + r.viscous * velocity

@@ -26,50 +26,28 @@ from needle_dynamics.compiled.cache import compiled, inlined
 
 
 class SpringSupports(NamedTuple):
-    """
-    Equivalent spring of the needle up to each node; row i is node i.
+    """Equivalent spring of the needle up to each node; row i is node i."""
 
-    Attributes
-    ----------
-    depths : ndarray, shape (m,)
-        Distance from the entry point [m]; node 0 is the entry point.
-    stiffness : ndarray, shape (m,)
-        Stiffness of the tissue between this node and the next one [N/m^2].
-    compliance : ndarray, shape (m, 3)
-        The entries 00, 01 and 11 of the symmetric C [m/N, 1/N, rad/(N m)].
-    response : ndarray, shape (m, 2, 2)
-        Deflection and slope of the unloaded end per position and tilt of the guide.
-    rest : ndarray, shape (m, 2, 2)
-        By plane (x, z): deflection [m] and slope of the unloaded end with the guide at zero.
-    path : ndarray, shape (m, 2, 3)
-        By plane: value [m], slope and second derivative [1/m] of the path at this node, towards
-        the next one.
-
-    """
-
-    depths: Vector
+    depths: Vector  #: distance from the entry point [m]; node 0 is the entry point, shape (m,)
+    #: Stiffness of the tissue between this node and the next one [N/m^2], shape (m,).
     stiffness: Vector
+    #: The entries 00, 01 and 11 of the symmetric C [m/N, 1/N, rad/(N m)], shape (m, 3).
     compliance: Matrix
+    #: Deflection and slope of the unloaded end per position and tilt of the guide,
+    #: shape (m, 2, 2).
     response: Array3
+    #: By plane (x, z): deflection [m] and slope of the unloaded end with the guide at zero,
+    #: shape (m, 2, 2).
     rest: Array3
+    #: By plane: value [m], slope and second derivative [1/m] of the path at this node, towards the
+    #: next one, shape (m, 2, 3).
     path: Array3
 
 
 class Element(NamedTuple):
-    """
-    Exact transfer of deflection, slope, shear force and moment over an element.
+    """Exact transfer of deflection, slope, shear force and moment over an element."""
 
-    Attributes
-    ----------
-    p0, p1, p2, p3, p4, p5, p6 : float
-        The functions h^j sum_m z^m / (4m + j)! with z = -k h^4 / (E I), in m^j.
-    ei : float
-        Bending stiffness [N m^2].
-    k : float
-        Stiffness of the tissue [N/m^2].
-
-    """
-
+    #: The functions h^j sum_m z^m / (4m + j)! with z = -k h^4 / (E I), in m^j.
     p0: float
     p1: float
     p2: float
@@ -77,32 +55,23 @@ class Element(NamedTuple):
     p4: float
     p5: float
     p6: float
-    ei: float
-    k: float
+    ei: float  #: bending stiffness [N m^2]
+    k: float  #: stiffness of the tissue [N/m^2]
 
 
 class Crossing(NamedTuple):
-    """
-    Transfer of the spring from the start to the end of an element.
+    """Transfer of the spring from the start to the end of an element."""
 
-    Attributes
-    ----------
-    c00, c01, c11 : float
-        Compliance at the end.
-    t00, t01, t10, t11 : float
-        Transfer of deflection and slope of the unloaded end from the start to the end.
-    value, slope, bend : tuple of float
-        Deflection and slope at the end per value, slope and second derivative of the path.
-
-    """
-
+    #: Compliance at the end.
     c00: float
     c01: float
     c11: float
+    #: Transfer of deflection and slope of the unloaded end from the start to the end.
     t00: float
     t01: float
     t10: float
     t11: float
+    #: Deflection and slope at the end per value, slope and second derivative of the path.
     value: tuple[float, float]
     slope: tuple[float, float]
     bend: tuple[float, float]
@@ -125,28 +94,28 @@ def element(ei: float, k: float, h: float) -> Element:
     p5 = 1.0 + z / 3024 * (1.0 + z / 17160 * (1.0 + z / 57120 * (1.0 + z / 143640)))
     p6 = 1.0 + z / 5040 * (1.0 + z / 24024 * (1.0 + z / 73440 * (1.0 + z / 175560)))
     return Element(
-        p0,
-        p1 * h,
-        p2 * h**2 / 2,
-        p3 * h**3 / 6,
-        p4 * h**4 / 24,
-        p5 * h**5 / 120,
-        p6 * h**6 / 720,
-        ei,
-        k,
-    )
+        p0, p1 * h, p2 * h**2 / 2, p3 * h**3 / 6, p4 * h**4 / 24, p5 * h**5 / 120,
+        p6 * h**6 / 720, ei, k,
+    )  # fmt: skip
+
+
+@inlined
+def _load_transfer(
+    e: Element, c00: float, c01: float, c11: float
+) -> tuple[float, float, float, float, float]:
+    """Return W = Phi_fx C + Phi_ff, from loads at the start to loads at the end, and 1 / det W."""
+    w00 = e.k * (e.p1 * c00 + e.p2 * c01) + e.p0
+    w01 = e.k * (e.p1 * c01 + e.p2 * c11) + e.k / e.ei * e.p3
+    w10 = -e.k * (e.p2 * c00 + e.p3 * c01) - e.p1
+    w11 = -e.k * (e.p2 * c01 + e.p3 * c11) + e.p0
+    return w00, w01, w10, w11, 1.0 / (w00 * w11 - w01 * w10)
 
 
 @inlined
 def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
     """Return the transfer over an element; c00, c01 and c11 are the compliance at its start."""
     a = e.k / e.ei
-    # W = Phi_fx C + Phi_ff maps the loads at the start to the loads at the end.
-    w00 = e.k * (e.p1 * c00 + e.p2 * c01) + e.p0
-    w01 = e.k * (e.p1 * c01 + e.p2 * c11) + a * e.p3
-    w10 = -e.k * (e.p2 * c00 + e.p3 * c01) - e.p1
-    w11 = -e.k * (e.p2 * c01 + e.p3 * c11) + e.p0
-    inverse = 1.0 / (w00 * w11 - w01 * w10)
+    w00, w01, w10, w11, inverse = _load_transfer(e, c00, c01, c11)
     # The transfer is symplectic: deflections transform with the transpose of the inverse of W.
     t00, t01, t10, t11 = w11 * inverse, -w10 * inverse, -w01 * inverse, w00 * inverse
     # Phi_xx C + Phi_xf, times the inverse of W.
@@ -186,18 +155,18 @@ def begin(s: SpringSupports, ei: float, free: float, skin: float, entry: FloatAr
     (2,).
     """
     c00, c01, c11 = free**3 / (3.0 * ei), free**2 / (2.0 * ei), free / ei
-    held = skin / (1.0 + skin * c00)
+    support = skin / (1.0 + skin * c00)
     s.depths[0] = 0.0
-    s.compliance[0, 0] = c00 - c00 * held * c00
-    s.compliance[0, 1] = c01 - c00 * held * c01
-    s.compliance[0, 2] = c11 - c01 * held * c01
-    s.response[0, 0, 0] = 1.0 - c00 * held
-    s.response[0, 0, 1] = free - c00 * held * free
-    s.response[0, 1, 0] = -c01 * held
-    s.response[0, 1, 1] = 1.0 - c01 * held * free
+    s.compliance[0, 0] = c00 - c00 * support * c00
+    s.compliance[0, 1] = c01 - c00 * support * c01
+    s.compliance[0, 2] = c11 - c01 * support * c01
+    s.response[0, 0, 0] = 1.0 - c00 * support
+    s.response[0, 0, 1] = free - c00 * support * free
+    s.response[0, 1, 0] = -c01 * support
+    s.response[0, 1, 1] = 1.0 - c01 * support * free
     for plane in range(2):
-        s.rest[0, plane, 0] = c00 * held * entry[plane]
-        s.rest[0, plane, 1] = c01 * held * entry[plane]
+        s.rest[0, plane, 0] = c00 * support * entry[plane]
+        s.rest[0, plane, 1] = c01 * support * entry[plane]
 
 
 @inlined
@@ -232,32 +201,16 @@ def shape(
     guide: FloatArray,
     load: FloatArray,
     found: FloatArray,
-    felt: FloatArray,
+    guide_load: FloatArray,
 ) -> None:
     """
     Compute deflection and slope of the needle at its nodes, and the load on the guide.
 
-    Parameters
-    ----------
-    s : SpringSupports
-        Rows.
-    last : int
-        Row of the node before the tip.
-    tip : float
-        Depth of the tip [m].
-    ei : float
-        Bending stiffness [N m^2].
-    free : float
-        Free length between guide and entry point [m].
-    guide : ndarray, shape (2, 2)
-        By plane: position [m] and tilt of the guide.
-    load : ndarray, shape (2,)
-        Lateral load on the tip, by plane [N].
-    found : ndarray, shape (2, last + 1, 2)
-        Output: deflections [m] and slopes, by plane and node.
-    felt : ndarray, shape (2, 2)
-        Output: force [N] and moment [N m] of the needle on the guide, by plane.
-
+    ``last`` is the row of the node before the tip at the depth ``tip`` [m], ``ei`` the bending
+    stiffness [N m^2], ``free`` the free length between guide and entry point [m]. By plane:
+    ``guide``, shape (2, 2), position [m] and tilt of the guide; ``load``, shape (2,), lateral load
+    on the tip [N]. Outputs: ``found``, shape (last + 1, 2, 2), deflection [m] and slope by node
+    and plane; ``guide_load``, shape (2, 2), force [N] and moment [N m] on the guide by plane.
     """
     for plane in range(2):
         b, tilt = guide[plane, 0], guide[plane, 1]
@@ -273,20 +226,18 @@ def shape(
             p, d, c = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
             v -= k * (e.p1 * (w0 - p) + e.p2 * (t0 - d) - e.p3 * c)
             m += k * (e.p2 * (w0 - p) + e.p3 * (t0 - d) - e.p4 * c)
-            w00 = k * (e.p1 * c00 + e.p2 * c01) + e.p0
-            w01 = k * (e.p1 * c01 + e.p2 * c11) + k / ei * e.p3
-            w10 = -k * (e.p2 * c00 + e.p3 * c01) - e.p1
-            w11 = -k * (e.p2 * c01 + e.p3 * c11) + e.p0
-            inverse = 1.0 / (w00 * w11 - w01 * w10)
+            w00, w01, w10, w11, inverse = _load_transfer(e, c00, c01, c11)
             v, m = (w11 * v - w01 * m) * inverse, (w00 * m - w10 * v) * inverse
-            found[plane, i, 0] = c00 * v + c01 * m + w0
-            found[plane, i, 1] = c01 * v + c11 * m + t0
+            found[i, plane, 0] = c00 * v + c01 * m + w0
+            found[i, plane, 1] = c01 * v + c11 * m + t0
             end = s.depths[i]
-        felt[plane, 0], felt[plane, 1] = v, m
+        guide_load[plane, 0], guide_load[plane, 1] = v, m
         if free > 0.0:
             # The force jumps at the skin; the free length is loaded at its ends only.
-            away = found[plane, 0, 0] - b - tilt * free
-            turn = found[plane, 0, 1] - tilt
+            away = found[0, plane, 0] - b - tilt * free
+            turn = found[0, plane, 1] - tilt
             shear = 6.0 * ei / free**3 * (2.0 * away - free * turn)
-            felt[plane, 0] = shear
-            felt[plane, 1] = 2.0 * ei / free * (2.0 * turn - 3.0 * away / free) + shear * free
+            guide_load[plane, 0] = shear
+            guide_load[plane, 1] = (
+                2.0 * ei / free * (2.0 * turn - 3.0 * away / free) + shear * free
+            )

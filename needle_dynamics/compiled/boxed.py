@@ -1,7 +1,7 @@
 """
 Arguments in the representation of machine code.
 
-At each call Numba converts every number and array of a named tuple: 6 us for fifty. A held value
+At each call Numba converts every number and array of a named tuple: 6 us for fifty. A boxed value
 is converted once. This file imports Numba: import it where it is first needed.
 """
 
@@ -17,7 +17,7 @@ _Value = TypeVar('_Value')
 
 
 @structref.register
-class _HeldType(types.StructRef):  # type: ignore[misc, name-defined]
+class _BoxedType(types.StructRef):  # type: ignore[misc, name-defined]
     """Numba's type of `Boxed`."""
 
     def preprocess_fields(self, fields: Any) -> Any:
@@ -26,43 +26,35 @@ class _HeldType(types.StructRef):  # type: ignore[misc, name-defined]
 
 
 class Boxed(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
-    """
-    A value that compiled functions take without conversion; its arrays are not copied.
+    """A value that compiled functions take without conversion; its arrays are not copied."""
 
-    Attributes
-    ----------
-    value : tuple
-        Named tuple of numbers, arrays and named tuples; for compiled functions only.
-
-    """
-
-    value: _Value
+    value: _Value  #: named tuple of numbers, arrays and named tuples; for compiled functions only
     _kept: _Value
 
     def __new__(cls, value: _Value) -> Boxed[_Value]:
-        held = _hold(value)
-        held._kept = value
-        return held
+        boxed = _box(value)
+        boxed._kept = value
+        return boxed
 
     def __reduce__(self) -> tuple[type[Boxed[_Value]], tuple[_Value]]:
         """Pickle the value, which is converted again in the copy."""
         return Boxed, (self._kept,)
 
 
-structref.define_proxy(Boxed, _HeldType, ['value'])
+structref.define_proxy(Boxed, _BoxedType, ['value'])
 
 
-def held_type(value: Any) -> Any:
+def boxed_type(value: Any) -> Any:
     """Return Numba's type of `Boxed` for Numba's type of the value."""
-    return _HeldType([('value', value)])
+    return _BoxedType([('value', value)])
 
 
-def prepare_hold(kind: Any) -> None:
+def prepare_box(kind: Any) -> None:
     """Load or compile the conversion to a `Boxed` type; other types need no conversion."""
-    if isinstance(kind, _HeldType):
-        _hold.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
+    if isinstance(kind, _BoxedType):
+        _box.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
 
 
 @compiled
-def _hold(value: _Value) -> Boxed[_Value]:
+def _box(value: _Value) -> Boxed[_Value]:
     return Boxed(value)

@@ -94,12 +94,12 @@ class _Compiled:
 
     def prepare(self) -> None:
         """Load or compile the function for the annotated types."""
-        from needle_dynamics.compiled.boxed import prepare_hold
+        from needle_dynamics.compiled.boxed import prepare_box
         from needle_dynamics.compiled.signatures import argument_types
 
         found = argument_types(self.py_func)
         for one in found:
-            prepare_hold(one)
+            prepare_box(one)
         self.dispatcher.compile(found)
 
 

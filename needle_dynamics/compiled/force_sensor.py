@@ -8,19 +8,19 @@ import numpy as np
 
 
 @kernel
-def straight(before: Vector, now: Vector, felt: Matrix) -> None:
-    """Fill ``felt``, shape (k, 6), with a linear interpolation that ends at ``now``."""
-    samples = felt.shape[0]
+def straight(before: Vector, now: Vector, wrenches: Matrix) -> None:
+    """Fill ``wrenches``, shape (k, 6), with a linear interpolation that ends at ``now``."""
+    samples = wrenches.shape[0]
     for j in range(samples):
         # The last sample equals ``now`` to the bit.
         back = (samples - 1.0 - j) / samples
         for i in range(6):
-            felt[j, i] = now[i] + back * (before[i] - now[i])
+            wrenches[j, i] = now[i] + back * (before[i] - now[i])
 
 
 @kernel
 def sense(
-    felt: Matrix,
+    wrenches: Matrix,
     drawn: Matrix,
     constants: Matrix,
     sections: Matrix,
@@ -30,35 +30,22 @@ def sense(
     reading: Vector,
 ) -> None:
     """
-    Simulate the k samples of a force sensor since its last reading, and return the last sample.
+    Simulate the k samples of a force sensor since its last reading, and write the last sample.
 
-    Parameters
-    ----------
-    felt : ndarray, shape (k, 6)
-        True wrench at each sample [N, N m].
-    drawn : ndarray, shape (k + 1, 6)
-        Standard normal numbers: noise of each sample, then the step of the offset.
-    constants : ndarray, shape (4, 6)
-        Standard deviations of noise and step, range, and resolution (0 for none) of each axis.
-    sections : ndarray, shape (filters, 6)
-        Second-order sections of the cascade, in the format of SciPy.
-    memory : ndarray, shape (filters, 2, 6)
-        Their state in transposed direct form II; updated.
-    offset : ndarray, shape (6,)
-        Offset of the sensor; updated.
-    zero : ndarray, shape (6,)
-        Tare, subtracted from the reading.
-    reading : ndarray, shape (6,)
-        Output: the reading.
-
+    ``wrenches``, shape (k, 6), are the true wrenches at the samples [N, N m]; ``drawn``, shape (k
+    + 1, 6), standard normal numbers: noise of each sample, then the step of the offset;
+    ``constants``, shape (4, 6), standard deviations of noise and step, range, and resolution (0
+    for none) of each axis; ``sections``, shape (filters, 6), the cascade in the format of SciPy;
+    ``zero``, shape (6,), the tare. Updated: ``memory`` of the sections, shape (filters, 2, 6), in
+    transposed direct form II, and ``offset``, shape (6,). Output: ``reading``, shape (6,).
     """
-    samples = felt.shape[0]
+    samples = wrenches.shape[0]
     for i in range(6):
         noise, limit, count = constants[0, i], constants[2, i], constants[3, i]
         offset[i] += constants[1, i] * drawn[samples, i]
         value = 0.0
         for j in range(samples):
-            value = felt[j, i] + offset[i] + noise * drawn[j, i]
+            value = wrenches[j, i] + offset[i] + noise * drawn[j, i]
             value = min(max(value, -limit), limit)
             for k in range(sections.shape[0]):
                 x = value

@@ -23,48 +23,34 @@ TANH: Final = 2
 
 
 class FrictionConstants(NamedTuple):
-    """
-    Constants of a friction law; see `needle_dynamics.friction.Friction`.
+    """Constants of a friction law; see `needle_dynamics.friction.Friction`."""
 
-    Attributes
-    ----------
-    law : int
-        Index of the law in `FRICTION_LAWS`.
-    coulomb, viscous : float
-        Coulomb friction mu_s [N] and viscous friction mu_v [N s/m].
-    withdrawal : float
-        Ratio of friction on withdrawal to friction on insertion.
-    breakaway : float
-        Ratio of static friction to mu_s (``stribeck``).
-    stribeck_speed, smoothing_speed : float
-        Speed scales of the decay (``stribeck``) and of the sign change (``tanh``) [m/s].
-
-    """
-
-    law: int
+    law: int  #: index of the law in `FRICTION_LAWS`
+    #: Coulomb friction mu_s [N] and viscous friction mu_v [N s/m].
     coulomb: float
     viscous: float
-    withdrawal: float
-    breakaway: float
+    withdrawal: float  #: ratio of friction on withdrawal to friction on insertion
+    breakaway: float  #: ratio of static friction to mu_s (``stribeck``)
+    #: Speed scales of the decay (``stribeck``) and of the sign change (``tanh``) [m/s].
     stribeck_speed: float
     smoothing_speed: float
 
 
 @kernel
-def dry_friction(f: FrictionConstants, coulomb: float, velocity: float) -> tuple[float, float]:
+def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[float, float]:
     """
-    Return dry friction at a velocity [N] and its derivative [N s/m], for every law.
+    Return dry friction at a speed [N] and its derivative [N s/m], for every law.
 
     ``coulomb`` is the Coulomb friction in the direction of motion [N]. The value at rest is the
     static friction limit. Where it is zero, the law is smooth: the needle never sticks, and
     creeps.
     """
     if f.law == STRIBECK:
-        ratio = velocity / f.stribeck_speed
+        ratio = speed / f.stribeck_speed
         excess = (f.breakaway - 1.0) * exp(-ratio * ratio)
         return coulomb * (1.0 + excess), -2.0 * coulomb * excess * ratio / f.stribeck_speed
     if f.law == TANH:
-        turned = tanh(velocity / f.smoothing_speed)
+        turned = tanh(speed / f.smoothing_speed)
         return coulomb * turned, coulomb * (1.0 - turned * turned) / f.smoothing_speed
     return coulomb, 0.0
 

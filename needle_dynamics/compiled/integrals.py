@@ -23,29 +23,17 @@ TERMS_PER_LENGTH: Final = 32
 
 
 class ModeTables(NamedTuple):
-    """
-    Tables for the evaluation of n modes, from `needle_dynamics.modes.ModeShapes.tables`.
+    """Tables for the evaluation of n modes, from `needle_dynamics.modes.ModeShapes.tables`."""
 
-    Attributes
-    ----------
-    length : float
-        Needle length l [m].
-    series : ndarray, shape (terms, columns)
-        Coefficients in powers of (s/l)^4. Columns: G and H of each pair i <= j (three powers of
-        s/l each), then phi, phi'' and the integrals of phi and y phi of each mode (two powers
-        each).
-    terms : ndarray, shape (l / s steps,)
-        Number of series terms for two modes, by relative insertion depth in steps of
-        1 / `TERMS_PER_LENGTH`.
-    modes : ndarray, shape (4, n)
-        Rows k_i l, mu_i, (mu_i - 1) exp(k_i l) and c_i of (11).
-
-    """
-
-    length: float
+    length: float  #: needle length l [m]
+    #: Coefficients in powers of (s/l)^4. Columns: G and H of each pair i <= j (three powers of s/l
+    #: each), then phi, phi'' and the integrals of phi and y phi of each mode (two powers each),
+    #: shape (terms, columns).
     series: FixedMatrix
+    #: Number of series terms for two modes, by relative insertion depth in steps of 1 /
+    #: `TERMS_PER_LENGTH`, shape (l / s steps,).
     terms: FixedVector
-    modes: FixedMatrix
+    modes: FixedMatrix  #: rows k_i l, mu_i, (mu_i - 1) exp(k_i l) and c_i of (11), shape (4, n)
 
 
 class ModeIntegrals(NamedTuple):

@@ -72,13 +72,6 @@ class Constants(NamedTuple):
     """
     Constants of a needle, in the order of the first rows.
 
-    Attributes
-    ----------
-    lowest, highest : float
-        Range of the insertion depth [m].
-    stop : float
-        Insertion depth at which the hub stops, or infinity [m].
-
     Other fields: see `needle_dynamics.parameters.NeedleParameters`.
 
     """
@@ -92,35 +85,24 @@ class Constants(NamedTuple):
     coulomb_friction: float
     viscous_friction: float
     withdrawal_friction: float
+    #: Range of the insertion depth [m].
     lowest: float
     highest: float
-    stop: float
+    stop: float  #: insertion depth at which the hub stops, or infinity [m]
     rotary_inertia: float
 
 
 class BatchTrajectory(NamedTuple):
-    """
-    Inputs and steps of a batch.
+    """Inputs and steps of a batch."""
 
-    Attributes
-    ----------
-    forces, torques : ndarray, shape (runs or 1, k or 1)
-        Insertion force [N] and torque [N m] in each interval.
-    intervals : int
-        Number of intervals.
-    interval, longest : float
-        Length of an interval and of the longest step [s].
-    graded : bool
-        Let steps grow with the insertion depth, as in `Integrator`.
-
-    """
-
+    #: Insertion force [N] and torque [N m] in each interval, shape (runs or 1, k or 1).
     forces: Matrix
     torques: Matrix
-    intervals: int
+    intervals: int  #: number of intervals
+    #: Length of an interval and of the longest step [s].
     interval: float
     longest: float
-    graded: bool
+    graded: bool  #: let steps grow with the insertion depth, as in `Integrator`
 
 
 @inlined
@@ -343,7 +325,7 @@ def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
 def run(
     needles: Matrix,
     table: Matrix,
-    course: BatchTrajectory,
+    trajectory: BatchTrajectory,
     runs: IntVector,
     states: Matrix,
     kept: Array3,
@@ -352,23 +334,12 @@ def run(
     """
     Advance needles through intervals of constant inputs.
 
-    Parameters
-    ----------
-    needles : ndarray, shape (all or 1, 13)
-        `Constants` of each run, or of all runs.
-    table : ndarray, shape (1 + 4 m, 26)
-        First columns of the series of two modes of length 1.
-    course : BatchTrajectory
-        Inputs and steps.
-    runs : ndarray of int
-        Indices of the runs to compute.
-    states : ndarray, shape (all, 8)
-        Initial states; overwritten with the states at the end of the last interval.
-    kept : ndarray, shape (all, count + 1, 8) or (all, 1, 8)
-        Output: states at the ends of the intervals; unused with one row.
-    completed : ndarray, shape (all,)
-        Output: number of completed intervals of each run.
-
+    ``needles``, shape (all or 1, 13), are the `Constants` of each run, or of all runs; ``table``,
+    shape (1 + 4 m, 26), the first columns of the series of two modes of length 1; ``runs`` the
+    indices of the runs to compute. ``states``, shape (all, 8), takes the states at the end of the
+    last interval, ``kept``, shape (all, count + 1, 8), the states at the ends of the intervals
+    (unused if it has one row per run), ``completed``, shape (all,), the number of completed
+    intervals.
     """
     w = np.zeros(_ROWS * LANES)
     # Run and interval of each lane.
@@ -383,23 +354,23 @@ def run(
                 for k in range(states.shape[1]):
                     kept[i, 0, k] = states[i, k]
             which[n], at[n] = i, 0
-            w[_FORCE + n] = _input(course.forces, i, 0)
-            w[_LEFT + n], w[_INSIDE + n] = course.interval, 1.0
+            w[_FORCE + n] = _input(trajectory.forces, i, 0)
+            w[_LEFT + n], w[_INSIDE + n] = trajectory.interval, 1.0
             n += 1
         if n == 0:
             return
-        _begin(w, n, course.longest, 1.0 if course.graded else 0.0)
+        _begin(w, n, trajectory.longest, 1.0 if trajectory.graded else 0.0)
         _modes(w, n, table)
         _rotate(w, n)
         _move(w, n)
         _end(w, n)
         # Backwards: a lane that ends is filled with the last lane, which is already checked.
         for i in range(n - 1, -1, -1):
-            goes_on = w[_INSIDE + i] != 0.0
-            if goes_on and w[_LEFT + i] == 0.0:
-                goes_on = _next(w, i, which[i], at, course, table, states, kept)
+            continues = w[_INSIDE + i] != 0.0
+            if continues and w[_LEFT + i] == 0.0:
+                continues = _next(w, i, which[i], at, trajectory, table, states, kept)
                 completed[which[i]] = at[i]
-            if not goes_on:
+            if not continues:
                 n -= 1
                 which[i], at[i] = which[n], at[n]
                 for k in range(_KEPT):
@@ -412,14 +383,14 @@ def _next(
     i: int,
     which: int,
     at: IntArray,
-    course: BatchTrajectory,
+    trajectory: BatchTrajectory,
     table: FloatArray,
     states: FloatArray,
     kept: FloatArray,
 ) -> bool:
     """End the interval of a lane; return whether the lane continues with the next interval."""
-    state, time = states[which], course.interval
-    turn = 2.0 / w[_INERTIA + i] * _input(course.torques, which, at[i])
+    state, time = states[which], trajectory.interval
+    turn = 2.0 / w[_INERTIA + i] * _input(trajectory.torques, which, at[i])
     angle, rate = state[1], state[5]
     _save(w, i, table, state)
     state[1] = angle + (rate + 0.5 * turn * time) * time
@@ -433,9 +404,9 @@ def _next(
     if kept.shape[1] > 1:
         for k in range(len(state)):
             kept[which, at[i], k] = state[k]
-    w[_FORCE + i] = _input(course.forces, which, min(at[i], course.intervals - 1))
+    w[_FORCE + i] = _input(trajectory.forces, which, min(at[i], trajectory.intervals - 1))
     w[_LEFT + i], w[_A + i] = time, 0.0
-    return bool(at[i] < course.intervals)
+    return bool(at[i] < trajectory.intervals)
 
 
 @inlined

@@ -20,87 +20,46 @@ import numpy as np
 
 
 class Elasticity(NamedTuple):
-    """
-    Needle and tissue constants of one step.
+    """Needle and tissue constants of one step."""
 
-    Attributes
-    ----------
-    density, bending : float
-        Mass per length rho A [kg/m] and bending stiffness E I_y [N m^2].
-    damping : float
-        Tissue damping c_a per length [N s/m^2].
-    as_printed : bool
-        Formulation `as_printed`: z are the rates, and the modes exert no force on the axis.
-    layer : int
-        Index of the layer that contains the tip.
-    stiffness : float
-        Stiffness of the tissue at the tip [N/m^2].
-    growth : float
-        Stiffness factor of swelling.
-    decay : float
-        Factor of the rates over half a step of damping.
-
-    """
-
+    #: Mass per length rho A [kg/m] and bending stiffness E I_y [N m^2].
     density: float
     bending: float
-    damping: float
+    damping: float  #: tissue damping c_a per length [N s/m^2]
+    #: Formulation `as_printed`: z are the rates, and the modes exert no force on the axis.
     as_printed: bool
-    layer: int
-    stiffness: float
-    growth: float
-    decay: float
+    layer: int  #: index of the layer that contains the tip
+    stiffness: float  #: stiffness of the tissue at the tip [N/m^2]
+    growth: float  #: stiffness factor of swelling
+    decay: float  #: factor of the rates over half a step of damping
 
 
 class Rotated(NamedTuple):
-    """
-    Integrals over one step.
+    """Integrals over one step."""
 
-    Attributes
-    ----------
-    impulse : float
-        Impulse of the modes on the insertion axis, against insertion [N s].
-    tip : float
-        Integral of the tip deflection [m s].
-    reaction, moment : float
-        Impulse of the tissue's reaction along z [N s] and of its moment about the entry point
-        [N m s].
-    lost : float
-        Energy lost to tissue damping [J].
-
-    """
-
-    impulse: float
-    tip: float
+    impulse: float  #: impulse of the modes on the insertion axis, against insertion [N s]
+    tip: float  #: integral of the tip deflection [m s]
+    #: Impulse of the tissue's reaction along z [N s] and of its moment about the entry
+    #: point [N m s].
     reaction: float
     moment: float
-    lost: float
+    lost: float  #: energy lost to tissue damping [J]
 
 
 class NormalPair(NamedTuple):
-    """
-    Normal modes of two shape modes, with the transformation of coordinates.
+    """Normal modes of two shape modes, with the transformation of coordinates."""
 
-    Attributes
-    ----------
-    l11, l21, l22 : float
-        Cholesky factor L of the modal mass rho A G.
-    i11, i22 : float
-        Reciprocals of the diagonal of L.
-    cosine, sine : float
-        Rotation that diagonalizes the stiffness in the coordinates y = L^T q.
-    square1, square2, omega1, omega2 : float
-        Squares of the frequencies [1/s^2], and frequencies [1/s].
-
-    """
-
+    #: Cholesky factor L of the modal mass rho A G.
     l11: float
     l21: float
     l22: float
+    #: Reciprocals of the diagonal of L.
     i11: float
     i22: float
+    #: Rotation that diagonalizes the stiffness in the coordinates y = L^T q.
     cosine: float
     sine: float
+    #: Squares of the frequencies [1/s^2], and frequencies [1/s].
     square1: float
     square2: float
     omega1: float
@@ -108,36 +67,23 @@ class NormalPair(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """
-    Rotation of two normal modes through one step: end values and integrals.
+    """Rotation of two normal modes through one step: end values and integrals."""
 
-    Attributes
-    ----------
-    y1, y2, v1, v2 : float
-        Coordinates y = L^T q at the end, and their rates after the second half step of damping.
-    b1, b2, f1, f2 : float
-        Rates of the normal modes at the start and the end of the undamped rotation.
-    n1, n2 : float
-        Values of the normal modes at the tip.
-    impulse : float
-        Impulse of the modes on the insertion axis, against insertion [N s].
-    lost : float
-        Energy lost to tissue damping [J].
-
-    """
-
+    #: Coordinates y = L^T q at the end, and their rates after the second half step of damping.
     y1: float
     y2: float
     v1: float
     v2: float
+    #: Rates of the normal modes at the start and the end of the undamped rotation.
     b1: float
     b2: float
     f1: float
     f2: float
+    #: Values of the normal modes at the tip.
     n1: float
     n2: float
-    impulse: float
-    lost: float
+    impulse: float  #: impulse of the modes on the insertion axis, against insertion [N s]
+    lost: float  #: energy lost to tissue damping [J]
 
 
 @inlined
@@ -246,12 +192,7 @@ def turn_pair(
 
 @inlined
 def rotate_two(
-    e: Elasticity,
-    layers: Layers,
-    at: ModeIntegrals,
-    q: FloatArray,
-    z: FloatArray,
-    h: float,
+    e: Elasticity, layers: Layers, at: ModeIntegrals, q: FloatArray, z: FloatArray, h: float
 ) -> Rotated:
     """
     Advance the deflections q and momenta z of two modes through a step of h [s], in place.
@@ -317,12 +258,7 @@ def rotate_two(
 
 @compiled
 def rotate_many(
-    e: Elasticity,
-    layers: Layers,
-    at: ModeIntegrals,
-    q: FloatArray,
-    z: FloatArray,
-    h: float,
+    e: Elasticity, layers: Layers, at: ModeIntegrals, q: FloatArray, z: FloatArray, h: float
 ) -> Rotated:
     """Advance the deflections q and momenta z (rates if as printed) through h [s], in place."""
     n = q.shape[0]

@@ -18,24 +18,13 @@ import numpy as np
 
 
 class NormalModes(NamedTuple):
-    """
-    Normal modes of the inserted part.
+    """Normal modes of the inserted part."""
 
-    Attributes
-    ----------
-    shapes : ndarray, shape (n, n)
-        N, one mode per column [kg^-1/2 m^1/2]: q = N a. Generalized forces and values at the
-        tip transform with N^T: N^T Q and N^T phi.
-    inverse : ndarray, shape (n, n)
-        N^-1: a = N^-1 q. Momenta are p = N^-T a_dot.
-    squares : ndarray, shape (n,)
-        Squares of the natural frequencies [1/s^2], ascending.
-
-    """
-
+    #: N, one mode per column [kg^-1/2 m^1/2]: q = N a. Generalized forces and values at the tip
+    #: transform with N^T: N^T Q and N^T phi, shape (n, n).
     shapes: Matrix
-    inverse: Matrix
-    squares: Vector
+    inverse: Matrix  #: N^-1: a = N^-1 q. Momenta are p = N^-T a_dot, shape (n, n)
+    squares: Vector  #: squares of the natural frequencies [1/s^2], ascending, shape (n,)
 
 
 @compiled

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
 from needle_dynamics.arrays import Shaped
-from needle_dynamics.compiled.boxed import Boxed, held_type
+from needle_dynamics.compiled.boxed import Boxed, boxed_type
 import numba
 from numba.core import types
 
@@ -53,7 +53,7 @@ def numba_type(hint: Any) -> Any:
             kind = numba.from_dtype(shaped.dtype)
             return types.Array(kind, shaped.dimensions, 'C', readonly=not shaped.writable)
     if origin is Boxed:
-        return held_type(numba_type(arguments[0]))
+        return boxed_type(numba_type(arguments[0]))
     if origin is tuple and Ellipsis not in arguments:
         return _tuple_type([numba_type(one) for one in arguments])
     if isinstance(hint, type) and issubclass(hint, tuple) and hasattr(hint, '_fields'):

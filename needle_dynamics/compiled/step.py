@@ -1,7 +1,7 @@
 """
 Step of the integrator, and sequences of steps under constant inputs.
 
-One step of length h from (s, u, q, p) is a symmetric splitting, see `needle_dynamics.simulated`:
+One step of length h from (s, u, q, p) is a symmetric splitting:
 drift the depth to the middle of the step, advance the modes at that depth (`modal_flow`), and
 move the insertion axis under the force, the mean force of the modes and friction (`friction`).
 Steps end at the borders of tissue layers, and the motion stops at the hub.
@@ -26,23 +26,7 @@ GRADED_FROM: Final = 0.1
 
 
 class CompiledNeedle(NamedTuple):
-    """
-    Constants of a needle in tissue, from `needle_dynamics.model.NeedleModel.compiled`; SI units.
-
-    Attributes
-    ----------
-    minimum_depth, maximum_depth : float
-        Range of the insertion depth [m].
-    as_printed : bool
-        Formulation `as_printed` instead of `complete`.
-    friction : FrictionConstants
-        Friction along the insertion axis.
-    modes : ModeTables
-        Tables of the shape modes.
-    layers : Layers
-        Layers of tissue.
-
-    """
+    """Constants of a needle in tissue, SI units; see `needle_dynamics.model.NeedleModel`."""
 
     length: float
     linear_density: float
@@ -51,15 +35,16 @@ class CompiledNeedle(NamedTuple):
     moving_mass: float
     carriage_mass: float
     rotary_inertia: float
+    #: Range of the insertion depth [m].
     minimum_depth: float
     maximum_depth: float
     hub_stop: bool
-    as_printed: bool
+    as_printed: bool  #: formulation `as_printed` instead of `complete`
     swelling: float
     swelling_time: float
-    friction: FrictionConstants
-    modes: ModeTables
-    layers: Layers
+    friction: FrictionConstants  #: friction along the insertion axis
+    modes: ModeTables  #: tables of the shape modes
+    layers: Layers  #: layers of tissue
 
 
 @compiled
@@ -77,59 +62,29 @@ def adapted(c: CompiledNeedle, coulomb: float, viscous: float, layers: Layers) -
 
 
 class Inputs(NamedTuple):
-    """
-    Inputs of the base over an interval.
+    """Inputs of the base over an interval."""
 
-    Attributes
-    ----------
-    force : float
-        Insertion force [N], positive into the tissue; ignored if ``moved``.
-    torque : float
-        Torque about x [N m].
-    velocity : float
-        Insertion velocity at the end of the interval [m/s], if ``moved``.
-    moved : bool
-        Whether the base follows a velocity ramp to ``velocity``, at any force.
-
-    """
-
-    force: float
-    torque: float
-    velocity: float
-    moved: bool
+    force: float  #: insertion force [N], positive into the tissue; ignored if ``moved``
+    torque: float  #: torque about x [N m]
+    velocity: float  #: insertion velocity at the end of the interval [m/s], if ``moved``
+    moved: bool  #: whether the base follows a velocity ramp to ``velocity``, at any force
 
 
 class Sums(NamedTuple):
-    """
-    Integrals accumulated over steps.
+    """Integrals accumulated over steps."""
 
-    Attributes
-    ----------
-    tip : float
-        Integral of the tip deflection [m s].
-    reaction, moment : float
-        Impulse of the tissue's reaction along z [N s] and of its moment about the entry point
-        [N m s].
-    resistance : float
-        Impulse of a moved base on the needle, without the inertial part [N s].
-    friction_work, damping_work, input_work : float
-        Energy lost to friction and to tissue damping, and work of the inputs [J].
-    impact_loss : float
-        Energy lost in contacts of the hub [J].
-    contact_time : float
-        Time of the last hub contact [s]; -1 without contact.
-
-    """
-
-    tip: float
+    tip: float  #: integral of the tip deflection [m s]
+    #: Impulse of the tissue's reaction along z [N s] and of its moment about the entry
+    #: point [N m s].
     reaction: float
     moment: float
-    resistance: float
+    resistance: float  #: impulse of a moved base on the needle, without the inertial part [N s]
+    #: Energy lost to friction and to tissue damping, and work of the inputs [J].
     friction_work: float
     damping_work: float
     input_work: float
-    impact_loss: float
-    contact_time: float
+    impact_loss: float  #: energy lost in contacts of the hub [J]
+    contact_time: float  #: time of the last hub contact [s]; -1 without contact
 
 
 class _Motion(NamedTuple):
@@ -228,20 +183,25 @@ def _resistance(
 
 
 @inlined
-def _write_felt(
-    c: CompiledNeedle, inputs: Inputs, before: _Border, now: _Border, span: float, felt: FloatArray
+def _write_loads(
+    c: CompiledNeedle,
+    inputs: Inputs,
+    before: _Border,
+    now: _Border,
+    span: float,
+    loads: FloatArray,
 ) -> None:
     """Write the mean load on the base in a part of the duration, by balance of momentum."""
     gained = now.motion.velocity - before.motion.velocity
     if inputs.moved:
         axial = c.linear_density * c.length * gained
-        felt[0] = (axial + now.sums.resistance - before.sums.resistance) / span
+        loads[0] = (axial + now.sums.resistance - before.sums.resistance) / span
     else:
-        felt[0] = inputs.force - c.carriage_mass * gained / span
+        loads[0] = inputs.force - c.carriage_mass * gained / span
     lateral = (now.momentum - before.momentum + now.sums.reaction - before.sums.reaction) / span
     about_entry = (now.angular - before.angular + now.sums.moment - before.sums.moment) / span
     lever = c.length - 0.5 * (before.motion.depth + now.motion.depth)
-    felt[1], felt[2] = lateral, about_entry + lever * lateral + inputs.torque
+    loads[1], loads[2] = lateral, about_entry + lever * lateral + inputs.torque
 
 
 @inlined
@@ -363,14 +323,14 @@ def advance(
     longest: float,
     graded: bool,
     duration: float,
-    felt: Matrix,
+    loads: Matrix,
 ) -> tuple[float, Sums]:
     """
     Advance a state under constant inputs for ``duration`` [s], in place.
 
     ``state`` is X = [q, q_dot], shape (2 (2 + n),), SI units; ``time`` [s] counts for swelling;
     ``longest`` is the longest step [s]. With ``graded``, steps grow with the insertion depth above
-    a tenth of the needle length, since the modes slow down. ``felt``, shape (parts, 3) or (0, 3),
+    a tenth of the needle length, since the modes slow down. ``loads``, shape (parts, 3) or (0, 3),
     takes the load on the base in equal parts of the duration, at whose ends steps end: mean forces
     along y and z [N] and mean moment about x at the base [N m], by balance of momentum.
 
@@ -392,8 +352,8 @@ def advance(
             z[i] = 0.0
             for j in range(n):
                 z[i] += c.linear_density * at.gram[i, j] * state[4 + n + j]
-    sensed = felt.shape[0] > 0
-    parts = felt.shape[0] if sensed else 1
+    sensed = loads.shape[0] > 0
+    parts = loads.shape[0] if sensed else 1
     motion = _Motion(c.length - state[0], -state[2 + n], 0.0)
     sums = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
     gain = (inputs.velocity - motion.velocity) / duration
@@ -411,7 +371,7 @@ def advance(
             break
         if sensed:
             now = _border(c, at, z, factor, rates, motion, sums)
-            _write_felt(c, inputs, border, now, span, felt[part])
+            _write_loads(c, inputs, border, now, span, loads[part])
             border = now
     left += later
     done = duration - left

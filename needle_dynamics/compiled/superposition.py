@@ -20,7 +20,7 @@ def insert_causes(
     guides: Matrix,
     loads: Matrix,
     tips: Matrix,
-    felt: Matrix,
+    forces: Matrix,
 ) -> None:
     """
     Insert a needle in one plane for m independent causes, with the same k depths for all of them.
@@ -29,25 +29,13 @@ def insert_causes(
     are computed once. The force on the guide is propagated from node to node: by reciprocity, a
     load at the end of the needle acts on the guide as the guide acts on that end.
 
-    Parameters
-    ----------
-    ei : float
-        Bending stiffness [N m^2].
-    skin : float
-        Stiffness of the skin [N/m].
-    free : float
-        Free length between guide and skin [m].
-    depths : ndarray, shape (k,)
-        Insertion depths [m], from 0: an increase cuts an element, a repeated depth is at rest.
-    stiffness : ndarray, shape (k,)
-        Stiffness of the tissue along the element that ends at each depth [N/m^2].
-    tilts : ndarray, shape (m,)
-        Tilt of the guide, by cause.
-    guides, loads : ndarray, shape (k, m)
-        Position of the guide [m] and lateral load on the tip [N] at each depth, by cause.
-    tips, felt : ndarray, shape (k, m)
-        Output: deflection of the tip [m] and force of the needle on the guide [N].
-
+    ``ei`` is the bending stiffness [N m^2], ``skin`` the stiffness of the skin [N/m], ``free`` the
+    free length between guide and skin [m]. ``depths``, shape (k,), are the insertion depths from 0
+    [m]: an increase cuts an element, a repeated depth is at rest; ``stiffness``, shape (k,), is
+    that of the tissue along the element that ends at each depth [N/m^2]. By cause: ``tilts`` of
+    the guide, shape (m,); ``guides`` and ``loads``, shape (k, m), position of the guide [m] and
+    lateral load on the tip [N] at each depth. Outputs, shape (k, m): ``tips``, deflection of the
+    tip [m], and ``forces`` of the needle on the guide [N].
     """
     count = len(tilts)
     s = SpringSupports(
@@ -74,7 +62,9 @@ def insert_causes(
         path[j], force[j] = entry, entry_force * entry
         w[j], t[j] = (1.0 - w_b) * entry, -t_b * entry
         tips[0, j] = w[j] + w_b * guides[0, j] + w_tilt * tilts[j] + c00 * loads[0, j]
-        felt[0, j] = force[j] + force_b * guides[0, j] + force_tilt * tilts[j] + w_b * loads[0, j]
+        forces[0, j] = (
+            force[j] + force_b * guides[0, j] + force_tilt * tilts[j] + w_b * loads[0, j]
+        )
     before = 1.0
     for i in range(1, len(depths)):
         h = depths[i] - depths[i - 1]
@@ -121,4 +111,4 @@ def insert_causes(
         for j in range(count):
             guide, tilt, load = guides[i, j], tilts[j], loads[i, j]
             tips[i, j] = w[j] + w_b * guide + w_tilt * tilt + c00 * load
-            felt[i, j] = force[j] + force_b * guide + force_tilt * tilt + w_b * load
+            forces[i, j] = force[j] + force_b * guide + force_tilt * tilt + w_b * load

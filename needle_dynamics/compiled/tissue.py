@@ -6,7 +6,7 @@ from math import expm1, inf
 from typing import NamedTuple
 
 from needle_dynamics.arrays import Array3, FloatArray, Matrix, Vector
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import compiled, inlined
 
 
 class Layers(NamedTuple):
@@ -18,27 +18,17 @@ class Layers(NamedTuple):
     the integrals without k, plus row m of ``gram``, ``area`` and ``moment``. All of them
     scale with the swelling of the tissue.
 
-    Attributes
-    ----------
-    starts : ndarray, shape (m,)
-        Depths at which the layers begin [m], the first 0.
-    stiffnesses : ndarray, shape (m,)
-        Stiffness of each layer per length [N/m^2].
-    gram : ndarray, shape (m, n, n)
-        Addition to the integral of k phi phi^T [N/m^2].
-    area, moment : ndarray, shape (m, n)
-        Additions to the integrals of k phi [N m^-3/2] and k y phi [N m^-1/2].
-
     """
 
-    starts: Vector
-    stiffnesses: Vector
-    gram: Array3
+    starts: Vector  #: depths at which the layers begin [m], the first 0, shape (m,)
+    stiffnesses: Vector  #: stiffness of each layer per length [N/m^2], shape (m,)
+    gram: Array3  #: addition to the integral of k phi phi^T [N/m^2], shape (m, n, n)
+    #: Additions to the integrals of k phi [N m^-3/2] and k y phi [N m^-1/2], shape (m, n).
     area: Matrix
     moment: Matrix
 
 
-@compiled
+@inlined
 def layer_at(starts: FloatArray, depth: float, layer: int = 0) -> int:
     """Return the layer at a depth [m], searched from ``layer``; at a border the lower layer."""
     while layer + 1 < starts.shape[0] and depth >= starts[layer + 1]:

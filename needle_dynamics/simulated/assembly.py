@@ -97,47 +97,19 @@ def defaults_of(prefix: str, preset: str) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantConstants:
-    """
-    All constants of a simulated plant.
+    """All constants of a simulated plant."""
 
-    Attributes
-    ----------
-    mode : str
-        One of `MODES`.
-    seed : int
-        Seed of all noise.
-    own : PlantSettings
-        Timing, initial state and limits.
-    model : NeedleParameters
-        Needle and tissue.
-    sensor : ForceSensorParameters
-        Force sensor.
-    tip : TipParameters
-        Tip sensor.
-    base : BaseParameters
-        Robot of mode `robot`.
-    indenter : IndenterParameters
-        Tissue and robot of mode `indenter`.
-    steered : bool
-        Whether the needle bends and cuts its own path.
-    steering : SteeringParameters
-        Additional constants of a steered needle.
-    guide : GuideParameters
-        Robot of the needle guide.
-
-    """
-
-    mode: str
-    seed: int
-    steered: bool
-    own: PlantSettings
-    model: NeedleParameters
-    sensor: ForceSensorParameters
-    tip: TipParameters
-    base: BaseParameters
-    indenter: IndenterParameters
-    steering: SteeringParameters
-    guide: GuideParameters
+    mode: str  #: one of `MODES`
+    seed: int  #: seed of all noise
+    steered: bool  #: whether the needle bends and cuts its own path
+    own: PlantSettings  #: timing, initial state and limits
+    model: NeedleParameters  #: needle and tissue
+    sensor: ForceSensorParameters  #: force sensor
+    tip: TipParameters  #: tip sensor
+    base: BaseParameters  #: robot of mode `robot`
+    indenter: IndenterParameters  #: tissue and robot of mode `indenter`
+    steering: SteeringParameters  #: additional constants of a steered needle
+    guide: GuideParameters  #: robot of the needle guide
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlantConstants:

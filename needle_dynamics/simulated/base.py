@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from math import copysign, inf, sqrt
@@ -12,6 +12,10 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.trajectories import check_times
 import numpy as np
+
+#: Parts of a sample interval with constant push force: with friction the velocity follows the
+#: force at once, and a present velocity with a mean force would be delayed by half an interval.
+PUSHES: Final = 4
 
 #: Position error below which the base rests at the end of a trajectory [m].
 _SETTLED: Final = 1e-8
@@ -44,8 +48,7 @@ class BaseMotion:
     Trajectory tracking of a joint position, or pushing with a force, within limits.
 
     ``depth`` is the insertion depth [m] to hold until a trajectory arrives, ``reach`` its range
-    [m], ``force_limit`` the largest push force [N]. ``what`` and ``unit`` name the joint in
-    messages.
+    [m], ``force_limit`` the largest push force [N]. ``joint`` and ``unit`` are for messages.
     """
 
     def __init__(
@@ -54,11 +57,11 @@ class BaseMotion:
         depth: float,
         reach: tuple[float, float],
         force_limit: float = inf,
-        what: str = 'trajectory',
+        joint: str = 'trajectory',
         unit: str = 'm',
     ) -> None:
         self.limits = parameters
-        self._what, self._unit = what, unit
+        self._joint, self._unit = joint, unit
         self._range = reach
         self._force_limit = force_limit
         #: Force of the active push [N].
@@ -92,7 +95,7 @@ class BaseMotion:
         # Written so that NaN is rejected too.
         if not all(low <= at <= high for at in depths if at is not None):
             raise ParameterError(
-                f'{self._what} must stay in [{low:g}, {high:g}] {self._unit}, got '
+                f'{self._joint} must stay in [{low:g}, {high:g}] {self._unit}, got '
                 f'{list(depths)} {self._unit}'
             )
         if None in ends:
@@ -134,6 +137,21 @@ class BaseMotion:
             self._depths[k - 1], self._pushes[k - 1] = depth, False
         self._force = 0.0
         return None
+
+    def pushes(self, time: float, interval: float, depth: Callable[[], float]) -> Iterator[float]:
+        """
+        Yield the push force of each part of a sample interval [N]; nothing during a motion.
+
+        ``time`` and ``interval`` in s; ``depth`` returns the present position of the base [m].
+        """
+        part = interval / PUSHES
+        force: float | None = None
+        for k in range(PUSHES):
+            push = self.push(time + k * part, depth(), part)
+            force = force if push is None else push
+            if force is None:
+                return
+            yield force
 
     def velocity(self, time: float, depth: float, velocity: float, interval: float) -> float:
         """

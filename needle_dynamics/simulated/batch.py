@@ -168,17 +168,22 @@ def simulate_batch(
     if not (np.isfinite(pushes).all() and np.isfinite(turns).all()):
         raise ParameterError('forces and torques must be finite')
     step = checked_step(step)
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     _check(each, starts)
     course = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
     kept, completed = _take(
         each, np.array(np.broadcast_to(starts, (runs, starts.shape[1]))), course, keep=keep,
-        workers=min(workers or os.cpu_count() or 1, runs), progress=progress or (lambda: None),
+        workers=thread_count(workers, runs), progress=progress or (lambda: None),
     )  # fmt: skip
     time = np.arange(count + 1, dtype=np.float64) * interval
     return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
+
+
+def thread_count(workers: int | None, runs: int) -> int:
+    """Return the number of threads of a batch; by default one per core."""
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
+    return min(workers or os.cpu_count() or 1, runs)
 
 
 def _take(

@@ -10,23 +10,11 @@ from needle_ros.timing import apart, NANOSECONDS
 
 
 class AppliedForces(NamedTuple):
-    """
-    Force command.
+    """Force command."""
 
-    Attributes
-    ----------
-    stamp : int
-        Time from which the command is valid [ns].
-    force : float
-        Insertion force [N], positive into the tissue.
-    torque : float
-        Torque about the insertion axis [N m].
-
-    """
-
-    stamp: int = 0
-    force: float = 0.0
-    torque: float = 0.0
+    stamp: int = 0  #: time from which the command is valid [ns]
+    force: float = 0.0  #: insertion force [N], positive into the tissue
+    torque: float = 0.0  #: torque about the insertion axis [N m]
 
 
 class Commands:
@@ -44,24 +32,6 @@ class Commands:
     node, however short its lifetime, and is rejected until the number of nodes changes.
 
     Arguments are in s, N, N m, N/s and W; force and torque limits apply to either sign.
-
-    Attributes
-    ----------
-    held : AppliedForces
-        Command that acts until the next sample.
-    newest : AppliedForces
-        Command that acts from the next sample on, unless it exceeds the timeout by then.
-    refused : int
-        Number of invalid commands.
-    stale : int
-        Number of commands with a stamp outside the timeout, past or future.
-    overtaken : int
-        Number of commands that arrived after a newer one (out of order).
-    duplicates : int
-        Number of nodes that publish commands in addition to the first.
-    exhausted : bool
-        Whether commands have supplied more than the permitted energy; reset at half of it.
-
     """
 
     def __init__(
@@ -80,24 +50,30 @@ class Commands:
         self._growth = force_rate_limit * interval
         #: Largest energy [J], and its decay factor per sample with a time constant of 1 s.
         self._most_energy, self._left = power_limit, exp(-interval)
+        #: Number of commands that were invalid, had a stamp outside the timeout, and arrived after
+        #: a newer one (out of order).
         self.refused = self.stale = self.overtaken = 0
         self.begin()
 
     def begin(self) -> None:
         """Discard all commands and their senders, as at an activation."""
-        self.held = self.newest = AppliedForces()
+        #: Command that acts until the next sample, and command that acts from then on, unless it
+        #: exceeds the timeout by then.
+        self.acting = self.newest = AppliedForces()
+        #: Number of nodes that publish commands in addition to the first, and of all of them.
         self.duplicates = self._number = 0
         self._quiet = 0
         #: Stamps of the samples to which a command may respond, and whether commands do.
         self._samples: dict[int, None] = {}
         self._answers = False
+        #: Whether commands have supplied more than the permitted energy; reset at half of it.
         self.exhausted = False
         #: Supplied energy with exponential decay [J].
         self._energy = 0.0
 
     def forget(self) -> None:
         """Reset the force to zero; commands older than the newest are still discarded."""
-        self.held = self.newest = AppliedForces(self.newest.stamp)
+        self.acting = self.newest = AppliedForces(self.newest.stamp)
 
     def offer(
         self, stamp: int, frame: str, force: float, torque: float, now: int
@@ -185,17 +161,17 @@ class Commands:
         Hold the newest command until the next sample, unless it exceeds the timeout.
 
         ``stamp`` is the time of the present sample [ns], ``distance`` the displacement of the
-        needle under the command held before [m], for the supplied energy.
+        needle under the previous command [m], for the supplied energy.
         """
-        samples, before, newest = self._samples, self.held.force, self.newest
+        samples, before, newest = self._samples, self.acting.force, self.newest
         samples[stamp] = None
         while (first := next(iter(samples))) < stamp - self._timeout or first > stamp:
             del samples[first]
         self._energy = self._left * self._energy + max(0.0, before * distance)
         self.exhausted = self._energy > (0.5 if self.exhausted else 1.0) * self._most_energy
         if self.exhausted or stamp - newest.stamp > self._timeout:
-            self.held = AppliedForces(newest.stamp)
+            self.acting = AppliedForces(newest.stamp)
             return
         growth = self._growth
         force = min(max(newest.force, min(before, 0.0) - growth), max(before, 0.0) + growth)
-        self.held = newest if force == newest.force else newest._replace(force=force)
+        self.acting = newest if force == newest.force else newest._replace(force=force)

@@ -184,7 +184,7 @@ class ForceSensor:
                 f'{p.rate:g} Hz; {fits:g} Hz would do'
             )
         self.samples = samples
-        self._felt = np.empty((samples, 6))
+        self._wrenches = np.empty((samples, 6))
         self._rng = np.random.default_rng(seed)
         self._constants = np.array(
             [
@@ -233,10 +233,10 @@ class ForceSensor:
             If the number of samples is wrong.
 
         """
-        felt = np.array(wrench, dtype=np.float64)
-        if felt.ndim == 2 and len(felt) != self.samples:
+        wrenches = np.array(wrench, dtype=np.float64)
+        if wrenches.ndim == 2 and len(wrenches) != self.samples:
             raise ShapeError(
-                f'wrench must have shape (6,) or ({self.samples}, 6), got {felt.shape}'
+                f'wrench must have shape (6,) or ({self.samples}, 6), got {wrenches.shape}'
             )
         if self._next == len(self._drawn):
             self._drawn = self._rng.standard_normal(self._block)
@@ -244,20 +244,20 @@ class ForceSensor:
         if self._before is None:
             # Filters start in the steady state of the first sample.
             limit = self._constants[2]
-            first = felt if felt.ndim == 1 else felt[0]
+            first = wrenches if wrenches.ndim == 1 else wrenches[0]
             value = np.clip(first + self._offset, -limit, limit)
             b, a = self._sections[:, :3], self._sections[:, 3:]
             self._memory[:, 0] = (1.0 - b[:, :1]) * value
             self._memory[:, 1] = (b[:, 2:] - a[:, 2:]) * value
             self._before = first
-        if felt.ndim == 1:
-            straight(self._before if start is None else start, felt, self._felt)
-            self._before, felt = felt, self._felt
+        if wrenches.ndim == 1:
+            straight(self._before if start is None else start, wrenches, self._wrenches)
+            self._before, wrenches = wrenches, self._wrenches
         else:
-            self._before = felt[-1]
+            self._before = wrenches[-1]
         reading = np.empty(6)
         sense(
-            felt, self._drawn[self._next], self._constants, self._sections, self._memory,
+            wrenches, self._drawn[self._next], self._constants, self._sections, self._memory,
             self._offset, self._zero, reading,
         )  # fmt: skip
         self._next += 1

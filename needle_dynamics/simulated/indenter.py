@@ -11,10 +11,9 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.measured import Measurement
-from needle_dynamics.simulated.plant import AT_REST
-from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, Topic
-from needle_ros.errors import JobError, ParameterError
+from needle_dynamics.simulated.measured import AT_REST, Measurement, SimulatedPlant
+from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE
+from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values
@@ -91,28 +90,23 @@ class IndenterParameters:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Press:
-    """
-    Measurements at the end of one sample interval.
+    """Measurements at the end of one sample interval."""
 
-    Attributes
-    ----------
-    position : ndarray, shape (3,)
-        Measured position of the end-effector x y z [m], zero without force.
-    force : ndarray, shape (2,)
-        True force of the end-effector on the tissue along x and z [N].
-    wrench : ndarray, shape (6,)
-        Reading of the sensor: force of the end-effector on the tissue x y z [N], torque [N m].
-
-    """
-
+    #: Measured position of the end-effector x y z [m], zero without force, shape (3,).
     position: FloatArray
+    #: True force of the end-effector on the tissue along x and z [N], shape (2,).
     force: FloatArray
+    #: Reading of the sensor: force of the end-effector on the tissue x y z [N], torque [N m],
+    #: shape (6,).
     wrench: FloatArray
 
 
-class Indenter:
+class Indenter(SimulatedPlant):
     """
     Indent the tissue with a commanded force in the plane, one sample at a time.
+
+    A trajectory has efforts of the joints `x` and `z` [N] and no positions; it is linear in time
+    from the present force.
 
     Parameters
     ----------
@@ -132,7 +126,7 @@ class Indenter:
     #: Insertion depth; there is no needle.
     depth = 0.0
 
-    topics: tuple[Topic, ...] = (BASE_WRENCH, END_EFFECTOR_POSE)
+    topics = (BASE_WRENCH, END_EFFECTOR_POSE)
 
     def __init__(
         self,
@@ -142,12 +136,10 @@ class Indenter:
         seed: int,
         force_limit: float = np.inf,
     ) -> None:
-        self.interval = 1.0 / rate
-        self.time = 0.0
+        super().__init__(sensor, rate)
         self._parameters = parameters
         self._levels = np.array(parameters.force_levels)
         self._entries = parameters.matrices.reshape(-1, 4).T
-        self._sensor = sensor
         # Independent of the random sequence of the force sensor.
         self._rng = np.random.default_rng([seed, 1])
         self._force_limit = force_limit
@@ -155,11 +147,9 @@ class Indenter:
         self._moving = False
         self._times = np.array([0.0])
         self._forces = np.zeros((1, 2))
-        self._count = 0
 
     @property
     def report(self) -> PlantStatus:
-        """Status with the forces only."""
         x, z = self._force
         return PlantStatus(force=(x, z))
 
@@ -170,26 +160,6 @@ class Indenter:
         positions: Sequence[Sequence[float]],
         efforts: Sequence[Sequence[float]],
     ) -> None:
-        """
-        Start a new force trajectory, linear in time from the present force.
-
-        Parameters
-        ----------
-        joints : sequence of str
-            Names of the joints, including `x` and `z`.
-        times : sequence of float
-            Time of each point from now [s].
-        positions : sequence of sequence of float
-            Must be empty: the indenter is force controlled.
-        efforts : sequence of sequence of float
-            Forces on the tissue [N].
-
-        Raises
-        ------
-        ParameterError
-            If times do not increase, or a force is missing or beyond the limit.
-
-        """
         check_times(times)
         if any(len(point) for point in positions):
             raise ParameterError('the indenter takes efforts, not positions')
@@ -204,52 +174,17 @@ class Indenter:
         self._times = self.time + np.append(0.0, times)
         self._forces = np.vstack([self._force, np.array(forces, dtype=np.float64).T])
 
-    def tare(self) -> None:
-        """
-        Zero the sensor on the mean of its latest readings.
-
-        Raises
-        ------
-        JobError
-            If the force changes, or has not been steady long enough.
-
-        """
-        if self._moving:
-            raise JobError('the end-effector moves; it must rest')
-        self._sensor.tare()
+    def _motion(self) -> str:
+        return 'the end-effector moves' if self._moving else ''
 
     def change(self, _parameters: NeedleParameters) -> None:
-        """
-        Ignore the constants: there is no needle.
-
-        Parameters
-        ----------
-        _parameters : NeedleParameters
-            Ignored.
-
-        """
+        # There is no needle.
+        return
 
     def take(self, _force: float, _torque: float) -> list[Measurement]:
-        """
-        Advance by one sample interval and return the measurements to publish.
-
-        Parameters
-        ----------
-        _force, _torque : float
-            Ignored: commands do not act on the end-effector.
-
-        Returns
-        -------
-        list of Measurement
-            One per topic.
-
-        """
         press = self.advance()
         pose = [*press.position.tolist(), 0.0, 0.0, 0.0, 1.0]
-        return [
-            (BASE_WRENCH.name, 0, press.wrench.tolist()),
-            (END_EFFECTOR_POSE.name, 0, pose),
-        ]
+        return [(BASE_WRENCH.name, 0, press.wrench.tolist()), (END_EFFECTOR_POSE.name, 0, pose)]
 
     def outline(self) -> None:
         """Return None: there is no needle to display."""
@@ -293,7 +228,6 @@ class Indenter:
         """
         p = self._parameters
         self._count += 1
-        self.time = self._count * self.interval
         wanted = np.array([np.interp(self.time, self._times, f) for f in self._forces.T])
         change = wanted - self._force
         size = hypot(*change)

@@ -1,17 +1,7 @@
 """
 Structure-preserving integrator of the needle: frozen-depth modal flow, exact friction flow.
 
-One step of length h from (s, u, q, p), u = s_dot and p = rho A G q_dot, is a symmetric
-splitting of the Hamiltonian system:
-
-1. drift the depth to the middle of the step with the velocity at its start;
-2. with the depth frozen there, the modal part is linear: tissue damping and the rotation in the
-   eigenbasis of (E I_y H + k_a G, rho A G) are exact for any frequency. With the momenta as
-   variables dG/dt needs no term. The impulse -dH/ds of the modes on the insertion axis along
-   this rotation is also an exact integral;
-3. with constant insertion force and mean modal force over the step, the insertion axis under
-   viscous and set-valued Coulomb friction has an exact flow, including stops and sticking.
-
+The splitting of a step is described in `needle_dynamics.compiled.step` and docs/architecture.md.
 The integrator is of second order, symplectic without friction and damping (the total
 displacement then equals drift-kick-drift), sticks exactly, and has no stability limit from the
 modes or from viscous friction. Source of the method: E. Hairer, C. Lubich, G. Wanner, "Geometric
@@ -56,7 +46,7 @@ class Interval:
         Mean force of the base on the needle along z [N], from the momentum balance.
     moment : float
         Mean moment of the base on the needle about x at the base [N m], including the torque.
-    felt : ndarray, shape (parts, 3)
+    loads : ndarray, shape (parts, 3)
         These three loads for each of the equal parts of the interval. Not compared by ``==``.
     friction_work, damping_work : float
         Energy dissipated by friction and tissue damping [J].
@@ -73,7 +63,7 @@ class Interval:
     axial_force: float
     lateral_force: float
     moment: float
-    felt: FloatArray = field(compare=False)
+    loads: FloatArray = field(compare=False)
     friction_work: float
     damping_work: float
     input_work: float
@@ -121,8 +111,8 @@ class Integrator:
     >>> from needle_dynamics import Integrator, NeedleModel, NeedleParameters
     >>> parameters = NeedleParameters.preset('phantom')
     >>> needle = Integrator(parameters, NeedleModel(parameters).state_at(0.05))
-    >>> seen = needle.advance(0.1, force=3.0)
-    >>> print(f'{needle.depth:.4f} m, {needle.velocity:.4f} m/s, {seen.axial_force:.1f} N')
+    >>> means = needle.advance(0.1, force=3.0)
+    >>> print(f'{needle.depth:.4f} m, {needle.velocity:.4f} m/s, {means.axial_force:.1f} N')
     0.0508 m, 0.0081 m/s, 3.0 N
 
     """
@@ -266,9 +256,9 @@ class Integrator:
 
         """
         before, clock, depth = self._state.copy(), self.time, self.depth
-        way = force
+        direction = force
         try:
-            seen = self.advance(duration, force)
+            means = self.advance(duration, force)
         except InsertionDepthError:
             # At the speed limit the depth may stay within its range.
             too_fast = True
@@ -276,11 +266,11 @@ class Integrator:
             # The hub may have stopped a motion that was too fast.
             gone = abs(self.depth - depth)
             too_fast = max(abs(self.velocity), gone / duration) > speed_limit
-            way = self.velocity or force
+            direction = self.velocity or force
         if too_fast:
             self._state[:], self.time = before, clock
-            seen = self.advance_moved(duration, copysign(speed_limit, way))
-        return seen
+            means = self.advance_moved(duration, copysign(speed_limit, direction))
+        return means
 
     def _run(self, duration: float, inputs: Inputs, parts: int) -> Interval:
         if not 0.0 < duration < inf:
@@ -289,19 +279,19 @@ class Integrator:
             if not isfinite(getattr(inputs, name)):
                 raise ParameterError(f'{name} must be finite, got {getattr(inputs, name)!r}')
         # An integer would cause the step to be compiled for another type.
-        duration, felt = float(duration), np.empty((parts, 3))
+        duration, loads = float(duration), np.empty((parts, 3))
         if self.tolerance is None:
-            sums = self._take(duration, inputs, self.step, felt)
+            sums = self._take(duration, inputs, self.step, loads)
         else:
-            sums = self._refine(duration, inputs, felt, self.tolerance)
+            sums = self._refine(duration, inputs, loads, self.tolerance)
         self.time += duration
-        axial, lateral, moment = (np.add.reduce(felt) / parts).tolist()
+        axial, lateral, moment = (np.add.reduce(loads) / parts).tolist()
         return Interval(
             tip_deflection=sums.tip / duration,
             axial_force=axial,
             lateral_force=lateral,
             moment=moment,
-            felt=felt,
+            loads=loads,
             friction_work=sums.friction_work,
             damping_work=sums.damping_work,
             input_work=sums.input_work,
@@ -309,10 +299,10 @@ class Integrator:
             contact_time=sums.contact_time if sums.contact_time >= 0.0 else None,
         )
 
-    def _take(self, duration: float, inputs: Inputs, longest: float, felt: FloatArray) -> Sums:
+    def _take(self, duration: float, inputs: Inputs, longest: float, loads: FloatArray) -> Sums:
         """Integrate over the duration under constant inputs."""
         left, sums = advance(
-            self._needle, self._state, self.time, inputs, longest, self.graded, duration, felt
+            self._needle, self._state, self.time, inputs, longest, self.graded, duration, loads
         )
         if left != 0.0:
             if left > 0.0:
@@ -320,7 +310,9 @@ class Integrator:
             raise not_completed(self.model, self._state, left)
         return sums
 
-    def _refine(self, duration: float, inputs: Inputs, felt: FloatArray, tolerance: float) -> Sums:
+    def _refine(
+        self, duration: float, inputs: Inputs, loads: FloatArray, tolerance: float
+    ) -> Sums:
         """Halve the step until the state at the end of the interval has converged."""
         start, clock = self._state.copy(), self.time
         longest = min(duration, self.step / self._refinement)
@@ -328,7 +320,7 @@ class Integrator:
         def attempt(longest: float) -> Sums | InsertionDepthError:
             self._state[:], self.time = start, clock
             try:
-                return self._take(duration, inputs, longest, felt)
+                return self._take(duration, inputs, longest, loads)
             except InsertionDepthError as error:
                 return error
 

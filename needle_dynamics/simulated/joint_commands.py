@@ -19,6 +19,16 @@ _EFFORT: Final = 'effort'
 _KINDS: Final = (_POSITION, _VELOCITY, _EFFORT)
 
 
+#: Names of the joints of the guide, in the order of the message.
+GUIDE_JOINTS: Final = tuple(joint.name for joint in STEERING_JOINTS)
+
+
+def moved_joints(mode: str, *, steered: bool) -> tuple[str, ...]:
+    """Return the joints of a needle that follow positions."""
+    insertion = (INSERTION,) if mode == 'robot' else ()
+    return (*insertion, *GUIDE_JOINTS) if steered else insertion
+
+
 class JointSetpoints(NamedTuple):
     """Target positions [m or rad] by joint, with the time to reach them [s]."""
 
@@ -27,27 +37,14 @@ class JointSetpoints(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """
-    Content of a `joint_commands` message.
+    """Content of a `joint_commands` message."""
 
-    Attributes
-    ----------
-    force, torque : float
-        Axial force [N] and torque [N m]; NaN if an effort that was a number is now NaN.
-    motions : list of JointSetpoints
-        Joint motions, only where the message has new values.
-    stamp : int
-        Stamp of the message [ns].
-    given : dict
-        Latest numbers by kind and joint.
-
-    """
-
+    #: Axial force [N] and torque [N m]; NaN if an effort that was a number is now NaN.
     force: float
     torque: float
-    motions: list[JointSetpoints]
-    stamp: int
-    given: dict[tuple[str, str], float]
+    motions: list[JointSetpoints]  #: joint motions, only where the message has new values
+    stamp: int  #: stamp of the message [ns]
+    given: dict[tuple[str, str], float]  #: latest numbers by kind and joint
 
 
 class JointCommands:
@@ -62,17 +59,11 @@ class JointCommands:
     """
 
     def __init__(self, mode: str, *, steered: bool, shortest: float, longest: float) -> None:
-        guide = tuple(joint.name for joint in STEERING_JOINTS) if steered else ()
-        #: Joints that accept each kind of command.
-        self._takes: dict[str, tuple[str, ...]] = {_POSITION: (), _EFFORT: ()}
+        moved, pushed = moved_joints(mode, steered=steered), tuple[str, ...]()
         if mode == 'simulation':
-            self._takes = {
-                _POSITION: guide,
-                _EFFORT: (INSERTION,) if steered else (INSERTION, ROTATION),
-            }
-        elif mode == 'robot':
-            self._takes = {_POSITION: (INSERTION, *guide), _EFFORT: ()}
-        self._takes[_VELOCITY] = self._takes[_POSITION]
+            pushed = (INSERTION,) if steered else (INSERTION, ROTATION)
+        #: Joints that accept each kind of command.
+        self._takes = {_POSITION: moved, _VELOCITY: moved, _EFFORT: pushed}
         self._shortest, self._longest = shortest, longest
         self.forget()
 

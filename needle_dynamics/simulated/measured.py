@@ -1,15 +1,22 @@
-"""Common interface of all simulated plants."""
+"""Common base of all simulated plants, and their measurements."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
-from needle_ros.contract import Topic
+from needle_dynamics.simulated.force_sensor import ForceSensor
+from needle_dynamics.simulated.tip_sensor import TipReading
+from needle_ros.contract import BASE_WRENCH, GROUND_TRUTH, JOINT_STATES, TIP_DEFLECTION, Topic
+from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
 import numpy as np
+
+#: Velocity below which taring is permitted [m/s].
+AT_REST: Final = 1e-6
 
 #: Measurement for one topic: topic name, sample intervals since the time of the stamp, and values
 #: in the order of the message.
@@ -17,25 +24,12 @@ Measurement: TypeAlias = tuple[str, int, list[float]]
 
 
 class MeasuredShape(NamedTuple):
-    """
-    Needle shape for display, in the frame of the entry point.
+    """Needle shape for display, in the frame of the entry point."""
 
-    Attributes
-    ----------
-    base : ndarray, shape (3,)
-        Needle base [m].
-    points : ndarray, shape (k, 3)
-        Points from the start of the bending part to the tip [m].
-    slopes : ndarray, shape (k, 2)
-        Slopes in x and z at the points.
-    path : ndarray, shape (m, 3)
-        Path cut by the tip [m]; empty for a needle that does not cut.
-
-    """
-
-    base: FloatArray
-    points: FloatArray
-    slopes: FloatArray
+    base: FloatArray  #: needle base [m], shape (3,)
+    points: FloatArray  #: points from the start of the bending part to the tip [m], shape (k, 3)
+    slopes: FloatArray  #: slopes in x and z at the points, shape (k, 2)
+    #: Path cut by the tip [m]; empty for a needle that does not cut, shape (m, 3).
     path: FloatArray
 
     @property
@@ -54,21 +48,32 @@ class MeasuredShape(NamedTuple):
         return (self.points[-1] - self.base).tolist(), self.turns[-1].tolist()
 
 
-class SimulatedPlant(Protocol):
-    """A plant that is advanced one sample at a time."""
+class SimulatedPlant(ABC):
+    """A plant that is advanced one sample at a time, with a force sensor; ``rate`` is in Hz."""
+
+    topics: tuple[Topic, ...]  #: published topics
+
+    def __init__(self, sensor: ForceSensor, rate: float) -> None:
+        self.interval = 1.0 / rate
+        self._sensor = sensor
+        self._count = 0
 
     @property
-    def topics(self) -> tuple[Topic, ...]:
-        """Published topics."""
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self._count * self.interval
 
     @property
+    @abstractmethod
     def depth(self) -> float:
-        """Insertion depth [m]."""
+        """Insertion depth [m]; 0 without a needle."""
 
     @property
+    @abstractmethod
     def report(self) -> PlantStatus:
         """Status with the state of the simulation only."""
 
+    @abstractmethod
     def follow(
         self,
         joints: Sequence[str],
@@ -76,16 +81,103 @@ class SimulatedPlant(Protocol):
         positions: Sequence[Sequence[float]],
         efforts: Sequence[Sequence[float]],
     ) -> None:
-        """Follow a trajectory from now on; units are s, m or rad, and N."""
+        """
+        Follow a trajectory from now on, linear in time between its points.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints.
+        times : sequence of float
+            Time of each point from now [s].
+        positions, efforts : sequence of sequence of float
+            Position [m or rad] of each joint at each point, or its force [N] at the end of a push.
+
+        Raises
+        ------
+        ParameterError
+            If the plant has no such joint, or a joint cannot follow; then no joint moves.
+
+        """
 
     def tare(self) -> None:
-        """Zero the force sensor, or raise JobError."""
+        """
+        Zero the force sensor on the mean of its latest readings.
 
+        Raises
+        ------
+        JobError
+            If the plant moves, or has not rested long enough.
+
+        """
+        motion = self._motion()
+        if motion:
+            raise JobError(f'{motion}; it must rest')
+        self._sensor.tare()
+
+    @abstractmethod
+    def _motion(self) -> str:
+        """Describe the motion that prevents a tare, '' at rest."""
+
+    @abstractmethod
     def change(self, parameters: NeedleParameters) -> None:
-        """Change the constants of the needle."""
+        """
+        Change the constants of the needle and continue from the present state.
 
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants; ignored without a needle.
+
+        Raises
+        ------
+        ShapeError, InsertionDepthError
+            If the state is invalid for the new constants; the old constants are kept.
+
+        """
+
+    @abstractmethod
     def take(self, force: float, torque: float) -> list[Measurement]:
-        """Advance by one interval under a force [N] and torque [N m]; `joint_states` is last."""
+        """
+        Advance by one sample interval and return the measurements to publish.
 
+        Parameters
+        ----------
+        force, torque : float
+            Commanded force and torque [N, N m], for a needle without a robot.
+
+        Returns
+        -------
+        list of Measurement
+            One per topic, `joint_states` last, so that a responding node has all of them.
+
+        Raises
+        ------
+        InsertionDepthError
+            If the needle left the tissue.
+
+        """
+
+    @abstractmethod
     def outline(self) -> MeasuredShape | None:
         """Return the needle shape for display; None without a needle."""
+
+
+def velocity_text(velocity: float) -> str:
+    """Describe the motion of a needle with a velocity [m/s], '' at rest."""
+    if abs(velocity) <= AT_REST:
+        return ''
+    return f'the needle moves at {1e3 * velocity:.3g} mm/s'
+
+
+def needle_measurements(
+    wrench: list[float], tip: TipReading | None, truth: list[float], joints: list[float]
+) -> list[Measurement]:
+    """Return the measurements of a plant with a needle; ``tip`` is None without a reading."""
+    reading = [] if tip is None else [(TIP_DEFLECTION.name, tip.age, tip.point)]
+    return [
+        (BASE_WRENCH.name, 0, wrench),
+        *reading,
+        (GROUND_TRUTH.name, 0, truth),
+        (JOINT_STATES.name, 0, joints),
+    ]

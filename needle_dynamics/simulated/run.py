@@ -32,24 +32,15 @@ _ROUNDING: Final = 2
 
 
 class Event(NamedTuple):
-    """
-    Input of a plant other than commands, effective from the next sample on.
+    """Input of a plant other than commands, effective from the next sample on."""
 
-    Attributes
-    ----------
-    kind : str
-        ``configured``: the plant was built from the parameters in ``content``. ``time``: the
-        sample is not one period after the previous one. ``trajectory``: ``content`` has the
-        arguments of `Plant.follow`. ``motion``: likewise, from `joint_commands`. ``parameters``:
-        the parameters in ``content`` changed. ``tare``: the force sensor was zeroed. ``reset``:
-        state, sensor and noise were reset to their start.
-    content : Mapping[str, Any]
-        JSON-compatible values.
-
-    """
-
+    #: ``configured``: the plant was built from the parameters in ``content``. ``time``: the sample
+    #: is not one period after the previous one. ``trajectory``: ``content`` has the arguments of
+    #: `Plant.follow`. ``motion``: likewise, from `joint_commands`. ``parameters``: the parameters
+    #: in ``content`` changed. ``tare``: the force sensor was zeroed. ``reset``: state, sensor and
+    #: noise were reset to their start.
     kind: str
-    content: Mapping[str, Any] = {}
+    content: Mapping[str, Any] = {}  #: JSON-compatible values
 
 
 class PlantRun:
@@ -168,10 +159,10 @@ class PlantRun:
         """
         Take a sample with a stamp [ns] and return its measurements, `joint_states` last.
 
-        ``command`` is the command that acted since the previous sample, by default the held
+        ``command`` is the command that acted since the previous sample, by default the acting
         command.
         """
-        acting = self.commands.held if command is None else command
+        acting = self.commands.acting if command is None else command
         before = self.plant.depth
         measured = self.plant.take(acting.force, acting.torque)
         # Integer difference first: a float has too few digits for a stamp.

@@ -5,38 +5,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid
+from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid, PUSHES
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.measured import MeasuredShape, Measurement
-from needle_dynamics.simulated.plant import AT_REST
+from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
+from needle_dynamics.simulated.measured import (
+    AT_REST,
+    MeasuredShape,
+    Measurement,
+    needle_measurements,
+    SimulatedPlant,
+    velocity_text,
+)
 from needle_dynamics.simulated.tip_sensor import TipSensor
 from needle_dynamics.steering.insertion import Insertion
 from needle_ros.contract import (
     BASE_WRENCH,
-    GROUND_TRUTH,
     INSERTION,
-    JOINT_STATES,
     ROLL,
     steered_states,
     steered_truth,
     STEERING_JOINTS,
     TIP_DEFLECTION,
-    Topic,
 )
-from needle_ros.errors import JobError, ParameterError
+from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
-
-#: Parts of a sample interval with constant push force, as in `Plant`.
-_PUSHES: Final = 4
-
-#: Names of the joints other than `insertion`, in the order of the message.
-_JOINTS: Final = tuple(joint.name for joint in STEERING_JOINTS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,10 +66,10 @@ class GuideParameters:
         limits = BaseParameters(
             speed_limit=speed, acceleration_limit=speed / self.rise_time, position_gain=gain
         )
-        return BaseMotion(limits, 0.0, (-reach, reach), what=joint, unit=unit)
+        return BaseMotion(limits, 0.0, (-reach, reach), joint=joint, unit=unit)
 
 
-class SteeredPlant:
+class SteeredPlant(SimulatedPlant):
     """
     Steered needle under a commanded force or moved by a robot, with guide and sensors.
 
@@ -89,40 +87,36 @@ class SteeredPlant:
         robot: BaseParameters,
         base: BaseMotion | None = None,
     ) -> None:
+        super().__init__(sensor, rate)
         self.insertion = insertion
         self.base = base
-        self.interval = 1.0 / rate
-        self.time = 0.0
-        self.topics: tuple[Topic, ...] = (
+        self.topics = (
             BASE_WRENCH, TIP_DEFLECTION, steered_truth(commanded=base is None), steered_states(),
         )  # fmt: skip
-        self._sensor, self._tip_sensor = sensor, tip
-        self._motions = {name: guide.motion(name, robot.position_gain) for name in _JOINTS}
+        self._tip_sensor = tip
+        self._motions = {name: guide.motion(name, robot.position_gain) for name in GUIDE_JOINTS}
         #: Position and velocity of the joints other than `insertion`.
-        self._at = dict.fromkeys(_JOINTS, 0.0)
-        self._velocity = dict.fromkeys(_JOINTS, 0.0)
+        self._at = dict.fromkeys(GUIDE_JOINTS, 0.0)
+        self._velocity = dict.fromkeys(GUIDE_JOINTS, 0.0)
         #: Joints in motion.
         self._moving: set[str] = set()
         self._resolution = robot.encoder_resolution if base is not None else 0.0
-        self._felt = np.zeros((sensor.samples, 6))
+        self._wrenches = np.zeros((sensor.samples, 6))
         # Fraction of each sensor sample within each push interval, shape (pushes, samples).
-        begins = np.arange(sensor.samples) * (_PUSHES / sensor.samples)
-        pushes, longest = np.arange(_PUSHES)[:, np.newaxis], _PUSHES / sensor.samples
+        begins = np.arange(sensor.samples) * (PUSHES / sensor.samples)
+        pushes, longest = np.arange(PUSHES)[:, np.newaxis], PUSHES / sensor.samples
         common = np.minimum(begins + longest, pushes + 1) - np.maximum(begins, pushes)
         self._shares = np.maximum(common, 0.0) / longest
         self._tip = [*insertion.needle.tip.tolist(), insertion.needle.tip_roll]
         #: Load of the guide on the needle, in the order of the guide joints.
-        self._load = [0.0] * len(_JOINTS)
-        self._count = 0
+        self._load = [0.0] * len(GUIDE_JOINTS)
 
     @property
     def depth(self) -> float:
-        """Insertion depth [m]."""
         return self.insertion.depth
 
     @property
     def report(self) -> PlantStatus:
-        """Status with the state of needle and guide only."""
         x, y, z, roll = self._tip
         return PlantStatus(insertion_depth=y, tip=(x, z), tip_roll=roll, joint=dict(self._at))
 
@@ -136,12 +130,9 @@ class SteeredPlant:
         """
         Follow a trajectory of guide, roll and base from now on; omitted joints continue.
 
-        ``times`` are relative to now [s], ``positions`` in m or rad, ``efforts`` of `insertion` in
-        N at the end of a push. Without a base, `insertion` is ignored: it is the reference of a
-        controller. If a joint is unknown or cannot follow, ParameterError is raised and no joint
-        moves.
+        Without a base, `insertion` is ignored: it is the reference of a controller.
         """
-        known = (INSERTION, *_JOINTS)
+        known = (INSERTION, *GUIDE_JOINTS)
         if not joints or not set(joints) <= {*known} or len({*joints}) < len(joints):
             raise ParameterError(f'takes joints of {", ".join(known)}, got {list(joints)}')
         check_times(times)
@@ -162,14 +153,9 @@ class SteeredPlant:
         self._motions |= followed
         self._moving |= {*followed}
 
-    def tare(self) -> None:
-        """Zero the sensor on the mean of its latest readings; needle and guide must rest."""
-        velocity = self.insertion.velocity
-        if abs(velocity) > AT_REST:
-            raise JobError(f'the needle moves at {1e3 * velocity:.3g} mm/s; it must rest')
-        if self._moving:
-            raise JobError(f'{", ".join(sorted(self._moving))} moves; it must rest')
-        self._sensor.tare()
+    def _motion(self) -> str:
+        joints = ', '.join(sorted(self._moving))
+        return velocity_text(self.insertion.velocity) or (joints and f'{joints} moves')
 
     def change(self, parameters: NeedleParameters) -> None:
         """Change the friction constants."""
@@ -182,40 +168,36 @@ class SteeredPlant:
         The commanded insertion force [N] is ignored when a base moves the needle.
         """
         across = self._move_guide() if self._moving else {}
-        felt = self._felt
+        wrenches = self._wrenches
         if self.base is None:
             self.insertion.push(self.interval, force, **across)
-            felt[:, 1] = force
+            wrenches[:, 1] = force
         else:
             self._carry(self.base, across)
         self._count += 1
-        self.time = self._count * self.interval
         x, z, about_x, about_y, about_z = self.insertion.wrench.tolist()
-        felt[:, 0], felt[:, 2:] = x, (z, about_x, about_y, about_z)
+        wrenches[:, 0], wrenches[:, 2:] = x, (z, about_x, about_y, about_z)
         # A slope in z turns about x; a slope in x turns about z in the opposite direction.
         self._load = [x, z, -about_z, about_x, about_y]
         moving = bool(self._moving) or abs(self.insertion.velocity) > AT_REST
-        return list(self._sensor.measure(felt, moving=moving).tolist())
+        return list(self._sensor.measure(wrenches, moving=moving).tolist())
 
     def _carry(self, base: BaseMotion, across: dict[str, Any]) -> None:
         """Move the needle along its axis with the base, or push it."""
         insertion, interval = self.insertion, self.interval
-        part = interval / _PUSHES
-        push = base.push(self.time, self.depth, part)
-        if push is None:
+        part, limit = interval / PUSHES, base.limits.speed_limit
+        forces: list[float] = []
+        for push in base.pushes(self.time, interval, lambda: self.depth):
+            moved = {} if forces else across
+            forces.append(insertion.push(part, push, speed_limit=limit, **moved))
+        if forces:
+            shared = zip(self._shares, forces, strict=True)
+            self._wrenches[:, 1] = sum(shares * force for shares, force in shared)
+        else:
             velocity = base.velocity(self.time, self.depth, insertion.velocity, interval)
-            forces = np.empty(self._sensor.samples)
-            insertion.carry(interval, velocity, felt=forces, **across)
-            self._felt[:, 1] = forces
-            return
-        self._felt[:, 1] = 0.0
-        for k, shares in enumerate(self._shares):
-            if k:
-                later = base.push(self.time + k * part, self.depth, part)
-                push = push if later is None else later
-            self._felt[:, 1] += shares * insertion.push(
-                part, push, speed_limit=base.limits.speed_limit, **(across if k == 0 else {})
-            )
+            means = np.empty(self._sensor.samples)
+            insertion.carry(interval, velocity, forces=means, **across)
+            self._wrenches[:, 1] = means
 
     def _move_guide(self) -> dict[str, Any]:
         """Advance guide, tilt and roll by one interval and return their positions."""
@@ -231,19 +213,12 @@ class SteeredPlant:
         return {'guide': (x, z), 'tilt': (tilt_x, tilt_z), 'roll': roll}
 
     def take(self, force: float, _torque: float) -> list[Measurement]:
-        """
-        Advance by one sample interval and return the measurements, `joint_states` last.
-
-        The torque has no effect, because the guide holds the needle.
-        """
+        # The torque has no effect, because the guide holds the needle.
         wrench = self.advance(force)
         needle, before = self.insertion.needle, self._tip
         self._tip = tip = [*needle.tip.tolist(), needle.tip_roll]
-        measured: list[Measurement] = [(BASE_WRENCH.name, 0, wrench)]
         x, depth, z, _ = tip
-        seen = self._tip_sensor.measure(depth, z, x)
-        if seen is not None:
-            measured.append((TIP_DEFLECTION.name, seen.age, seen.point))
+        reading = self._tip_sensor.measure(depth, z, x)
         rates = [(b - a) / self.interval for a, b in zip(before, tip, strict=True)]
         velocity = self.insertion.velocity
         outside = needle.needle.length - depth
@@ -251,17 +226,14 @@ class SteeredPlant:
         if self.base is None:
             # Insertion decreases d; the other coordinates have no command.
             truth += [-force, 0.0, 0.0, 0.0]
-        measured.append((GROUND_TRUTH.name, 0, truth))
         joints = [
             on_grid(depth, self._resolution), *self._at.values(),
             velocity, *self._velocity.values(),
-            float(self._felt[-1, 1]), *self._load,
+            float(self._wrenches[-1, 1]), *self._load,
         ]  # fmt: skip
-        measured.append((JOINT_STATES.name, 0, joints))
-        return measured
+        return needle_measurements(wrench, reading, truth, joints)
 
     def outline(self) -> MeasuredShape:
-        """Return needle (base, guide, tip) and path for display."""
         needle = self.insertion.needle
         shape, path = needle.shape, needle.path
         points = np.insert(shape.deflections, 1, shape.depths, axis=1)

@@ -39,26 +39,12 @@ class TipParameters:
 
 
 class TipReading(NamedTuple):
-    """
-    Published sample of the tip sensor.
+    """Published sample of the tip sensor."""
 
-    Attributes
-    ----------
-    age : int
-        Plant samples since the end of the exposure.
-    depth : float
-        Insertion depth at that time [m].
-    deflection : float
-        Mean tip deflection along z over the exposure, with noise [m].
-    across : float
-        Mean tip deflection along x.
-
-    """
-
-    age: int
-    depth: float
-    deflection: float
-    across: float = 0.0
+    age: int  #: plant samples since the end of the exposure
+    depth: float  #: insertion depth at that time [m]
+    deflection: float  #: mean tip deflection along z over the exposure, with noise [m]
+    across: float = 0.0  #: mean tip deflection along x
 
     @property
     def point(self) -> list[float]:
@@ -113,13 +99,13 @@ class TipSensor:
             self._taken += 1
             x, y, z = (value / number for value in sums)
             self._sums = [0.0, 0.0, 0.0]
-            self._see(x, y if self._spatial else depth, z)
+            self._take(x, y if self._spatial else depth, z)
         if not self._waiting or self._count - self._waiting[0][0] < self._late:
             return None
         taken, x, y, z = self._waiting.popleft()
         return TipReading(age=self._count - taken, depth=y, deflection=z, across=x)
 
-    def _see(self, x: float, y: float, z: float) -> None:
+    def _take(self, x: float, y: float, z: float) -> None:
         """Take a sample in the sensor frame, unless it is lost."""
         p = self._parameters
         if p.turn:
@@ -128,7 +114,7 @@ class TipSensor:
         if any(p.offset):
             x, y, z = x + p.offset[0], y + p.offset[1], z + p.offset[2]
         # A tip outside the slice is not measured; this test is free of noise.
-        seen = not p.slice or abs(x) <= p.slice
+        visible = not p.slice or abs(x) <= p.slice
         if p.noise:
             z += p.noise * float(self._random.standard_normal())
             if self._spatial:
@@ -136,5 +122,5 @@ class TipSensor:
                 y += p.noise * float(self._random.standard_normal())
         if p.dropout and self._losses.random() < p.dropout:
             return
-        if seen:
+        if visible:
             self._waiting.append((self._count, 0.0 if p.slice else x, y, z))

@@ -33,7 +33,7 @@ DEFAULT_SAMPLES: Final = 2000
 _MOST_INTERVALS: Final = 100_000_000
 
 #: Least travel for relative errors, as a fraction of the needle length.
-_SHORTEST_WAY: Final = 1e-4
+_LEAST_TRAVEL: Final = 1e-4
 
 #: Number of step halvings without a smaller error after which rounding dominates.
 _TRIES: Final = 3
@@ -264,10 +264,12 @@ def _refined(
 def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
     """Return the difference of the samples of two runs, see `Trajectory.error`."""
     tips, others = model.tip_deflections(two), model.tip_deflections(one)
-    ways, peak = np.abs(two[:, 0] - two[0, 0]), float(np.abs(tips).max())
-    way = max(float(ways.max()), _SHORTEST_WAY * model.parameters.length)
+    distances, peak = np.abs(two[:, 0] - two[0, 0]), float(np.abs(tips).max())
+    farthest = max(float(distances.max()), _LEAST_TRAVEL * model.parameters.length)
     apart = float(np.abs(tips - others).max())
-    return max(float(np.abs(two[:, 0] - one[:, 0]).max()) / way, apart / peak if peak else apart)
+    return max(
+        float(np.abs(two[:, 0] - one[:, 0]).max()) / farthest, apart / peak if peak else apart
+    )
 
 
 def floats(name: str, values: object) -> FloatArray:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-import os
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cut import insert, NOT_FELT
+from needle_dynamics.compiled.cut import insert, NO_FORCES
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.batch import thread_count
 from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
 from needle_dynamics.steering.parameters import noise_cell, SteeringParameters
@@ -85,8 +85,6 @@ def insert_batch(
             f'needles, steering, poses and seeds must be for one number of runs, got {len(each)}, '
             f'{len(beyond)}, {len(poses)} and {len(seeds)}'
         )
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     cell = noise_cell(beyond[0])
     if any(noise_cell(one) != cell for one in beyond):
@@ -112,13 +110,13 @@ def insert_batch(
     for row, loads in zip(wander, drawn, strict=True):
         row[: len(loads)] = loads
     tips = np.empty((runs, poses.shape[1], 2))
-    workers = min(workers or os.cpu_count() or 1, runs)
+    workers = thread_count(workers, runs)
     longest = values[:, 5].max()
     rooms = [empty_cut(longest, values[:, 1].min(), layers.shape[2]) for _ in range(workers)]
 
     def take(worker: int) -> None:
         share = np.arange(worker, runs, workers)
-        insert(values, layers, cell, wander, poses, share, rooms[worker], tips, NOT_FELT)
+        insert(values, layers, cell, wander, poses, share, rooms[worker], tips, NO_FORCES)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(take, range(workers)))

@@ -9,7 +9,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, VELOCITY
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.needle import SteeredNeedle
+from needle_dynamics.steering.needle import Placement, SteeredNeedle
 from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -28,11 +28,10 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConst
         raise ParameterError(
             'hub_stop must be true: the hub of a steered needle stops on the guide'
         )
-    layers = len(needle.tissue.starts)
-    several = {
-        name: by_layer(name, getattr(steering, name), layers)
-        for name in ('coulomb_per_length', 'viscous_per_length', 'cutting_force')
-    }
+
+    def layered(name: str) -> FloatArray:
+        return by_layer(name, getattr(steering, name), len(needle.tissue.starts))
+
     membranes = np.array(steering.membrane_depths)
     order = np.argsort(membranes)
     return AxisConstants(
@@ -42,9 +41,9 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConst
         withdrawal=needle.withdrawal_friction,
         reach=needle.length - steering.free_length,
         starts=np.array(needle.tissue.starts),
-        coulomb_per_length=several['coulomb_per_length'],
-        viscous_per_length=several['viscous_per_length'],
-        cutting=several['cutting_force'],
+        coulomb_per_length=layered('coulomb_per_length'),
+        viscous_per_length=layered('viscous_per_length'),
+        cutting=layered('cutting_force'),
         membranes=membranes[order],
         strengths=np.array(steering.membrane_strengths)[order],
         stiffness=np.full(len(membranes), steering.membrane_stiffness),
@@ -194,26 +193,26 @@ class Insertion:
 
         """
         self._check(duration, 'force', force)
-        shift, given = self.needle.checked(guide, tilt, roll, tissue)
-        self._drift_to(duration, shift)
+        placement = self.needle.checked(guide, tilt, roll, tissue)
+        self._drift_to(duration, placement.tissue)
         state, punctured = self._state.copy(), self._punctured.copy()
-        felt = np.full(1, float(force))
-        left = push(self.axis, state, punctured, felt[0], float(duration), self._step)
+        forces = np.full(1, float(force))
+        left = push(self.axis, state, punctured, forces[0], float(duration), self._step)
         velocity = float(state[VELOCITY]) + self._drift
         if abs(velocity) > speed_limit:
             state[:], punctured[:] = self._state, self._punctured
             limited = copysign(speed_limit, velocity)
-            left = self._carry(state, punctured, duration, limited, felt)
+            left = self._carry(state, punctured, duration, limited, forces)
         self._state, self._punctured = state, punctured
-        self._across(duration, left, shift, given)
-        return float(felt[0])
+        self._move_needle(duration, left, placement)
+        return float(forces[0])
 
     def carry(
         self,
         duration: float,
         velocity: float,
         *,
-        felt: FloatArray | None = None,
+        forces: FloatArray | None = None,
         guide: Sequence[float] | None = None,
         tilt: Sequence[float] | None = None,
         roll: float | None = None,
@@ -228,7 +227,7 @@ class Insertion:
             Time [s].
         velocity : float
             Insertion velocity at the end [m/s].
-        felt : ndarray, shape (parts,), optional
+        forces : ndarray, shape (parts,), optional
             Overwritten with the mean force over each of the equal parts of the duration [N].
         guide, tilt, roll, tissue : optional
             As in `push`.
@@ -247,11 +246,11 @@ class Insertion:
 
         """
         self._check(duration, 'velocity', velocity)
-        shift, given = self.needle.checked(guide, tilt, roll, tissue)
-        self._drift_to(duration, shift)
-        forces = np.empty(1) if felt is None else felt
+        placement = self.needle.checked(guide, tilt, roll, tissue)
+        self._drift_to(duration, placement.tissue)
+        forces = np.empty(1) if forces is None else forces
         left = self._carry(self._state, self._punctured, duration, velocity, forces)
-        self._across(duration, left, shift, given)
+        self._move_needle(duration, left, placement)
         return float(forces.mean())
 
     def _carry(
@@ -260,12 +259,12 @@ class Insertion:
         punctured: BoolArray,
         duration: float,
         velocity: float,
-        felt: FloatArray,
+        forces: FloatArray,
     ) -> float:
         """Carry the axis; return the remaining time when the needle left the tissue [s]."""
-        speed = float(velocity) - self._drift
+        relative = float(velocity) - self._drift
         return float(
-            carry_on(self.axis, state, punctured, speed, float(duration), self._step, felt)
+            carry_on(self.axis, state, punctured, relative, float(duration), self._step, forces)
         )
 
     def _check(self, duration: float, name: str, value: float) -> None:
@@ -280,17 +279,13 @@ class Insertion:
         self._state[VELOCITY] += self._drift - drift
         self._drift = drift
 
-    def _across(
-        self,
-        duration: float,
-        left: float,
-        shift: FloatArray,
-        given: tuple[tuple[float, float], tuple[float, float], float],
-    ) -> None:
-        self._tissue = shift
+    def _move_needle(self, duration: float, left: float, placement: Placement) -> None:
+        """Move the needle to the depth of the axis; an error if the axis has time left [s]."""
+        self._tissue = placement.tissue
         self.time += duration - left
         depth = self.depth
-        self.needle.bring(min(max(depth, float(shift[1])), self.axis.reach), shift, given)
+        lowest = float(placement.tissue[1])
+        self.needle.bring(min(max(depth, lowest), self.axis.reach), placement)
         if left > 0.0:
             limit = (
                 f'{1e3 * self.axis.reach:.4g} mm, where its hub stops on the guide'
@@ -304,8 +299,8 @@ class Insertion:
         """
         Lateral wrench of the base: force x, z [N] and torque x, y, z [N m]; shape (5,).
 
-        The torque about y is the windup torque, with the stiffness of a needle that is held at the
-        mean position of the friction of its inserted part.
+        The torque about y is the windup torque, with the stiffness of a needle that is fixed at
+        the mean position of the friction of its inserted part.
         """
         across = self.needle
         (force_x, force_z), (moment_x, moment_z) = across.guide_load

@@ -8,22 +8,19 @@ from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.beam import SpringSupports
-from needle_dynamics.compiled.cut import (
-    bend,
-    bring,
+from needle_dynamics.compiled.cut import correlate, GuidePose, move_boxed, start
+from needle_dynamics.compiled.cutting_needle import (
     Cut,
     CuttingNeedle,
     DEEPEST,
     DEPTH,
     FREE,
-    GuidePose,
+    guide_response,
     LAST,
     place,
-    remember,
-    respond,
     ROLL,
     set_free,
-    start,
+    solve_shape,
     Steered,
     TIP_ROLL,
 )
@@ -80,6 +77,16 @@ class NeedlePath(NamedTuple):
     deflections: FloatArray
 
 
+class Placement(NamedTuple):
+    """Position of guide, needle and tissue."""
+
+    #: Position [m] and tilt of the guide in x and z.
+    guide: tuple[float, float]
+    tilt: tuple[float, float]
+    roll: float  #: roll of the base [rad]
+    tissue: FloatArray  #: displacement of the tissue with its path in x, y and z [m], shape (3,)
+
+
 def steered(
     needle: NeedleParameters, steering: SteeringParameters, wander: FloatArray | None = None
 ) -> Steered:
@@ -127,7 +134,7 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     keep = exp(-cell / steering.path_noise_length)
     turns = np.random.default_rng(seed).standard_normal((len(depths), 2))
     turns[1:] *= sqrt(1.0 - keep * keep)
-    remember(turns, keep)
+    correlate(turns, keep)
     ei, tissue = needle.bending_stiffness, needle.tissue
     loads = np.array([turning_load(ei, k) for k in tissue.stiffnesses])
     layers = np.searchsorted(tissue.starts, depths, side='right') - 1
@@ -138,22 +145,15 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
 def empty_cut(length: float, element: float, layers: int) -> Cut:
     """Allocate the state of a needle (lengths in m); ``start`` initializes it."""
     rows = _SPARE * (ceil(length / element) + layers) + 3
-    springs = SpringSupports(
-        np.zeros(rows),
-        np.zeros(rows),
-        np.zeros((rows, 3)),
-        np.zeros((rows, 2, 2)),
-        np.zeros((rows, 2, 2)),
-        np.zeros((rows, 2, 3)),
-    )
+    shapes = (), (), (3,), (2, 2), (2, 2), (2, 3)
     return Cut(
-        springs,
-        np.zeros((2, 2)),
-        np.zeros(5),
-        np.zeros(2),
-        np.zeros((2, 2)),
-        np.zeros(2),
-        np.zeros(2, dtype=np.int64),
+        springs=SpringSupports(*(np.zeros((rows, *shape)) for shape in shapes)),
+        guide=np.zeros((2, 2)),
+        pose=np.zeros(5),
+        entry=np.zeros(2),
+        tip=np.zeros((2, 2)),
+        load=np.zeros(2),
+        counts=np.zeros(2, dtype=np.int64),
     )
 
 
@@ -217,23 +217,16 @@ class SteeredNeedle:
         self.steering = steering or SteeringParameters()
         self._constants = steered(needle, self.steering, wandering(needle, self.steering, seed))
         self._cut = empty_cut(needle.length, self._constants.element, len(self._constants.starts))
-        self._held = Boxed(CuttingNeedle(self._constants, self._cut))
-        self._shift = np.zeros(3)
-        self._guide, self._tilt = _pair('guide', guide), _pair('tilt', tilt)
-        self._roll = _finite('roll', roll)
+        self._boxed = Boxed(CuttingNeedle(self._constants, self._cut))
+        self._placement = Placement(
+            _pair('guide', guide), _pair('tilt', tilt), _finite('roll', roll), np.zeros(3)
+        )
         start(self._constants, self._cut, self._pose(0.0), self.steering.free_length)
 
     def _pose(self, depth: float) -> GuidePose:
         """Return the pose in the frame of the tissue."""
-        (x, z), (tilt_x, tilt_z) = self._guide, self._tilt
-        return GuidePose(
-            depth - self._shift[1],
-            x - self._shift[0],
-            tilt_x,
-            z - self._shift[2],
-            tilt_z,
-            self._roll,
-        )
+        (x, z), (tilt_x, tilt_z), roll, shift = self._placement
+        return GuidePose(depth - shift[1], x - shift[0], tilt_x, z - shift[2], tilt_z, roll)
 
     def move(
         self,
@@ -269,21 +262,16 @@ class SteeredNeedle:
 
         """
         to = self.depth if depth is None else _finite('depth', depth)
-        shift, given = self.checked(guide, tilt, roll, tissue)
-        reach = self.needle.length - self.steering.free_length
-        if not shift[1] <= to <= reach:
+        placement = self.checked(guide, tilt, roll, tissue)
+        lowest, reach = placement.tissue[1], self.needle.length - self.steering.free_length
+        if not lowest <= to <= reach:
             raise ParameterError(
-                f'depth must be in [{shift[1]:g}, {reach:g}] m, the length of the needle '
+                f'depth must be in [{lowest:g}, {reach:g}] m, the length of the needle '
                 f'minus its free length, got {to!r} m'
             )
-        self.bring(to, shift, given)
+        self.bring(to, placement)
 
-    def bring(
-        self,
-        depth: float,
-        shift: FloatArray,
-        given: tuple[tuple[float, float], tuple[float, float], float],
-    ) -> None:
+    def bring(self, depth: float, placement: Placement) -> None:
         """
         Move the needle to a valid pose.
 
@@ -291,19 +279,20 @@ class SteeredNeedle:
         ----------
         depth : float
             Depth s of the tip [m], within the reach of the needle.
-        shift, given
-            Return values of `checked`.
+        placement : Placement
+            Return value of `checked`.
 
         """
-        if shift is not self._shift and (shift != self._shift).any():
+        shift, before = placement.tissue, self._placement
+        if shift is not before.tissue and (shift != before.tissue).any():
             here = self.depth
-            self._shift = shift
+            self._placement = before._replace(tissue=shift)
             free = self.steering.free_length + float(shift[1])
             if free != self._cut.pose[FREE]:
                 set_free(self._constants, self._cut, free)
-            bring(self._held, self._pose(here))
-        self._guide, self._tilt, self._roll = given
-        bring(self._held, self._pose(depth))
+            move_boxed(self._boxed, self._pose(here))
+        self._placement = placement
+        move_boxed(self._boxed, self._pose(depth))
 
     def checked(
         self,
@@ -311,7 +300,7 @@ class SteeredNeedle:
         tilt: Sequence[float] | None,
         roll: float | None,
         tissue: ArrayLike | None,
-    ) -> tuple[FloatArray, tuple[tuple[float, float], tuple[float, float], float]]:
+    ) -> Placement:
         """
         Check the arguments of `move` except the depth.
 
@@ -322,10 +311,8 @@ class SteeredNeedle:
 
         Returns
         -------
-        shift : ndarray, shape (3,)
-            Displacement of the tissue [m].
-        given : tuple
-            Guide, tilt and roll; present values where omitted.
+        Placement
+            The values, present values where omitted.
 
         Raises
         ------
@@ -333,40 +320,39 @@ class SteeredNeedle:
             If a value is not valid.
 
         """
-        shift = self._shift if tissue is None else _numbers('tissue', tissue, 3)
+        now = self._placement
+        if guide is None and tilt is None and roll is None and tissue is None:
+            return now
+        shift = now.tissue if tissue is None else _numbers('tissue', tissue, 3)
         if self.steering.free_length + shift[1] < 0.0 or self.depth < shift[1]:
             raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
-        return shift, (
-            self._guide if guide is None else _pair('guide', guide),
-            self._tilt if tilt is None else _pair('tilt', tilt),
-            self._roll if roll is None else _finite('roll', roll),
+        return Placement(
+            now.guide if guide is None else _pair('guide', guide),
+            now.tilt if tilt is None else _pair('tilt', tilt),
+            now.roll if roll is None else _finite('roll', roll),
+            shift,
         )
 
     @property
     def depth(self) -> float:
         """Depth s of the tip [m]."""
-        return float(self._cut.pose[DEPTH] + self._shift[1])
+        return float(self._cut.pose[DEPTH] + self._placement.tissue[1])
 
     @property
     def deepest(self) -> float:
         """Greatest depth reached, at the end of the path [m]."""
-        return float(self._cut.pose[DEEPEST] + self._shift[1])
+        return float(self._cut.pose[DEEPEST] + self._placement.tissue[1])
 
     @property
     def tip(self) -> FloatArray:
         """Tip position in x, y and z [m]; shape (3,)."""
         (x, _), (z, _) = self._cut.tip
-        return np.array([x + self._shift[0], self.depth, z + self._shift[2]])
-
-    @property
-    def tip_slope(self) -> FloatArray:
-        """Slope of the needle at the tip in x and z; shape (2,)."""
-        return self._cut.tip[:, 1].copy()
+        return np.array([x + self._placement.tissue[0], self.depth, z + self._placement.tissue[2]])
 
     @property
     def guide(self) -> FloatArray:
         """Position of the guide in x and z [m]; shape (2,)."""
-        return np.array(self._guide)
+        return np.array(self._placement.guide)
 
     @property
     def roll(self) -> float:
@@ -393,7 +379,7 @@ class SteeredNeedle:
     def authority(self) -> FloatArray:
         """Deflection [m] and slope of the resting tip per guide position [m] and tilt; (2, 2)."""
         found = np.empty((2, 2))
-        respond(self._constants, self._cut, found)
+        guide_response(self._constants, self._cut, found)
         return found
 
     @property
@@ -407,22 +393,24 @@ class SteeredNeedle:
             p = s.path[last]
             end = p[:, 0] + rest * (p[:, 1] + 0.5 * rest * p[:, 2])
             depths, values = np.append(depths, c.pose[DEEPEST]), np.vstack([values, end])
-        return NeedlePath(depths + self._shift[1], values + self._shift[[0, 2]])
+        return NeedlePath(
+            depths + self._placement.tissue[1], values + self._placement.tissue[[0, 2]]
+        )
 
     def _solve(self) -> tuple[int, FloatArray, FloatArray]:
-        found, felt = np.empty((2, len(self._cut.springs.depths), 2)), np.empty((2, 2))
-        last = bend(self._held, found, felt)
-        return last, found[:, : last + 1], felt
+        found, load = np.empty((len(self._cut.springs.depths), 2, 2)), np.empty((2, 2))
+        last = solve_shape(self._boxed, found, load)
+        return last, found[: last + 1], load
 
     @property
     def shape(self) -> NeedleShape:
         """Shape of the needle from the guide to the tip, at its nodes."""
         c = self._cut
         last, found, _ = self._solve()
-        whole = np.concatenate([c.guide[:, np.newaxis], found, c.tip[:, np.newaxis]], axis=1)
-        whole[:, :, 0] += self._shift[[0, 2], np.newaxis]
+        whole = np.concatenate([c.guide[np.newaxis], found, c.tip[np.newaxis]])
+        whole[:, :, 0] += self._placement.tissue[[0, 2]]
         depths = np.concatenate([[-c.pose[FREE]], c.springs.depths[: last + 1], [c.pose[DEPTH]]])
-        return NeedleShape(depths + self._shift[1], whole[:, :, 0].T, whole[:, :, 1].T)
+        return NeedleShape(depths + self._placement.tissue[1], whole[:, :, 0], whole[:, :, 1])
 
     @property
     def guide_load(self) -> FloatArray:

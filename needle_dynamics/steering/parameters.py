@@ -234,7 +234,7 @@ STEERING_PRESETS: Final[Mapping[str, SteeringPreset]] = {
     'hollow_1.05mm': _literature(1.05e-3, 0.838e-3, 200e9, 2e4, 'ustk, needle of 19 gauge'),
 }
 
-#: Preset of the node, of commands, studies and environments, unless another one is set.
+#: Preset of the node, of commands, studies and environments, if no other preset is set.
 DEFAULT_STEERING_PRESET: Final = 'bending_35mm'
 
 #: Needle and tissue constants of all presets by name.

@@ -50,19 +50,21 @@ def bicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float, lead: float)
     `bicycle_curvature`; ``lead`` is the distance l2 of the tip from the rear wheel [m]. Returns
     tip positions x, y, z [m], shape (k, 3), from zero with the needle along y.
     """
-    ways = np.atleast_1d(np.array(lengths, dtype=np.float64))
+    distances = np.atleast_1d(np.array(lengths, dtype=np.float64))
     turns = np.array(rolls, dtype=np.float64)
-    if ways.ndim != 1 or turns.shape not in ((), ways.shape):
+    if distances.ndim != 1 or turns.shape not in ((), distances.shape):
         raise ShapeError(
-            f'lengths must have shape (k,) and rolls the same or (), got {ways.shape} and '
+            f'lengths must have shape (k,) and rolls the same or (), got {distances.shape} and '
             f'{turns.shape}'
         )
-    steps = np.diff(ways, prepend=0.0)
-    if not (np.isfinite(ways).all() and np.isfinite(turns).all() and (steps >= 0.0).all()):
+    steps = np.diff(distances, prepend=0.0)
+    if not (np.isfinite(distances).all() and np.isfinite(turns).all() and (steps >= 0.0).all()):
         raise ParameterError('lengths must be finite, >= 0 and increase; rolls must be finite')
     place, frame = np.array([0.0, -lead, 0.0]), np.eye(3)
-    found = np.empty((len(ways), 3))
-    for k, (step, roll) in enumerate(zip(steps, np.broadcast_to(turns, ways.shape), strict=True)):
+    found = np.empty((len(distances), 3))
+    for k, (step, roll) in enumerate(
+        zip(steps, np.broadcast_to(turns, distances.shape), strict=True)
+    ):
         # Along y of the frame, bending to the side that the roll turns from z towards x.
         side = np.array([np.sin(roll), 0.0, np.cos(roll)])
         angle = curvature * step

@@ -6,7 +6,7 @@ from math import ceil
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cut import insert, NOT_FELT
+from needle_dynamics.compiled.cut import insert, NO_FORCES
 from needle_dynamics.steering.needle import empty_cut
 from needle_identification.steering.recording import SteeringRecording
 import numpy as np
@@ -68,7 +68,7 @@ def responses(
         np.arange(3),
         empty_cut(reach, element, 1),
         tips,
-        NOT_FELT,
+        NO_FORCES,
     )
     if order == 'guide first':
         tips = tips[:, ::2]

@@ -21,7 +21,7 @@ from needle_controller import (
     Setpoint,
     transition_matrix,
 )
-from needle_controller.compiled.laws import LEARNED, SEEN
+from needle_controller.compiled.laws import LEARNED, MEASURED
 from needle_controller.compiled.learning import bounds, correction
 from needle_dynamics import NeedleModel, NeedleParameters
 import numpy as np
@@ -132,7 +132,7 @@ def test_missing_samples_are_excluded_from_learning() -> None:
     loop.command(0.05 + 3.5 * PERIOD * 0.01, 0.01, Setpoint(0.05, 0.01))
     assert loop.learned != {}
     loop.stop()
-    assert loop.memory[SEEN] == 0.0
+    assert loop.memory[MEASURED] == 0.0
 
 
 def test_learning_does_not_change_the_poles() -> None:

@@ -24,15 +24,15 @@ def test_command_acts_from_one_sample_to_the_next() -> None:
     """Zero-order hold: the newest command between two samples acts after the second."""
     commands = made()
     commands.hold(NOW)
-    assert commands.held == AppliedForces()
+    assert commands.acting == AppliedForces()
     assert commands.offer(NOW, 'needle_base', 1.0, 0.1, NOW + 10) == (True, '')
     assert commands.offer(NOW, '', 2.0, 0.2, NOW + 20) == (True, '')
-    assert commands.held == AppliedForces()
+    assert commands.acting == AppliedForces()
     commands.hold(NOW + PERIOD)
-    assert commands.held == AppliedForces(NOW, 2.0, 0.2)
+    assert commands.acting == AppliedForces(NOW, 2.0, 0.2)
     # No newer command: the command is held.
     commands.hold(NOW + 2 * PERIOD)
-    assert commands.held == AppliedForces(NOW, 2.0, 0.2)
+    assert commands.acting == AppliedForces(NOW, 2.0, 0.2)
 
 
 def test_command_expires_at_the_timeout() -> None:
@@ -40,9 +40,9 @@ def test_command_expires_at_the_timeout() -> None:
     commands = made()
     commands.offer(NOW, '', 2.0, 0.0, NOW)
     commands.hold(NOW + 100 * PERIOD)
-    assert commands.held.force == 2.0
+    assert commands.acting.force == 2.0
     commands.hold(NOW + 100 * PERIOD + 1)
-    assert commands.held == AppliedForces(NOW)
+    assert commands.acting == AppliedForces(NOW)
 
 
 def test_zero_stamp_means_now() -> None:
@@ -96,7 +96,7 @@ def test_invalid_command_sets_zero_force(
     said = f'a command {complaint}; no force is applied'
     assert commands.offer(NOW + 1, frame, force, torque, NOW) == (True, said)
     commands.hold(NOW + PERIOD)
-    assert commands.held == AppliedForces(NOW + 1)
+    assert commands.acting == AppliedForces(NOW + 1)
     assert commands.refused == 1
 
 
@@ -108,7 +108,7 @@ def test_no_force_acts_with_several_command_publishers() -> None:
     assert commands.count_commanders(3)
     assert commands.duplicates == 2
     commands.hold(NOW + PERIOD)
-    assert commands.held == AppliedForces(NOW)
+    assert commands.acting == AppliedForces(NOW)
     commands.offer(NOW + PERIOD, '', 1.0, 0.0, NOW + PERIOD)
     assert commands.newest == AppliedForces(NOW + PERIOD)
     assert commands.count_commanders(1)
@@ -125,7 +125,7 @@ def test_force_growth_is_rate_limited_and_release_is_immediate(forces: list[floa
         stamp = NOW + k * PERIOD
         commands.offer(stamp, '', force, 0.5, stamp)
         commands.hold(stamp)
-        held = commands.held
+        held = commands.acting
         assert (held.stamp, held.torque) == (stamp, 0.5)
         assert abs(held.force) <= max(abs(force), 0.0)
         if abs(force) <= abs(before) and force * before >= 0.0:
@@ -137,7 +137,7 @@ def test_force_growth_is_rate_limited_and_release_is_immediate(forces: list[floa
             assert abs(held.force) == pytest.approx(min(abs(force), growth), 1e-12)
         before = held.force
     commands.hold(NOW + 1000 * PERIOD)
-    assert commands.held.force == 0.0
+    assert commands.acting.force == 0.0
 
 
 def test_no_force_acts_above_the_energy_limit() -> None:
@@ -147,10 +147,10 @@ def test_no_force_acts_above_the_energy_limit() -> None:
     for k in range(4000):
         stamp = NOW + k * PERIOD
         commands.offer(stamp, '', 5.0, 0.0, stamp)
-        distance = 0.4e-3 if commands.held.force else 0.0
-        spent += commands.held.force * distance
+        distance = 0.4e-3 if commands.acting.force else 0.0
+        spent += commands.acting.force * distance
         commands.hold(stamp, distance)
-        acted.append(commands.held.force == 5.0)
+        acted.append(commands.acting.force == 5.0)
         assert commands.exhausted != acted[-1]
     first = acted.index(False)
     # 2 W (1 - exp(-t)) is 1 J at ln 2; then it halves in ln 2.
@@ -184,10 +184,10 @@ def test_reset_and_activation_discard_commands() -> None:
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     commands.hold(NOW)
     commands.forget()
-    assert commands.held == commands.newest == AppliedForces(NOW)
+    assert commands.acting == commands.newest == AppliedForces(NOW)
     assert commands.offer(NOW - 1, '', 1.0, 0.0, NOW) == (False, '')
     commands.begin()
-    assert commands.held == commands.newest == AppliedForces()
+    assert commands.acting == commands.newest == AppliedForces()
 
 
 def test_force_without_the_stamp_of_a_sample_is_rejected() -> None:

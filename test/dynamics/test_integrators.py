@@ -705,9 +705,9 @@ def test_base_loads_of_parts_equal_loads_of_single_intervals(
     rows = [[part.axial_force, part.lateral_force, part.moment] for part in parts]
     size = np.abs(rows).max(axis=0)
     # 1e-7: conversion of rates to momenta and back in each single interval, cond(G) eps.
-    assert_allclose(total.felt / size, rows / size, rtol=0.0, atol=1e-7)
+    assert_allclose(total.loads / size, rows / size, rtol=0.0, atol=1e-7)
     mean = [total.axial_force, total.lateral_force, total.moment]
-    assert_allclose(total.felt.mean(axis=0), mean, rtol=0.0, atol=1e-14 * size.max())
+    assert_allclose(total.loads.mean(axis=0), mean, rtol=0.0, atol=1e-14 * size.max())
     assert_allclose(whole.state, single.state, rtol=0.0, atol=1e-7 * np.abs(whole.state).max())
     for name in ('friction_work', 'damping_work', 'input_work', 'impact_loss'):
         works = [getattr(part, name) for part in parts]

@@ -168,13 +168,13 @@ def test_force_is_held_and_ends_after_the_last_message() -> None:
     plant = run()
     names = ('insertion', 'rotation')
     drive(plant, 500, 10, lambda now, _: message(now, names, (), (), (3.56, nan)))
-    assert plant.commands.held.force == 3.56
+    assert plant.commands.acting.force == 3.56
     before = plant.plant.depth
     drive(plant, 100, 10, lambda now, _: message(now, names, (), (), (3.56, nan)))
     assert plant.plant.depth - before == pytest.approx(0.001, rel=0.02)
     for k in range(102):
         plant.take(START + (100 + k) * PERIOD)
-    assert plant.commands.held.force == 0.0
+    assert plant.commands.acting.force == 0.0
 
 
 @pytest.mark.parametrize('value', [nan, inf, -16.0])

@@ -210,15 +210,15 @@ def test_readings_of_a_push_conserve_the_impulse(
 
     monkeypatch.setattr(Insertion, 'push', pushed)
     plant, _ = run({**VALUES, 'sensor.rate': 500.0 * samples}, 5, push)
-    felt = plant.plant._felt[:, 1]  # type: ignore[attr-defined]
-    assert len(felt) == samples
+    loads = plant.plant._wrenches[:, 1]  # type: ignore[attr-defined]
+    assert len(loads) == samples
     assert len(forces) == 20
     assert (np.diff(forces) > 0.0).all()
     # Equal impulse except for rounding; each reading covers the pushes in its interval.
-    assert felt.mean() == pytest.approx(np.mean(forces[-4:]), rel=1e-12)
-    assert (np.diff(felt) >= 0.0).all()
+    assert loads.mean() == pytest.approx(np.mean(forces[-4:]), rel=1e-12)
+    assert (np.diff(loads) >= 0.0).all()
     if samples == 2:
-        assert felt.tolist() == pytest.approx([np.mean(forces[-4:-2]), np.mean(forces[-2:])])
+        assert loads.tolist() == pytest.approx([np.mean(forces[-4:-2]), np.mean(forces[-2:])])
 
 
 def test_push_force_ramps_up_within_the_speed_limit() -> None:

@@ -24,21 +24,19 @@ from collections.abc import Mapping, Sequence
 from math import cos, nan, sin
 from typing import NamedTuple
 
-from needle_controller.compiled.steering import (
+from needle_controller.compiled.guide_plan import choose_guide, hit_probability, reachable_set
+from needle_controller.compiled.hypotheses import (
     BEVEL,
-    chance,
-    choose,
-    expect,
-    FINE,
     FROZEN,
     LOST,
     MISSING,
-    reach,
+    predict,
     SAME,
-    see,
     Steering,
     STEP,
     TURNS,
+    update,
+    VALID,
     weights,
 )
 from needle_controller.steering.law import (
@@ -147,7 +145,7 @@ class MultiHypothesisLaw(SteeringLaw):
             responses=model.responses,
             limit=float(limit),
             load_limit=float(limits.load_limit),
-            ways=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
+            ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
             covariance=covariance,
@@ -158,7 +156,7 @@ class MultiHypothesisLaw(SteeringLaw):
             last=np.full(2, nan),
             counts=np.array([0, turns, 0, 0, 0]),
         )
-        self._held = Boxed(self._now)
+        self._boxed = Boxed(self._now)
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
@@ -213,18 +211,18 @@ class MultiHypothesisLaw(SteeringLaw):
             Mean and covariance over all hypotheses.
 
         """
-        x, z, xx, xz, zz = expect(self._held, range(self._model.steps + 1)[at])
+        x, z, xx, xz, zz = predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
     def hit_probability(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
-        return chance(self._held)
+        return hit_probability(self._boxed)
 
     @property
     def reach(self) -> Reach:
         """Reachable set of the tip."""
-        middles, sizes, _ = reach(self._held)
+        middles, sizes, _ = reachable_set(self._boxed)
         return Reach(middles, sizes, self.weights)
 
     def status(self) -> Mapping[str, float]:
@@ -261,8 +259,8 @@ class MultiHypothesisLaw(SteeringLaw):
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
         x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
-        kind, off_x, off_z = see(self._held, at, x, z, variance)
-        if kind == FINE:
+        kind, off_x, off_z = update(self._boxed, at, x, z, variance)
+        if kind == VALID:
             return
         if kind == LOST:
             missing = self._now.counts[MISSING]
@@ -285,4 +283,4 @@ class MultiHypothesisLaw(SteeringLaw):
 
     def _choose(self) -> complex:
         """Return the next position of the guide, x + i z [m]."""
-        return choose(self._held)
+        return choose_guide(self._boxed)

@@ -1,0 +1,301 @@
+"""
+Reachable set of the tip, and the next position of the guide.
+
+The distributions of the tip by hypothesis are those of `needle_controller.compiled.hypotheses`.
+"""
+
+from __future__ import annotations
+
+from math import cos, inf, sin, sqrt, tau
+from typing import Final, NamedTuple, TYPE_CHECKING
+
+from needle_controller.compiled.hypotheses import (
+    BEVEL,
+    Steering,
+    STEP,
+    tip_distribution,
+    TURNS,
+    weights,
+)
+from needle_dynamics.arrays import ComplexArray, ComplexVector, FloatArray, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
+from needle_dynamics.compiled.matrices import backward, cholesky, forward
+import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.boxed import Boxed
+
+#: Fraction of the later guide motion that the plan uses.
+_USED: Final = 0.8
+
+#: Candidate positions of the guide, relative to its range.
+_FINE: Final = np.linspace(-1.0, 1.0, 121)
+
+#: Number of candidate bevel directions, and candidate guide positions for each direction.
+_ROLLS: Final = 16
+_COARSE: Final = np.linspace(-1.0, 1.0, 13)
+
+#: Least decrease of the mean square distance from the reachable set by a turn [m^2].
+_TURN: Final = 1e-4**2
+
+#: Cost of a load on the guide above its limit [m^2/N^2]: dominates every distance.
+_OVERLOAD: Final = 1.0
+
+#: Abscissas and weights of the quadrature over a normal distribution.
+_ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
+_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
+
+#: Cost of the distance from the plan for the mean, and of motion in that plan [shift of the tip
+#: per shift of the guide, squared].
+_DEVIATION, _MOTION = 1e-5, 1e-2
+
+#: Distance from the target that counts as a hit [m].
+_HIT: Final = 1e-3
+
+
+class FinalTip(NamedTuple):
+    """Final position of the tip by hypothesis, without further guide motion."""
+
+    means: ComplexVector  #: mean, x + i z [m], shape (h,)
+    errors: Vector  #: standard deviation along each axis [m], shape (h,)
+    turned: Vector  #: range of the tip along each axis by later turns [m], shape (h,)
+
+
+@compiled
+def _ends(c: Steering, turns: int, first: int) -> FinalTip:
+    """Return the final position of the tip with ``turns`` turns from step ``first`` on."""
+    r, last = c.responses, len(c.guide)
+    # Future positions of the guide are 0.
+    tip = tip_distribution(c, last, c.guide)
+    means, turned = tip.means, np.zeros(len(tip.means))
+    if turns > 0:
+        for i in range(len(means)):
+            load = c.mean[i, BEVEL]
+            for j in range(first, last + 1):
+                means[i] -= load * r.bevel[i, last, j] * c.turned[j]
+            turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[i, first]
+    errors = np.empty(len(means))
+    for i in range(len(means)):
+        errors[i] = sqrt(tip.variances[i])
+    return FinalTip(means, errors, turned)
+
+
+@inlined
+def _guide_now(c: Steering) -> complex:
+    """Return the present position of the guide [m]."""
+    k = c.counts[STEP]
+    return c.guide[k - 1] if 0 < k <= len(c.guide) else 0j
+
+
+@inlined
+def _guide_range(c: Steering, begin: float, step: int) -> tuple[float, float]:
+    """Return middle and half width of the range of the guide ``step`` + 1 steps later [m]."""
+    low, high = max(begin - c.ranges[step], -c.limit), min(begin + c.ranges[step], c.limit)
+    return 0.5 * (low + high), 0.5 * (high - low)
+
+
+@compiled
+def _reachable(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    k, last, now = c.counts[STEP], len(c.guide), _guide_now(c)
+    ends = _ends(c, c.counts[TURNS], k + 1)
+    middles, sizes = ends.means, np.empty(len(ends.means), np.complex128)
+    for i in range(len(sizes)):
+        sizes[i] = complex(ends.turned[i], ends.turned[i])
+    for j in range(k, last):
+        (x, wide), (z, high) = _guide_range(c, now.real, j - k), _guide_range(c, now.imag, j - k)
+        for i in range(len(middles)):
+            shift = c.responses.guide[i, last, j]
+            middles[i] += shift * complex(x, z)
+            sizes[i] += abs(shift) * complex(wide, high)
+    return middles, sizes, ends.errors
+
+
+@kernel
+def reachable_set(boxed: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """
+    Return the reachable set of the tip by hypothesis, shape (h,) each.
+
+    Its middle x + i z [m], its half widths along x + i along z [m], and the standard deviation of
+    the middle along each axis [m].
+    """
+    return _reachable(boxed.value)
+
+
+@kernel
+def hit_probability(boxed: Boxed[Steering]) -> float:
+    """Return the probability that the tip can reach the target within 1 mm."""
+    c = boxed.value
+    (middles, sizes, errors), w = _reachable(c), weights(c.logs)
+    along_x = along_z = 0.0
+    for i in range(len(w)):
+        x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
+        for a in range(len(_WEIGHTS)):
+            off = errors[i] * _ABSCISSAS[a]
+            if abs(x + off) <= _HIT + sizes[i].real:
+                along_x += w[i] * _WEIGHTS[a]
+            if abs(z + off) <= _HIT + sizes[i].imag:
+                along_z += w[i] * _WEIGHTS[a]
+    return along_x * along_z
+
+
+@kernel
+def choose_guide(boxed: Boxed[Steering]) -> complex:
+    """
+    Return the next position of the guide, x + i z [m], and turn the needle if worthwhile.
+
+    Updates the roll and the bevel directions of the state.
+    """
+    c = boxed.value
+    k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
+    turns, candidates = c.counts[TURNS], _candidates(c, _FINE)
+    ends = _ends(c, turns, k + 2)
+    cost, guide = _best(c, w, ends, candidates)
+    if turns == 0 or cost < _TURN:
+        return guide
+    # The present plan with a turn now.
+    base, few = _ends(c, turns - 1, k + 2), _candidates(c, _COARSE)
+    best, roll, chosen = inf, 0.0, base
+    for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
+        other = c.roll[0] + tau * turn / _ROLLS
+        means = base.means.copy()
+        for i in range(len(means)):
+            push = 0.0
+            for j in range(k + 1, k + 2 if turns > 1 else last + 1):
+                push += c.responses.bevel[i, last, j]
+            means[i] += c.mean[i, BEVEL] * push * (_direction(other) - c.turned[k + 1])
+        ends = FinalTip(means, base.errors, base.turned)
+        costs = _costs(c, w, ends, few)
+        along_x = along_z = inf
+        for t in range(costs.shape[1]):
+            along_x, along_z = min(along_x, costs[0, t]), min(along_z, costs[1, t])
+        found = along_x + along_z
+        if found < best:
+            best, roll, chosen = found, other, ends
+    if best + _TURN > cost:
+        return guide
+    c.roll[0], c.counts[TURNS] = roll, turns - 1
+    for j in range(k + 1, len(c.turned)):
+        c.turned[j] = _direction(roll)
+    return _best(c, w, chosen, candidates)[1]
+
+
+@inlined
+def _direction(roll: float) -> complex:
+    """Return the direction of the bevel relative to zero roll."""
+    return complex(cos(roll), -sin(roll))
+
+
+@inlined
+def _candidates(c: Steering, parts: FloatArray) -> FloatArray:
+    """Return candidate positions of the guide in x and z [m], shape (2, positions)."""
+    if c.limit == 0.0:
+        return np.zeros((2, 1))
+    now, found = _guide_now(c), np.empty((2, len(parts)))
+    for plane in range(2):
+        middle, half = _guide_range(c, now.imag if plane else now.real, 0)
+        for t in range(len(parts)):
+            found[plane, t] = middle + half * parts[t]
+    return found
+
+
+@compiled
+def _best(
+    c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray
+) -> tuple[float, complex]:
+    """Return mean square distance from the reachable set and position of the best candidate."""
+    costs, whole, found = _costs(c, w, ends, candidates), 0.0, np.empty(2)
+    plan = _plan(c, w, ends)
+    for plane in range(2):
+        wanted, best = min(max(plan[plane], -c.limit), c.limit), inf
+        for t in range(candidates.shape[1]):
+            cost = costs[plane, t] + _DEVIATION * (candidates[plane, t] - wanted) ** 2
+            if cost < best:
+                best, at = cost, t
+        whole += costs[plane, at]
+        found[plane] = candidates[plane, at]
+    return whole, complex(found[0], found[1])
+
+
+@compiled
+def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -> FloatArray:
+    """Return the mean square distance from the reachable set by candidate, in x and z [m^2]."""
+    r, k, last = c.responses, c.counts[STEP], len(c.guide)
+    # Later positions that depend on the next position; the others are only limited.
+    near = 0
+    while near < last - k - 1 and c.ranges[near] < 2.0 * c.limit:
+        near += 1
+    count = candidates.shape[1]
+    middles, halves = np.empty((near, count)), np.empty((near, count))
+    left, later, found = np.empty(count), np.empty(count), np.zeros((2, count))
+    load, stiffness = _guide_load(c, w)
+    for plane in range(2):
+        to = candidates[plane]
+        for j in range(near):
+            for t in range(count):
+                middles[j, t], halves[j, t] = _guide_range(c, to[t], j)
+        for i in range(len(w)):
+            mean = ends.means[i].imag if plane else ends.means[i].real
+            need = c.target[plane] - mean
+            shift, anywhere = r.guide[i, last, k], c.limit * r.later_guide[i, k + 1 + near]
+            for t in range(count):
+                left[t] = need - shift * to[t]
+                later[t] = _USED * anywhere + ends.turned[i]
+            for j in range(near):
+                shift = r.guide[i, last, k + 1 + j]
+                for t in range(count):
+                    left[t] -= shift * middles[j, t]
+                    later[t] += _USED * abs(shift) * halves[j, t]
+            for a in range(len(_WEIGHTS)):
+                off, weight = ends.errors[i] * _ABSCISSAS[a], w[i] * _WEIGHTS[a]
+                for t in range(count):
+                    short = max(0.0, abs(left[t] + off) - later[t])
+                    found[plane, t] += weight * short * short
+        force = load.imag if plane else load.real
+        for t in range(count):
+            over = max(0.0, abs(force + stiffness * to[t]) - c.load_limit)
+            found[plane, t] += _OVERLOAD * over**2
+    return found
+
+
+@compiled
+def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
+    """Return the load on a guide at zero [N], and its derivative by the position [N/m]."""
+    r, k, force, stiffness = c.responses, c.counts[STEP], 0j, 0.0
+    if c.load_limit == inf:
+        return force, stiffness
+    for i in range(len(w)):
+        load = 0j
+        for j in range(k):
+            load += r.guide_load[i, k, j] * c.guide[j]
+        push = 0j
+        for j in range(len(c.turned)):
+            push += r.bevel_load[i, k, j] * c.turned[j]
+        for j in range(r.causes_load.shape[2]):
+            load += (push if j == BEVEL else r.causes_load[i, k, j]) * c.mean[i, j]
+        force += w[i] * load
+        stiffness += w[i] * r.guide_load[i, k, k]
+    return force, stiffness
+
+
+@compiled
+def _plan(c: Steering, w: FloatArray, ends: FinalTip) -> tuple[float, float]:
+    """Return the next position of a least-squares plan for the mean, with a cost of motion."""
+    k, last = c.counts[STEP], len(c.guide)
+    count = last - k
+    normal, factor = np.zeros((count, count)), np.zeros((count, count))
+    for j in range(count):
+        normal[j, j] = _MOTION
+    x, z = np.zeros(count), np.zeros(count)
+    for i in range(len(w)):
+        shifts = c.responses.guide[i, last, k:]
+        for j in range(count):
+            weighted = w[i] * shifts[j]
+            x[j] += weighted * (c.target[0] - ends.means[i].real)
+            z[j] += weighted * (c.target[1] - ends.means[i].imag)
+            for m in range(j, count):
+                normal[j, m] += weighted * shifts[m]
+    cholesky(normal, factor)
+    for one in (x, z):
+        forward(factor, one)
+        backward(factor, one)
+    return x[0], z[0]

@@ -1,0 +1,260 @@
+r"""
+Hypotheses of the steering controller: state, and update by tip measurements.
+
+By hypothesis the tip at a depth is :math:`z = a \cdot b + x \cdot \theta` with the positions b of
+the guide, x + i z, and unknown constants :math:`\theta` with mean :math:`\bar\theta` and
+covariance P. Its mean is :math:`a \cdot b + x \cdot \bar\theta`, its covariance with the constants
+:math:`s = P \bar x`, and its variance :math:`x \cdot s`; a tip measurement is an update of rank
+one. See `needle_controller.steering.laws.multi_hypothesis`.
+"""
+
+from __future__ import annotations
+
+from math import exp, inf, isfinite, log
+from typing import Final, NamedTuple, TYPE_CHECKING
+
+from needle_dynamics.arrays import (
+    Array3,
+    Array4,
+    ComplexArray,
+    ComplexArray3,
+    ComplexMatrix,
+    ComplexVector,
+    FloatArray,
+    IntVector,
+    Matrix,
+    Vector,
+)
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
+import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.boxed import Boxed
+
+#: Standard deviation of the relative loss of the bevel load at rest.
+_BEVEL_RELEASE: Final = 0.03
+
+#: Index of the bevel load among the constants.
+BEVEL: Final = 3
+
+#: Gate on the squared innovation over its variance (exceeded by noise once in 3 million tip
+#: measurements), and number of successive measurements outside the gate that is a fault.
+_GATE, _MOST_IMPLAUSIBLE = 30.0, 2
+
+#: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
+MOST_SAME: Final = 2
+
+#: Largest number of successive missing tip measurements.
+MOST_MISSING: Final = 6
+
+#: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
+#: implausible and missing measurements.
+STEP, TURNS, SAME, IMPLAUSIBLE, MISSING = range(5)
+
+#: Result of the check of a tip measurement.
+VALID, LOST, FROZEN, OUTLIER = range(4)
+
+
+class HypothesisResponses(NamedTuple):
+    """Responses of the tip by hypothesis: arrays of `SteeringModel`, and sums."""
+
+    #: As in `SteeringModel`.
+    guide: Array3
+    causes: Array3
+    bevel: Array3
+    elastic: Matrix
+    guide_load: Array3
+    causes_load: Array3
+    bevel_load: Array3
+    between: Array4
+    #: Sums of the absolute values of `guide` at the last depth, from each step on,
+    #: shape (h, n + 1).
+    later_guide: Matrix
+    #: Sums of the absolute values of `bevel` at the last depth, from the skin and each step on,
+    #: shape (h, n + 3).
+    later_bevel: Matrix
+
+
+class Steering(NamedTuple):
+    """State and limits of a steering controller: h hypotheses, n steps and m constants."""
+
+    responses: HypothesisResponses  #: responses of the tip
+    limit: float  #: largest position of the guide along each axis [m]
+    load_limit: float  #: largest planned force of the guide [N]
+    ranges: Vector  #: range of the guide motion after a number of steps, from 1 [m], shape (n,)
+    target: Vector  #: target of the tip, x and z [m], shape (2,)
+    mean: ComplexMatrix  #: mean of the constants, shape (h, m)
+    covariance: ComplexArray3  #: their covariance, shape (h, m, m)
+    logs: Vector  #: logarithm of the probability of each hypothesis, up to a constant, shape (h,)
+    guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
+    #: Direction of the bevel relative to zero roll, on the skin and in each step, shape (n + 1,).
+    turned: ComplexVector
+    roll: Vector  #: roll of the needle [rad], shape (1,)
+    last: Vector  #: last tip measurement [m], shape (2,)
+    #: Tip measurements so far, remaining turns, successive equal, implausible and missing
+    #: measurements, shape (5,).
+    counts: IntVector
+
+
+class TipDistribution(NamedTuple):
+    """Distribution of the tip at a depth by hypothesis."""
+
+    means: ComplexVector  #: mean, x + i z [m], shape (h,)
+    variances: Vector  #: variance along each axis [m^2], shape (h,)
+    shared: ComplexMatrix  #: covariance with the constants, shape (h, m)
+
+
+class TipMoments(NamedTuple):
+    """Mean and covariance of the tip over all hypotheses."""
+
+    #: Mean [m].
+    x: float
+    z: float
+    #: Covariance [m^2].
+    xx: float
+    xz: float
+    zz: float
+
+
+@kernel
+def weights(logs: Vector) -> FloatArray:
+    """Return hypothesis weights, shape (h,), from their logarithms up to a constant."""
+    largest, whole, found = -inf, 0.0, np.empty(len(logs))
+    for value in logs:
+        largest = max(largest, value)
+    for i in range(len(logs)):
+        found[i] = exp(logs[i] - largest)
+        whole += found[i]
+    for i in range(len(logs)):
+        found[i] /= whole
+    return found
+
+
+@inlined
+def _guide_at_rest(c: Steering) -> ComplexArray:
+    """Return the positions of the guide, shape (n,), with the guide at rest from now on."""
+    guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
+    if done > 0:
+        for j in range(done, len(guide)):
+            guide[j] = guide[done - 1]
+    return guide
+
+
+@compiled
+def tip_distribution(c: Steering, at: int, guide: ComplexArray) -> TipDistribution:
+    """Return the distribution of the tip at a depth by hypothesis."""
+    r = c.responses
+    h, m = c.mean.shape
+    means, variances = np.zeros(h, np.complex128), np.zeros(h)
+    shared, row = np.zeros((h, m), np.complex128), np.empty(m, np.complex128)
+    for i in range(h):
+        for j in range(m - 2):
+            row[j] = r.causes[i, at, j]
+        row[BEVEL] = row[m - 2] = row[m - 1] = 0.0
+        for j in range(len(c.turned)):
+            row[BEVEL] += r.bevel[i, at, j] * c.turned[j]
+        for j in range(len(guide)):
+            means[i] += r.guide[i, at, j] * guide[j]
+            row[m - 2] += r.between[0, i, at, j] * guide[j]
+            row[m - 1] += r.between[1, i, at, j] * guide[j]
+        of = shared[i]
+        for j in range(m):
+            means[i] += c.mean[i, j] * row[j]
+            # P is Hermitian: its rows are its conjugated columns.
+            for l in range(m):
+                of[l] += row[j] * c.covariance[i, j, l]
+        for j in range(m):
+            variances[i] += of[j].real * row[j].real + of[j].imag * row[j].imag
+            of[j] = of[j].conjugate()
+        variances[i] += (_BEVEL_RELEASE * r.elastic[i, at] * abs(c.mean[i, BEVEL])) ** 2
+    return TipDistribution(means, variances, shared)
+
+
+@compiled
+def _moments(w: FloatArray, tip: TipDistribution) -> TipMoments:
+    """Return mean and covariance of the tip over all hypotheses."""
+    x = z = xx = xz = zz = 0.0
+    for i in range(len(w)):
+        x += w[i] * tip.means[i].real
+        z += w[i] * tip.means[i].imag
+    for i in range(len(w)):
+        dx, dz = tip.means[i].real - x, tip.means[i].imag - z
+        xx += w[i] * (dx * dx + tip.variances[i])
+        xz += w[i] * dx * dz
+        zz += w[i] * (dz * dz + tip.variances[i])
+    return TipMoments(x, z, xx, xz, zz)
+
+
+@kernel
+def predict(boxed: Boxed[Steering], at: int) -> TipMoments:
+    """Predict the tip at depth number ``at`` with guide and roll as last commanded."""
+    c = boxed.value
+    return _moments(weights(c.logs), tip_distribution(c, at, _guide_at_rest(c)))
+
+
+@kernel
+def update(
+    boxed: Boxed[Steering], at: int, x: float, z: float, variance: float
+) -> tuple[int, float, float]:
+    """
+    Update hypotheses and weights with a tip measurement (x, z) [m] at depth number ``at``.
+
+    ``x`` and ``z`` are nan if the measurement is missing; ``variance`` is per axis [m^2]. Returns
+    `VALID` or the reason for a stop, and the innovation along both axes [m].
+    """
+    c = boxed.value
+    tip, w = tip_distribution(c, at, _guide_at_rest(c)), weights(c.logs)
+    predicted = _moments(w, tip)
+    off_x, off_z = x - predicted.x, z - predicted.z
+    kind, counts = _check(c, x, z, off_x, off_z, predicted, variance)
+    if counts:
+        for i in range(len(w)):
+            _update_hypothesis(
+                c, i, complex(x, z) - tip.means[i], tip.variances[i] + variance, tip.shared[i]
+            )
+    return kind, off_x, off_z
+
+
+@inlined
+def _check(
+    c: Steering,
+    x: float,
+    z: float,
+    off_x: float,
+    off_z: float,
+    predicted: TipMoments,
+    variance: float,
+) -> tuple[int, bool]:
+    """Check a tip measurement; return its kind and whether the update uses it."""
+    counts = c.counts
+    if not (isfinite(x) and isfinite(z)):
+        counts[MISSING] += 1
+        return (LOST if counts[MISSING] > MOST_MISSING else VALID), False
+    counts[MISSING] = 0
+    same = x == c.last[0] and z == c.last[1]
+    counts[SAME] = counts[SAME] + 1 if same else 0
+    c.last[0], c.last[1] = x, z
+    if same:
+        return (FROZEN if counts[SAME] >= MOST_SAME else VALID), False
+    xx, xz, zz = predicted.xx + variance, predicted.xz, predicted.zz + variance
+    distance = zz * off_x**2 - 2.0 * xz * off_x * off_z + xx * off_z**2
+    # False for an infinite distance and for nan.
+    if distance <= _GATE * (xx * zz - xz**2):
+        counts[IMPLAUSIBLE] = 0
+        return VALID, True
+    counts[IMPLAUSIBLE] += 1
+    return (OUTLIER if counts[IMPLAUSIBLE] >= _MOST_IMPLAUSIBLE else VALID), False
+
+
+@inlined
+def _update_hypothesis(
+    c: Steering, i: int, off: complex, variance: float, shared: ComplexArray
+) -> None:
+    """Update a hypothesis and its weight with the innovation of a tip measurement [m]."""
+    for j in range(len(shared)):
+        gain = shared[j] / variance
+        c.mean[i, j] += gain * off
+        to = c.covariance[i, j]
+        for k in range(len(shared)):
+            to[k] -= gain * shared[k].conjugate()
+    c.logs[i] -= 0.5 * (off.real**2 + off.imag**2) / variance + log(variance)
