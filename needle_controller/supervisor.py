@@ -8,7 +8,7 @@ from time import monotonic
 from typing import Final
 
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
-from needle_controller.force_command import ForceCommand, ServiceResult
+from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
@@ -27,13 +27,14 @@ from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.requests import Verdict
 from needle_ros.status import ControllerPhase, ControllerStatus
+from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'
 
 
-class Supervisor(StateMachine):
+class Supervisor(StateMachine[ForceCommand]):
     """
     Answer each measurement with a force command, and command zero force on any fault.
 
@@ -56,6 +57,9 @@ class Supervisor(StateMachine):
         self._deflection_ignored = False
         self._last = ForceCommand(0)
         self._following = ResponseMonitor()
+        #: Mode of the system that is followed, and last measured insertion depth [m].
+        self._obeyed = Mode.RUNNING
+        self._depth: float | None = None
         #: The controller while configured, and while measurements are answered.
         self.controller: Controller | None = None
         self._active: Controller | None = None
@@ -122,6 +126,9 @@ class Supervisor(StateMachine):
         self._begin(now)
         self.safety.count_publishers(publishers)
         self._active = self.controller
+        if self._obeyed is not Mode.STOPPED:
+            self._obeyed = Mode.RUNNING
+            self.obey(now)
 
     def deactivate(self, now: int) -> ForceCommand:
         """Command zero force, and discard the motion and its target."""
@@ -136,6 +143,7 @@ class Supervisor(StateMachine):
         self._waiting = WaitingRequest(self.requests)
         self._time = now
         self.safety.begin(now)
+        self._depth = None
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
@@ -153,6 +161,7 @@ class Supervisor(StateMachine):
 
     def receive(self, *, targets: bool) -> None:
         """Set which requests are accepted."""
+        self._targets = targets
         topics = (TARGET, JOINT_TRAJECTORY) if targets else (JOINT_TRAJECTORY,)
         self._take_requests(dict.fromkeys(topics, (INSERTION,)))
         self._waiting = WaitingRequest(self.requests)
@@ -210,57 +219,82 @@ class Supervisor(StateMachine):
         request = self._waiting.take(stamp)
         if request is None:
             return
+        if self.authority.mode is Mode.RETRACTING and not self._targets:
+            # The motion is from the node `steering`, not from a user.
+            topic, stamp, _ = request
+            self.requests.answer(topic, stamp, Verdict.SUPERSEDED, 'the needle is retracted')
+            return
         try:
             if self._active is None:
                 raise JobError('the controller is not active')
             if self.safety.stop is not None:
                 raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
             request.execute(self._active)
+            self.authority.run()
+            self._obeyed = self.authority.mode
         except (JobError, ParameterError) as error:
             self._reject(request.topic, request.stamp, str(error))
         else:
             self._accept(request.topic, request.stamp)
 
-    def emergency_stop(self, now: int) -> ServiceResult:
-        """Stop until it is cleared."""
-        self.requests.supersede(now)
-        answer = self._stop_for('emergency stop', now)
-        return ServiceResult(True, 'stopped; ~/clear_stop releases', answer)
+    def _obstacle(self, word: str, now: int) -> str:
+        if word == STOP:
+            return ''
+        if word != CLEAR_STOP:
+            if self._active is None:
+                return 'the controller is not active'
+            return _WAITING if word == RETRACT and self._depth is None else ''
+        self._check_clock(now)
+        return self.safety.obstacle(now) or ''
 
-    def clear_stop(self, now: int) -> ServiceResult:
-        """Release the stop, unless a measurement is still beyond a limit."""
-        if self.safety.stop is None:
-            return ServiceResult(True, 'there was no stop')
-        answer = self._check_clock(now)
+    def obey(self, now: int) -> ForceCommand | None:
+        """Stop, pause, retract or continue as the state of the system requires."""
+        mode, before = self.authority.mode, self._obeyed
+        self._obeyed = mode
+        if mode is before:
+            return None
+        if mode is Mode.STOPPED:
+            return self._stop(self.authority.reason, now)
+        if before is Mode.STOPPED and not self._clear(now):
+            return None
+        if self._active is not None:
+            guide = self._active.guide
+            (guide.pause if mode is Mode.PAUSED else guide.resume)()
+            if mode is Mode.RETRACTING:
+                self._retract(self._active, self._depth, now)
+        self.events.add(Severity.INFO)
+        return None
+
+    def _stop(self, reason: str, now: int) -> ForceCommand:
+        """Latch a stop: zero force, and no motion until the next request."""
+        self.safety.latch(reason)
+        self.requests.supersede(now)
+        self.fault = reason
+        self.bending.forget()
+        if self.controller is not None:
+            self.controller.guide.forget()
+        self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
+        return self._release(now)
+
+    def _clear(self, now: int) -> bool:
+        """Release the stop, or stop the system again because of a measurement."""
         reason = self.safety.clear(now)
         if reason is not None:
-            message = f'clear_stop refused: {reason}'
-            self.events.reject(message)
-            return ServiceResult(False, message, answer)
+            self.authority.stop(reason)
+            self._obeyed = Mode.STOPPED
+            return False
         self.fault = _WAITING
         self.bending.forget()
         self.events.add(Severity.INFO, 'the stop is cleared')
-        return ServiceResult(True, 'cleared; the motion restarts', answer)
+        return True
 
-    def pause(self, hold: bool) -> ServiceResult:
-        """Brake the reference to rest and hold it, or let it continue."""
-        if self._active is None:
-            return ServiceResult(False, 'pause refused: the controller is not active')
-        guide = self._active.guide
-        (guide.pause if hold else guide.resume)()
-        self.events.add(Severity.INFO)
-        return ServiceResult(True, 'paused' if hold else 'resumed')
-
-    def retract(self, now: int) -> ServiceResult:
-        """Retract to `retract_depth`."""
-        if self._active is None or self.safety.stop is not None:
-            why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
-            return ServiceResult(False, f'retract refused: the controller is {why}')
+    def _retract(self, controller: Controller, depth: float | None, now: int) -> None:
+        """Withdraw a needle at a depth [m]; one that is less deep rests."""
         self.requests.supersede(now)
         self._waiting.discard('the needle is retracted', Verdict.SUPERSEDED)
-        self._active.guide.resume()
-        self._active.set_target(self.retract_depth)
-        return ServiceResult(True, f'retracting to {self.retract_depth:g} m')
+        if depth is not None:
+            low, high = controller.settings.depths(controller.parameters)
+            controller.set_target(min(max(min(self.retract_depth, depth), low), high))
 
     # Sensors.
 
@@ -336,6 +370,7 @@ class Supervisor(StateMachine):
                 if self.safety.stop is not None:
                     return self._command(ForceCommand(stamp))
                 return self._release_for('joint_states is beyond a limit', stamp)
+            self._depth = measured.depth
             try:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
@@ -423,13 +458,11 @@ class Supervisor(StateMachine):
     # Zero force.
 
     def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
-        """Latch a stop, if there is a reason and no stop yet."""
-        if not self.safety.latch(reason):
+        """Stop the system, if there is a reason and no stop yet."""
+        if reason is None or self.authority.reason:
             return None
-        self.fault = reason
-        self.bending.forget()
-        self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
-        return self._release(stamp)
+        self.authority.stop(reason)
+        return self.obey(stamp)
 
     def _release_for(self, fault: str, stamp: int) -> ForceCommand:
         """Command zero force on a fault, and log its beginning."""
@@ -476,6 +509,7 @@ class Supervisor(StateMachine):
         return replace(
             ControllerStatus() if control is None else control.status(),
             phase=self._phase,
+            system=self.authority.mode,
             fault=self.fault or '',
             stop=safety.stop or '',
             stops=safety.stops,
@@ -488,7 +522,7 @@ class Supervisor(StateMachine):
             input=safety.inputs(now),
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,
-            requests=self.requests.status(paused=active is not None and active.guide.paused),
+            requests=self.requests.status(),
         )
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
+from needle_dynamics.simulated.run import moved_joints
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import ParameterError, printable
@@ -16,21 +16,13 @@ from rclpy.subscription import Subscription
 from trajectory_msgs.msg import JointTrajectory
 
 
-def _moved_joints(mode: str, *, steered: bool) -> tuple[str, ...]:
-    """Return the joints that follow trajectories."""
-    if mode == 'indenter':
-        return PRESS_JOINTS
-    insertion = (contract.INSERTION,) if mode == 'robot' else ()
-    guide = tuple(joint.name for joint in contract.STEERING_JOINTS) if steered else ()
-    return (*insertion, *guide)
-
-
 class PlantTrajectories:
     """
     Receive `joint_trajectory`, execute each request once and acknowledge it.
 
     `simulated` returns the simulated time [ns] while the plant is active, and `follow` executes
     the content of a trajectory or raises ParameterError. `rejected` counts rejected requests.
+    While `stopped` is not empty, no request is executed.
     """
 
     def __init__(
@@ -44,6 +36,7 @@ class PlantTrajectories:
         self._moved: tuple[str, ...] = ()
         self.requests = RequestLog({})
         self.rejected = 0
+        self.stopped = ''
 
     def configure(self, mode: str, *, steered: bool) -> None:
         """Subscribe, if any joint follows trajectories."""
@@ -51,7 +44,7 @@ class PlantTrajectories:
             # In mode `simulation`, `insertion` is the reference of a controller.
             topic = contract.JOINT_TRAJECTORY
             self._subscription = self._node.subscribe(topic, self._on_trajectory)
-            self._moved = _moved_joints(mode, steered=steered)
+            self._moved = moved_joints(mode, steered=steered)
             self.requests = RequestLog({topic: self._moved})
 
     def cleanup(self) -> None:
@@ -75,6 +68,10 @@ class PlantTrajectories:
         if known is not None:
             if known.verdict is Verdict.REJECTED:
                 self._reject(known.reason)
+        elif self.stopped:
+            # A stop of the node `steering` is not an error of its sender.
+            verdict = Verdict.SUPERSEDED
+            self.requests.answer(contract.JOINT_TRAJECTORY, stamp, verdict, self.stopped)
         else:
             verdict, reason = Verdict.ACCEPTED, ''
             try:

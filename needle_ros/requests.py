@@ -39,7 +39,6 @@ _PAUSE: Final = 0.05
 #: Keys and key prefixes in a status.
 _TAKES: Final = 'takes '
 _REQUEST: Final = 'request '
-_PAUSED: Final = 'paused'
 
 _MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
 
@@ -95,19 +94,15 @@ class RequestStatus:
         Moved joints by topic of the request.
     answers : tuple of Acknowledgement
         The latest answers, the newest last.
-    paused : bool
-        Whether a user has paused the motion, for an unlimited time.
 
     """
 
     takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     answers: tuple[Acknowledgement, ...] = ()
-    paused: bool = False
 
     def to_values(self) -> dict[str, str]:
         """Return the fields as values of a DiagnosticStatus."""
         values = {f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()}
-        values[_PAUSED] = str(self.paused)
         for one in self.answers:
             key = f'{_REQUEST}{one.topic} {one.stamp}'
             values[key] = f'{one.verdict.value}: {one.reason}' if one.reason else one.verdict.value
@@ -126,7 +121,7 @@ class RequestStatus:
                 verdict, _, reason = value.partition(': ')
                 if stamp.isdecimal() and verdict in _VERDICTS:
                     answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
-        return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
+        return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
         """Return the answer to a request with a topic and stamp [ns], or None."""
@@ -246,10 +241,10 @@ class RequestLog:
         self._changed, self._published = False, now
         return True
 
-    def status(self, *, paused: bool = False) -> RequestStatus:
+    def status(self) -> RequestStatus:
         """Return the status with the latest answers."""
         answers = tuple(self._answers.values())[-_PUBLISHED:]
-        return RequestStatus(self._takes, answers, paused)
+        return RequestStatus(self._takes, answers)
 
 
 class PendingRequest:

@@ -139,7 +139,7 @@ class Safety:
 
     def clear(self, now: int) -> str | None:
         """
-        Release the stop, or return why not.
+        Release the stop, or return why not; see `obstacle`.
 
         Parameters
         ----------
@@ -152,15 +152,32 @@ class Safety:
             Why the stop stays; None if it is released.
 
         """
+        reason = self.obstacle(now)
+        if reason is None:
+            self.stop = None
+        return reason
+
+    def obstacle(self, now: int) -> str | None:
+        """
+        Return why a stop cannot be released.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str or None
+            Measurement beyond a limit, or a required measurement that is missing; or None.
+
+        """
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None
-        reason = self.guard.violated or required
-        if reason is None:
-            self.stop = None
-        return reason
+        return self.guard.violated or required
 
     def count_publishers(self, publishers: Mapping[str, int]) -> None:
         """

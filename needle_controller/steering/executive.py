@@ -24,6 +24,7 @@ from needle_controller.steering.motion_control import MotionControl
 from needle_controller.steering.planner import InsertionPlanner, PlannedInsertion
 from needle_controller.steering.planning import ComputedJob, StartJob
 from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.retraction import Retraction
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering.stepped import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
@@ -35,6 +36,7 @@ from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
+from needle_ros.system_state import Mode, RETRACT
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -48,7 +50,7 @@ _SAME: Final = 1e-6
 _SCATTERED: Final = 3.0
 
 
-class SteeringExecutive(StateMachine):
+class SteeringExecutive(StateMachine[JointMotion]):
     """
     Execute a steered insertion, and stop it on any fault.
 
@@ -101,14 +103,18 @@ class SteeringExecutive(StateMachine):
         self._motions = MotionControl(settings, self.events)
         #: The latest insertion.
         self._insertion: InsertionStrategy | None = None
-        #: Stamp of the latest joint states [ns].
-        self._latest = 0
+        #: The retraction after it.
+        self._retraction: Retraction | None = None
+        #: Mode of the system that is followed.
+        self._obeyed = Mode.RUNNING
 
     @property
     def phase(self) -> Phase:
         """State."""
         if self._planner.job is not None:
             return Phase.PLANNING
+        if self._retraction is not None:
+            return Phase.IDLE if self._retraction.done else Phase.RETRACTING
         if self._insertion is None:
             return Phase.IDLE
         return Phase.STOPPED if self.fault else self._insertion.phase
@@ -168,6 +174,7 @@ class SteeringExecutive(StateMachine):
         try:
             if not np.isfinite(point).all():
                 raise ParameterError(f'target must be finite, got {list(point)}')
+            self._check_mode()
             if self.steers:
                 self._aim(point)
             else:
@@ -175,9 +182,20 @@ class SteeringExecutive(StateMachine):
         except NeedleError as error:
             self._reject(TARGET, stamp, str(error))
             return None
+        self.authority.run()
+        self._obeyed = self.authority.mode
         planning = self.phase is Phase.PLANNING
         self._accept(TARGET, stamp, Verdict.RECEIVED if planning else Verdict.ACCEPTED)
         return self._begin_if_planned(now) if planning else None
+
+    def _check_mode(self) -> None:
+        """Raise `JobError` if the system does not permit an insertion now."""
+        if self.authority.reason:
+            raise JobError(f'stopped: {self.authority.reason}; ~/clear_stop releases')
+        if self.phase is Phase.RETRACTING:
+            raise JobError('the needle is withdrawn; wait until it rests, or stop it')
+        if self._obeyed is Mode.PAUSED and not self.steers:
+            raise JobError('paused; resume before the next insertion')
 
     def _aim(self, point: tuple[float, float, float]) -> None:
         depth = self.depth
@@ -220,7 +238,7 @@ class SteeringExecutive(StateMachine):
 
     def _begin_if_planned(self, now: int) -> JointMotion | None:
         """Begin the insertion once its plan is computed."""
-        taken = self._planner.take()
+        taken = None if self._obeyed is Mode.PAUSED else self._planner.take()
         if taken is None:
             return None
         (stamp, point, depths, planned), job = taken
@@ -237,15 +255,59 @@ class SteeringExecutive(StateMachine):
         guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
         strategy = ContinuousInsertion if settings.continuous else SteppedInsertion
         self._insertion, self.fault = strategy(guarded, motions, settings), ''
+        self._retraction = None
         motions.discard_stop()
         self.events.add(
             Severity.INFO, f'insertion to {_words(point)} in {len(depths) - 1} steps begins'
         )
         return self._insertion.begin(at, now)
 
-    def stop(self, why: str, now: int, silence: float = 0.0) -> JointMotion | None:
+    def _obstacle(self, word: str, _now: int) -> str:
+        if word == RETRACT and not self._motions.known:
+            return 'no positions of needle and guide received'
+        return ''
+
+    def obey(self, now: int) -> JointMotion | None:
+        """Stop, pause, retract or continue as the state of the system requires."""
+        mode, before = self.authority.mode, self._obeyed
+        self._obeyed = mode
+        if mode is before:
+            return None
+        self.events.add(Severity.INFO)
+        if mode is Mode.STOPPED:
+            return self.halt(self.authority.reason, now)
+        # A stop before is not sent again: it would end the motion that a user requests.
+        self._motions.discard_stop()
+        if mode is Mode.RETRACTING:
+            return self._retract(now)
+        if mode is Mode.PAUSED:
+            return self._motions.pause(now) if self._moves else None
+        if before is Mode.PAUSED:
+            return self._run(lambda insertion: insertion.resume(now), now)
+        return None
+
+    @property
+    def _moves(self) -> bool:
+        """Whether needle or guide may move by a motion of this executive."""
+        return self.phase in (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
+
+    def _retract(self, now: int) -> JointMotion | None:
+        """Withdraw the needle, and return the guide to its zero; this ends an insertion."""
+        self.requests.supersede(now)
+        self._cancel(Verdict.SUPERSEDED, 'the needle is retracted')
+        if not self._motions.known:
+            return None
+        if self.steers:
+            self.fault = 'a user has requested the retraction'
+        self._motions.monitor.forget()
+        if self._retraction is None or self._retraction.done:
+            self._retraction = Retraction(self._motions, self.settings)
+            self.events.add(Severity.INFO, 'the needle is withdrawn')
+        return self._retraction.follow(now)
+
+    def stop(self, why: str, now: int) -> JointMotion | None:
         """
-        Stop the insertion: needle and guide brake to rest at their positions; cancel a plan.
+        Stop the whole system: axial force, needle and guide.
 
         Parameters
         ----------
@@ -253,18 +315,30 @@ class SteeringExecutive(StateMachine):
             Reason for the user.
         now : int
             Time [ns].
-        silence : float
-            Age of the latest positions [s].
+
+        """
+        self.authority.stop(why)
+        return self.obey(now)
+
+    def halt(self, why: str, now: int) -> JointMotion | None:
+        """
+        End the insertion or retraction: needle and guide brake to rest; cancel a plan.
+
+        Parameters
+        ----------
+        why, now
+            As for `stop`.
 
         """
         self.requests.supersede(now)
         self._cancel(Verdict.REJECTED, f'stopped: {why}')
-        if not self.steers:
+        moves, retracts = self._moves, self.phase is Phase.RETRACTING
+        if not (self.steers or retracts):
             return None
-        moves, self.fault = self.phase is not Phase.MEASURING, why
+        self.fault, self._retraction = why, None
         self._motions.monitor.forget()
         self.events.add(Severity.ERROR, f'stopped: {why}')
-        return self._motions.stop(now, silence) if moves else None
+        return self._motions.stop(now) if moves else None
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
         """
@@ -318,11 +392,13 @@ class SteeringExecutive(StateMachine):
         if not self._is_valid(self._joint_stream, reading, at, now):
             return None
         motions, stamp = self._motions, reading.stamp
-        motions.at = np.array(at)
-        elapsed = stamp - self._latest if self._latest else 0
-        self._latest = stamp
+        motions.measure(np.array(at), stamp)
         if self.phase is Phase.STOPPED:
             return motions.stop_again(stamp, now)
+        if self._obeyed is Mode.PAUSED:
+            return None
+        if self.phase is Phase.RETRACTING and self._retraction is not None:
+            return self._retraction.follow(now)
         if not self.steers:
             return None
         if motions.astray():
@@ -332,7 +408,6 @@ class SteeringExecutive(StateMachine):
             if missed:
                 return self.stop(f'during the measurement of the tip {missed}', now)
             return None
-        motions.extend_if_paused(elapsed)
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)
@@ -342,7 +417,7 @@ class SteeringExecutive(StateMachine):
     ) -> JointMotion | None:
         """Pass an event to the insertion under way, and stop it on a fault."""
         insertion = self._insertion
-        if insertion is None or not self.steers:
+        if insertion is None or not self.steers or self._obeyed is Mode.PAUSED:
             return None
         try:
             move = process(insertion)
@@ -398,7 +473,7 @@ class SteeringExecutive(StateMachine):
                 return self.stop(f'{stream.publishers} nodes publish {stream.name}', now)
         silence = self._joint_stream.silence(now)
         if silence > timeout:
-            return self.stop(f'no joint_states received within {silence:.2f} s', now, silence)
+            return self.stop(f'no joint_states received within {silence:.2f} s', now)
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
@@ -467,13 +542,13 @@ class SteeringExecutive(StateMachine):
                     f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
                     f'configured {1e3 * noise:.2f} mm (prior.noise)'
                 )
-        job, paused = self._planner.job, self._motions.monitor.paused if self.steers else ''
+        job = self._planner.job
         status = replace(
             status,
             phase=self.phase,
+            system=self.authority.mode,
             fault=self.fault,
             planned_fraction=None if job is None else job.fraction,
-            paused_by=paused,
             warning=warning,
             input={stream.name: stream.status(now) for stream in self._streams},
             rejected=self.events.rejected,
@@ -489,8 +564,8 @@ class SteeringExecutive(StateMachine):
         state = DESCRIPTIONS[self.phase]
         if job is not None:
             state = f'{state}: {job.fraction:.0%}'
-        elif paused:
-            state = f'{state}; {paused} is paused'
+        elif self._obeyed is Mode.PAUSED:
+            state = f'{state}; paused'
         return Severity.INFO, state, status
 
 

@@ -23,6 +23,7 @@ DESCRIPTIONS: Final = {
     Phase.GUIDING: 'the guide moves',
     Phase.INSERTING: 'the needle is inserted',
     Phase.MEASURING: 'measures the tip',
+    Phase.RETRACTING: 'the needle is withdrawn',
 }
 
 
@@ -76,6 +77,15 @@ class InsertionStrategy(ABC):
         """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         return self._motions.send(goal, now)
+
+    def resume(self, now: int) -> JointMotion | None:
+        """Continue after a pause: move on, or measure again."""
+        self._rest = None
+        if self.phase is not Phase.MEASURING:
+            return self._motions.resume(now)
+        self.phase = Phase.INSERTING if self.law.step else Phase.GUIDING
+        self._look, self._motions.due = None, now
+        return None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Process new positions of the joints during a motion."""

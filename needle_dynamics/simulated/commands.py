@@ -61,6 +61,8 @@ class Commands:
         Number of nodes that publish commands in addition to the first.
     exhausted : bool
         Whether commands have supplied more than the permitted energy; reset at half of it.
+    stopped : bool
+        Whether no command acts, because the system is stopped.
 
     """
 
@@ -81,6 +83,7 @@ class Commands:
         #: Largest energy [J], and its decay factor per sample with a time constant of 1 s.
         self._most_energy, self._left = power_limit, exp(-interval)
         self.refused = self.stale = self.overtaken = 0
+        self.stopped = False
         self.begin()
 
     def begin(self) -> None:
@@ -156,7 +159,12 @@ class Commands:
 
     def may_move(self, now: int) -> bool:
         """Return whether commands may act at a time [ns], with a single sender."""
-        return not self.duplicates and now >= self._quiet
+        return not (self.stopped or self.duplicates) and now >= self._quiet
+
+    def stop(self) -> None:
+        """End the force; no command acts while `stopped`."""
+        self.stopped = True
+        self.newest = AppliedForces(self.newest.stamp)
 
     def hush(self, now: int) -> None:
         """Ignore commands for the timeout; a short-lived node may have sent some."""

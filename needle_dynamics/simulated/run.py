@@ -12,9 +12,17 @@ from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces, Commands
+from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
-from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
+from needle_ros.contract import (
+    INSERTION,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    STEERING_JOINTS,
+    Topic,
+)
 from needle_ros.errors import ParameterError
+from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -27,8 +35,23 @@ PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
 
+#: Time in which joints come to rest at their positions [s].
+_HALT: Final = 0.05
+
+#: Mean velocity of a retraction [m/s].
+_WITHDRAWAL: Final = 0.01
+
 #: Tolerance of the period due to the rounding of stamps [ns].
 _ROUNDING: Final = 2
+
+
+def moved_joints(mode: str, *, steered: bool) -> tuple[str, ...]:
+    """Return the joints that follow trajectories."""
+    if mode == 'indenter':
+        return PRESS_JOINTS
+    insertion = (INSERTION,) if mode == 'robot' else ()
+    guide = tuple(joint.name for joint in STEERING_JOINTS) if steered else ()
+    return (*insertion, *guide)
 
 
 class Event(NamedTuple):
@@ -124,6 +147,36 @@ class PlantRun:
         # The last measurement, with the positions first.
         values = self._measured[-1][2]
         return {joint.name: value for joint, value in zip(joints, values, strict=False)}
+
+    def halt(self) -> None:
+        """End every force and motion, of the needle and of all joints that move by themselves."""
+        self.commands.stop()
+        joints = moved_joints(self.constants.mode, steered=self.constants.steered)
+        at = self._positions()
+        if self.constants.mode == 'indenter':
+            goals: tuple[list[float], list[float]] = [], [0.0] * len(joints)
+        else:
+            goals = [at[name] for name in joints], []
+        if joints:
+            positions, efforts = ([one] for one in goals)
+            content = {'joints': [*joints], 'times': [_HALT]}
+            self.perform(
+                Event(TRAJECTORY, {**content, 'positions': positions, 'efforts': efforts})
+            )
+
+    def withdraw(self) -> None:
+        """Withdraw the needle by its own base, if it has one."""
+        if self.constants.mode != 'robot':
+            return
+        at = self._positions()[INSERTION]
+        end = min(at, RETRACT_DEPTH)
+        content = {
+            'joints': [INSERTION],
+            'times': [(at - end) / _WITHDRAWAL + _HALT],
+            'positions': [[end]],
+            'efforts': [[]],
+        }
+        self.perform(Event(TRAJECTORY, content))
 
     # Events.
 

@@ -19,6 +19,7 @@ from needle_controller import (
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
@@ -82,10 +83,13 @@ class Loop:
         return self.watch()
 
     def stop(self) -> ForceCommand | None:
-        return self.supervisor.emergency_stop(self.now).answer
+        return self.request(STOP)
 
     def clear(self) -> ForceCommand | None:
-        return self.supervisor.clear_stop(self.now).answer
+        return self.request(CLEAR_STOP)
+
+    def request(self, word: str) -> ForceCommand | None:
+        return self.supervisor.request(word, self.now)[2]
 
     def pushes(self) -> ForceCommand:
         """Measure until a force is commanded."""
@@ -121,9 +125,9 @@ EVENTS: list[Callable[[Loop], ForceCommand | None]] = [
     lambda loop: loop.passes(-SECOND),
     lambda loop: loop.aim(0.05),
     lambda loop: loop.aim(nan),
-    lambda loop: loop.supervisor.pause(True).answer,
-    lambda loop: loop.supervisor.pause(False).answer,
-    lambda loop: loop.supervisor.retract(loop.now).answer,
+    lambda loop: loop.request(PAUSE),
+    lambda loop: loop.request(RESUME),
+    lambda loop: loop.request(RETRACT),
     Loop.stop,
 ]
 events = st.lists(st.sampled_from(EVENTS), max_size=40)
@@ -182,7 +186,7 @@ def test_valid_measurements_restart_the_motion_after_faults(
         event(loop)
     loop.depth = 0.02
     loop.passes(2 * SECOND)
-    loop.supervisor.pause(False)
+    loop.request(RESUME)
     for _ in range(10):
         loop.measure()
         loop.wrench()
@@ -334,17 +338,19 @@ def test_inactive_supervisor_accepts_only_the_stop() -> None:
     """The stop survives configuration, and measurements are not answered."""
     supervisor = Supervisor()
     reading = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
-    assert supervisor.emergency_stop(SECOND).answer == ForceCommand(SECOND)
+    assert supervisor.request(STOP, SECOND)[2] == ForceCommand(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
     assert supervisor.events.last_rejection == 'target rejected: the controller is not active'
-    assert supervisor.pause(True).message == 'pause refused: the controller is not active'
+    assert supervisor.request(PAUSE, SECOND)[1] == (
+        'pause refused: stopped: requested by a user; ~/clear_stop releases'
+    )
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
     assert supervisor.encoders(reading, SECOND) == ForceCommand(SECOND)
     assert supervisor.diagnose(SECOND)[:2] == (
         Severity.ERROR,
-        'emergency stop; ~/clear_stop releases',
+        'requested by a user; ~/clear_stop releases',
     )
 
 
@@ -485,7 +491,7 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
     loop = Loop(target=None)
     loop.measure()
     loop.supervisor.target(loop.now + 10 * PERIOD, '', 0.1, 0.0, loop.now)
-    assert loop.supervisor.retract(loop.now).success
+    assert loop.supervisor.request(RETRACT, loop.now)[0]
     for _ in range(30):
         loop.measure()
     assert loop.supervisor.controller is not None
