@@ -25,6 +25,7 @@ from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
+from needle_controller.waiting_request import JointPath
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.errors import NeedleError, ParameterError
@@ -329,15 +330,16 @@ class ControllerNode(ModelNode):
             return
         # One point above the limit is enough to reject it.
         points = message.points[: MOST_POINTS + 1]
+        path = JointPath(
+            message.joint_names,
+            [seconds(point.time_from_start) for point in points],
+            [point.positions for point in points],
+            [point.velocities for point in points],
+        )
+        header = message.header
         self._act(
             self._supervisor.trajectory(
-                nanoseconds(message.header.stamp),
-                message.header.frame_id,
-                message.joint_names,
-                [seconds(point.time_from_start) for point in points],
-                [point.positions for point in points],
-                [point.velocities for point in points],
-                self.now(),
+                nanoseconds(header.stamp), header.frame_id, path, self.now()
             )
         )
 

@@ -8,9 +8,9 @@ from typing import Generic, TypeVar
 
 from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_ros.contract import ENTRY, INSERTION, Topic
-from needle_ros.event_log import EventLog
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.requests import RequestLog, Verdict
-from needle_ros.system_state import Authority
+from needle_ros.system_state import Authority, Mode
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -29,6 +29,8 @@ class StateMachine(ABC, Generic[_Command]):
         self._steady = steady
         self.events = EventLog(steady)
         self.authority = Authority()
+        #: Mode of the system that is followed.
+        self._obeyed = Mode.RUNNING
         #: Time of the last event [ns].
         self._time = 0
         self._take_requests(takes)
@@ -52,9 +54,36 @@ class StateMachine(ABC, Generic[_Command]):
     def _obstacle(self, word: str, now: int, /) -> str:
         """Return why a request of a user cannot be executed, or ''."""
 
-    @abstractmethod
     def obey(self, now: int) -> _Command | None:
-        """Follow the state of the system; return the command to publish."""
+        """
+        Follow the state of the system.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        command or None
+            Command to publish.
+
+        """
+        mode, before = self.authority.mode, self._obeyed
+        self._obeyed = mode
+        if mode is before:
+            return None
+        self.events.add(Severity.INFO)
+        return self._change_mode(mode, before, now)
+
+    @abstractmethod
+    def _change_mode(self, mode: Mode, before: Mode, now: int, /) -> _Command | None:
+        """Stop, pause, retract or continue; return the command to publish."""
+
+    def _end_retraction(self) -> None:
+        """Continue with a motion that a user has requested."""
+        self.authority.run()
+        self._obeyed = self.authority.mode
 
     def _is_new(self, topic: Topic, stamp: int, frame: str, now: int) -> bool:
         """Return whether a request must be executed; log why it is rejected."""

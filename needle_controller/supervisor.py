@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import monotonic
 from typing import Final
@@ -20,7 +20,7 @@ from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
-from needle_controller.waiting_request import AxialRequest, follow_trajectory, WaitingRequest
+from needle_controller.waiting_request import AxialRequest, follow_path, JointPath, WaitingRequest
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
@@ -54,11 +54,9 @@ class Supervisor(StateMachine[ForceCommand]):
         self.fault: str | None = None
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
-        self._deflection_ignored = False
         self._last = ForceCommand(0)
         self._following = ResponseMonitor()
-        #: Mode of the system that is followed, and last measured insertion depth [m].
-        self._obeyed = Mode.RUNNING
+        #: Last measured insertion depth [m].
         self._depth: float | None = None
         #: The controller while configured, and while measurements are answered.
         self.controller: Controller | None = None
@@ -173,32 +171,20 @@ class Supervisor(StateMachine[ForceCommand]):
 
         def aim(controller: Controller) -> None:
             controller.set_target(depth)
-            if deflection != 0.0 and not self._deflection_ignored:
-                self._deflection_ignored = True
-                self.events.add(
-                    Severity.WARNING,
+            if deflection != 0.0:
+                self._warn(
+                    'target deflection',
                     f'target deflection {deflection:g} m is ignored: force and torque at the '
                     'base cannot reach it; the depth is taken',
                 )
 
         return self._request(TARGET, stamp, frame, now, aim)
 
-    def trajectory(
-        self,
-        stamp: int,
-        frame: str,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        velocities: Sequence[Sequence[float]],
-        now: int,
-    ) -> ForceCommand | None:
-        """Take a path: times from now [s], positions [m], velocities [m/s] or none, by joint."""
-
-        def follow(controller: Controller) -> None:
-            follow_trajectory(controller, joints, times, positions, velocities)
-
-        return self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
+    def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
+        """Take a path."""
+        return self._request(
+            JOINT_TRAJECTORY, stamp, frame, now, lambda controller: follow_path(controller, path)
+        )
 
     def _request(
         self, topic: Topic, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
@@ -230,8 +216,7 @@ class Supervisor(StateMachine[ForceCommand]):
             if self.safety.stop is not None:
                 raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
             request.execute(self._active)
-            self.authority.run()
-            self._obeyed = self.authority.mode
+            self._end_retraction()
         except (JobError, ParameterError) as error:
             self._reject(request.topic, request.stamp, str(error))
         else:
@@ -247,12 +232,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._check_clock(now)
         return self.safety.obstacle(now) or ''
 
-    def obey(self, now: int) -> ForceCommand | None:
-        """Stop, pause, retract or continue as the state of the system requires."""
-        mode, before = self.authority.mode, self._obeyed
-        self._obeyed = mode
-        if mode is before:
-            return None
+    def _change_mode(self, mode: Mode, before: Mode, now: int) -> ForceCommand | None:
         if mode is Mode.STOPPED:
             return self._stop(self.authority.reason, now)
         if before is Mode.STOPPED and not self._clear(now):
@@ -262,15 +242,14 @@ class Supervisor(StateMachine[ForceCommand]):
             (guide.pause if mode is Mode.PAUSED else guide.resume)()
             if mode is Mode.RETRACTING:
                 self._retract(self._active, self._depth, now)
-        self.events.add(Severity.INFO)
         return None
 
     def _stop(self, reason: str, now: int) -> ForceCommand:
         """Latch a stop: zero force, and no motion until the next request."""
         self.safety.latch(reason)
         self.requests.supersede(now)
-        self.fault = reason
         self.bending.forget()
+        self.fault = reason
         if self.controller is not None:
             self.controller.guide.forget()
         self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
@@ -295,8 +274,6 @@ class Supervisor(StateMachine[ForceCommand]):
         if depth is not None:
             low, high = controller.settings.depths(controller.parameters)
             controller.set_target(min(max(min(self.retract_depth, depth), low), high))
-
-    # Sensors.
 
     def tip(self, reading: Reading, now: int) -> ForceCommand | None:
         """Take a `tip_deflection` measurement."""
@@ -342,8 +319,9 @@ class Supervisor(StateMachine[ForceCommand]):
         """Log that a measurement is refused, once a second."""
         self._warn(f'{stream.name} {refusal.kind}', f'{refusal.line}; ignored')
 
-    def _warn(self, kind: str, line: str) -> None:
-        self.events.add(Severity.WARNING, line, kind)
+    def _warn(self, kind: str, line: str | None) -> None:
+        if line is not None:
+            self.events.add(Severity.WARNING, line, kind)
 
     def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
         """Answer `joint_states`; a repeated message gets the same command, a late one none."""
@@ -375,8 +353,7 @@ class Supervisor(StateMachine[ForceCommand]):
                 self.bending.update(stamp, measured)
             except NeedleError as error:
                 self._warn('observer', f'observer: {error}')
-            if self.bending.warning is not None:
-                self._warn('doubt', self.bending.warning)
+            self._warn('doubt', self.bending.warning)
         return self._answer(controller, stamp, measured)
 
     def _again(self, stamp: int) -> ForceCommand:
@@ -409,25 +386,22 @@ class Supervisor(StateMachine[ForceCommand]):
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
         if stopped is not None:
             return stopped
-        lost = self._following.update(
-            stamp, measured.depth, aim.position, self._last.force, measured.force
-        )
+        force, depth = self._last.force, measured.depth
+        lost = self._following.update(stamp, depth, aim.position, force, measured.force)
         if lost != controller.guide.waits:
             controller.guide.wait(lost)
         if lost:
             controller.unwind()
             self._log_fault(
                 'the plant does not follow: it reports '
-                f'{measured.force:.3g} N, {self._last.force:.3g} N is commanded',
+                f'{measured.force:.3g} N, {force:.3g} N is commanded',
                 'the reference waits',
             )
         elif self.fault is not None:
             self.fault = None
             self.events.add(Severity.INFO, kind='recovery')
         force, torque, limits = command.force, command.torque, controller.settings
-        buckling = buckling_warning(controller.parameters, measured.depth, force)
-        if buckling is not None:
-            self._warn('buckling', buckling)
+        self._warn('buckling', buckling_warning(controller.parameters, depth, force))
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
         return self._command(ForceCommand(stamp, force, torque, aim[:2], error))
@@ -451,11 +425,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
         rate = self._timing.compare_rate(joints)
-        if rate is not None:
-            self._warn('pace', rate)
+        self._warn('pace', rate)
         return answer
-
-    # Zero force.
 
     def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
         """Stop the system, if there is a reason and no stop yet."""
@@ -489,8 +460,6 @@ class Supervisor(StateMachine[ForceCommand]):
         self._last = answer
         return answer
 
-    # Status.
-
     @property
     def _phase(self) -> ControllerPhase:
         if self.safety.stop is not None:
@@ -507,19 +476,13 @@ class Supervisor(StateMachine[ForceCommand]):
         if active is not None:
             warning = safety.warning(now) or self.bending.warning or self._timing.warning(now)
         return replace(
-            ControllerStatus() if control is None else control.status(),
+            safety.status(ControllerStatus() if control is None else control.status(), now),
             phase=self._phase,
             system=self.authority.mode,
             fault=self.fault or '',
-            stop=safety.stop or '',
-            stops=safety.stops,
             warning=warning or '',
-            duplicate_publishers=safety.duplicate_publishers or '',
             observer=self.bending.status(),
             latency=self._timing.status(),
-            command_rate=safety.saturation.rate(now),
-            saturated_fraction=safety.saturation.share(now),
-            input=safety.inputs(now),
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,
             requests=self.requests.status(),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final
 
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
@@ -15,16 +14,6 @@ from needle_dynamics.arrays import FloatArray
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-
-#: Descriptions of the phases for the user.
-DESCRIPTIONS: Final = {
-    Phase.IDLE: 'waits for a target',
-    Phase.PLANNING: 'computes the plan',
-    Phase.GUIDING: 'the guide moves',
-    Phase.INSERTING: 'the needle is inserted',
-    Phase.MEASURING: 'measures the tip',
-    Phase.RETRACTING: 'the needle is withdrawn',
-}
 
 
 class InsertionStrategy(ABC):

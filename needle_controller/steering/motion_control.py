@@ -148,13 +148,11 @@ class MotionControl:
         duration = duration_of(np.array([depth - self.at[0], 0.0, 0.0]), self._settings)
         return self._stamped(smooth(self._settings.joints[:1], begin, end, duration), now)
 
-    def guide_at_limited_speed(
-        self, position: FloatArray, duration: float, now: int
-    ) -> JointMotion:
-        """Send the guide to rest at a position [m], in a duration [s] or at `guide_speed`."""
-        way = np.array([0.0, *(position - self.at[1:3])])
-        longer = max(duration, duration_of(way, self._settings))
-        return self.guide_to(position, np.zeros(2), longer, now)
+    def guide_toward(self, position: FloatArray, duration: float, now: int) -> JointMotion:
+        """Send the guide to a position [m], in a duration [s] or at `guide_speed`."""
+        way = position - self.at[1:3]
+        duration = max(duration, float(np.hypot(*way)) / self._settings.guide_speed)
+        return self.guide_to(position, way / duration, duration, now)
 
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
@@ -220,6 +218,7 @@ class MotionControl:
         # A needle that rests, or whose positions are implausible, is not moved into the tissue.
         moving = min(max(self.velocity, 0.0), self._settings.speed)
         end[0] = min(end[0] + 0.5 * BRAKING * moving, self.goal[0])
+        end[0] = max(end[0], min(self.origin[0], 0.0))
         end[1:3] = np.clip(end[1:3], -limit, limit)
         return end
 

@@ -36,6 +36,8 @@ class Retraction:
 
     def follow(self, now: int) -> JointMotion | None:
         """Return the next motion at the present positions; the insertion is repeated if lost."""
+        if self.done:
+            return None
         motions, settings = self._motions, self._settings
         depth, guide = float(motions.at[0]), motions.at[1:3]
         rest, begin = depth - self._end, float(self._begin[0]) - self._end
@@ -48,8 +50,10 @@ class Retraction:
         if self.done or now - self._guided < _INTERVAL * NANOSECONDS:
             return None
         self._guided = now
+        # At the end of the guide motion.
+        rest += motions.velocity * _INTERVAL
         part = min(max(rest / begin, 0.0), 1.0) if begin > settings.depth_tolerance else 0.0
-        return motions.guide_at_limited_speed(part * self._begin[1:3], _INTERVAL, now)
+        return motions.guide_toward(part * self._begin[1:3], _INTERVAL, now)
 
     def _is_due(self, depth: float, now: int) -> bool:
         """Return whether the withdrawal must be sent: first, or again to a needle at rest."""

@@ -17,6 +17,7 @@ from needle_controller import (
     SafetyLimits,
 )
 from needle_controller.supervisor import Supervisor
+from needle_controller.waiting_request import JointPath
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
@@ -431,12 +432,12 @@ def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
     loop.said()
     many = [[float(k)] for k in range(MOST_POINTS + 1)]
     times = [float(k) for k in range(MOST_POINTS + 1)]
-    loop.supervisor.trajectory(0, '', ['insertion'], times, many, [], loop.now)
+    loop.supervisor.trajectory(0, '', JointPath(['insertion'], times, many), loop.now)
     (line,) = loop.said()
     assert line == f'joint_trajectory rejected: a path may have at most {MOST_POINTS} points'
     loop.seconds += 1.0
     evil = '\x1b]0;evil\x07\u202e' + 1000 * 'x'
-    loop.supervisor.trajectory(0, evil, ['insertion'], [1.0], [[0.03]], [], loop.now)
+    loop.supervisor.trajectory(0, evil, JointPath(['insertion'], [1.0], [[0.03]]), loop.now)
     line = loop.said()[-1]
     assert len(line) <= 500
     assert line.isprintable()
@@ -471,9 +472,8 @@ def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(
                 if what == 'target':
                     loop.supervisor.target(stamp, '', 0.1, 0.0, now)
                 else:
-                    loop.supervisor.trajectory(
-                        stamp, '', ['insertion'], [0.0, 1.0], [[0.02], [0.0205]], [], now
-                    )
+                    path = JointPath(['insertion'], [0.0, 1.0], [[0.02], [0.0205]])
+                    loop.supervisor.trajectory(stamp, '', path, now)
             answers.append(loop.measure())
         assert loop.said() == []
         return answers
