@@ -279,9 +279,9 @@ class Supervisor(StateMachine[ForceCommand]):
         """Take a `tip_deflection` measurement."""
         if self._active is None:
             return None
-        answer, deflection = self._check_clock(now), reading.values[0][2]
+        answer, (x, depth, deflection) = self._check_clock(now), reading.values[0]
         if self._is_valid(self.safety.streams['tip_deflection'], reading, [deflection], now):
-            answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
+            answer = self._stop_for(self.safety.guard.tip(deflection, depth, x), now) or answer
             # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
                 self.bending.take_tip(reading.stamp, deflection)
@@ -291,10 +291,11 @@ class Supervisor(StateMachine[ForceCommand]):
         """Take a `base_wrench` measurement."""
         if self._active is None:
             return None
-        answer, (_, axial, lateral, moment, _, _) = self._check_clock(now), reading.values[0]
+        answer, values = self._check_clock(now), reading.values[0]
+        _, axial, lateral, moment, _, _ = values
         stream, guard = self.safety.streams['base_wrench'], self.safety.guard
         if self._is_valid(stream, reading, [lateral, moment, axial], now):
-            answer = self._stop_for(guard.wrench(axial, lateral, moment), now) or answer
+            answer = self._stop_for(guard.wrench(values[:3], values[3:]), now) or answer
             # The sensor also measures the commanded torque of the base.
             moment -= self._last.torque
             newest = self.safety.streams['joint_states'].last

@@ -504,3 +504,64 @@ def test_clock_set_back_is_detected() -> None:
     steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
     found = [supervisor.clock_went_back(round(t * SECOND), timeout) for t in steps]
     assert found == [0, 0, 0, 0, 0, 48.95, 0]
+
+
+@pytest.mark.parametrize(
+    ('topic', 'component', 'size'),
+    [
+        *(('wrench', k, size) for k, size in enumerate([11.0, 31.0, 11.0, 1.1, 1.1, 1.1])),
+        ('tip', 0, 0.051),
+        ('tip', 2, 0.051),
+    ],
+)
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_every_component_of_a_sensor_has_a_limit(
+    topic: str, component: int, size: float, sign: float
+) -> None:
+    """Two readings beyond the limit stop; readings just within all limits do not."""
+    loop = Loop()
+    loop.aim(0.05)
+    loop.pushes()
+    values = [0.0] * (6 if topic == 'wrench' else 3)
+
+    def read(scale: float) -> None:
+        loop.measure()
+        shown = [scale * one for one in values]
+        if topic == 'wrench':
+            loop.supervisor.wrench(Reading(loop.now, 'needle_base', (), (tuple(shown),)), loop.now)
+        else:
+            shown[1] += 0.02
+            loop.supervisor.tip(Reading(loop.now, 'needle_entry', (), (tuple(shown),)), loop.now)
+
+    values[component] = sign * size
+    # A jump of the sensor is discarded first.
+    for _ in range(3):
+        read(0.9)
+    assert loop.supervisor.authority.reason == ''
+    for _ in range(3):
+        read(1.0)
+    assert 'is beyond the limit' in loop.supervisor.authority.reason
+
+
+@pytest.mark.parametrize(('within', 'beyond'), [(0.25, 0.26), (-0.045, -0.055)])
+def test_depth_of_the_tip_has_a_limit(within: float, beyond: float) -> None:
+    """50 mm and the tolerance outside of the range of depths, 1 to 200 mm."""
+    guard = Loop().supervisor.safety.guard
+    assert guard.tip(0.0, within) is None
+    assert guard.tip(0.0, beyond) is None
+    assert 'distance of the tip' in (guard.tip(0.0, beyond) or '')
+
+
+def test_component_that_a_sensor_does_not_measure_is_no_fault() -> None:
+    """NaN in a component that the controller does not use."""
+    loop = Loop()
+    loop.aim(0.05)
+    loop.pushes()
+    for _ in range(5):
+        loop.measure()
+        wrench, tip = (nan, 1.0, 0.0, 0.0, nan, nan), (nan, nan, 1e-3)
+        loop.supervisor.wrench(Reading(loop.now, 'needle_base', (), (wrench,)), loop.now)
+        loop.supervisor.tip(Reading(loop.now, 'needle_entry', (), (tip,)), loop.now)
+    assert loop.supervisor.authority.reason == ''
+    status = loop.supervisor.diagnose(loop.now)[2]
+    assert status.input['base_wrench'].accepted == status.input['tip_deflection'].accepted == 5
