@@ -21,6 +21,7 @@ from benchmarks.page import Answer, PageSection, Tick
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION, WRENCH_COMMAND
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
+from needle_ros.system_state import CLEAR_STOP
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -278,7 +279,7 @@ def _recovery(loop: Loop) -> float:
     """Clear a stop and move to another target; return the time [s]."""
     if (
         loop.supervisor.safety.stop is not None
-        and not loop.supervisor.clear_stop(loop.now).success
+        and not loop.supervisor.request(CLEAR_STOP, loop.now)[0]
     ):
         return inf
     loop.target(_AFTER)

@@ -16,7 +16,7 @@ from needle_controller.controller import (
     Gains,
     LAWS,
 )
-from needle_controller.force_command import ForceCommand, ServiceResult
+from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import HardwareSettings
 from needle_controller.hardware_node import CONTRACT, Driver
 from needle_controller.observer.settings import ObserverSettings
@@ -25,6 +25,7 @@ from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
+from needle_controller.waiting_request import JointPath
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.errors import NeedleError, ParameterError
@@ -32,6 +33,8 @@ from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.status import ControllerStatus, Diagnosis
+from needle_ros.system_state import RETRACT_DEPTH
+from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import nanoseconds, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
@@ -39,13 +42,9 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
-from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 _RETRACT = 'retract_depth'
-
-#: Default retract depth [m], limited to the range of depths.
-_RETRACT_DEPTH = 0.01
 
 #: Number of repetitions of the last command at deactivation, because the driver may have no
 #: timeout, and time between them [s].
@@ -69,10 +68,11 @@ class ControllerNode(ModelNode):
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths
     are followed, and targets are executed by the node `steering`. The command is zero before the
     first target or path, while measurements are stale, jump or are not finite, and while another
-    node publishes commands. It is also zero from ``~/emergency_stop`` or a measurement beyond a
+    node publishes commands. It is also zero from ``~/stop`` of any node or a measurement beyond a
     limit until ``~/clear_stop``. It has the stamp of the measurement that it answers, otherwise
     the present time. ``~/pause`` brakes the reference and holds it, ``~/retract`` moves to
-    ``retract_depth``. ``reference`` and ``tracking_error`` are the reference and its error.
+    ``retract_depth``: they hold for the whole system, see `needle_ros.system_state`.
+    ``reference`` and ``tracking_error`` are the reference and its error.
 
     An observer estimates the load of the bent needle from ``tip_deflection`` and ``base_wrench``,
     if these are published. Both are checked against the limits in any case.
@@ -123,7 +123,7 @@ class ControllerNode(ModelNode):
         )
         self.declare_parameter(
             _RETRACT,
-            _RETRACT_DEPTH,
+            RETRACT_DEPTH,
             ParameterDescriptor(
                 description='insertion depth of ~/retract [m]', dynamic_typing=True
             ),
@@ -153,10 +153,12 @@ class ControllerNode(ModelNode):
         self._write_aim = contract.REFERENCE.template().serialize
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
-        self._serve(Trigger, 'emergency_stop', lambda _: supervisor.emergency_stop(self.now()))
-        self._serve(Trigger, 'clear_stop', lambda _: supervisor.clear_stop(self.now()))
-        self._serve(SetBool, 'pause', lambda request: supervisor.pause(request.data))
-        self._serve(Trigger, 'retract', lambda _: supervisor.retract(self.now()))
+        self._system = SystemStateTopics(
+            self,
+            supervisor.authority,
+            self._on_request,
+            lambda: self._act(supervisor.obey(self.now())),
+        )
         #: A stopped or jumping ROS clock does not stop the watchdog.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -235,9 +237,9 @@ class ControllerNode(ModelNode):
         """Return the depth to retract to, or reject it."""
         value = changes.get(_RETRACT, self.get_parameter(_RETRACT).value)
         low, high = self.settings('', ControllerSettings).depths(self.model_parameters())
-        if _RETRACT not in changes and value == _RETRACT_DEPTH:
+        if _RETRACT not in changes and value == RETRACT_DEPTH:
             # The default is limited to the range of the needle.
-            return min(max(_RETRACT_DEPTH, low), high)
+            return min(max(RETRACT_DEPTH, low), high)
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value <= high:
             raise ParameterError(f'{_RETRACT} must be in [{low:g}, {high:g}] m, got {value!r}')
@@ -307,15 +309,10 @@ class ControllerNode(ModelNode):
 
         return on_reading
 
-    def _serve(self, kind: Any, name: str, act: Callable[[Any], ServiceResult]) -> None:
-        """Offer a service that executes a request and publishes the command."""
-
-        def on_request(request: Any, response: Any) -> Any:
-            response.success, response.message, answer = act(request)
-            self._act(answer)
-            return response
-
-        self.create_service(kind, f'~/{name}', on_request)
+    def _on_request(self, word: str) -> tuple[bool, str]:
+        success, line, answer = self._supervisor.request(word, self.now())
+        self._act(answer)
+        return success, line
 
     def _on_target(self, message: PointStamped) -> None:
         if self.get_parameter('steered').value:
@@ -333,15 +330,16 @@ class ControllerNode(ModelNode):
             return
         # One point above the limit is enough to reject it.
         points = message.points[: MOST_POINTS + 1]
+        path = JointPath(
+            message.joint_names,
+            [seconds(point.time_from_start) for point in points],
+            [point.positions for point in points],
+            [point.velocities for point in points],
+        )
+        header = message.header
         self._act(
             self._supervisor.trajectory(
-                nanoseconds(message.header.stamp),
-                message.header.frame_id,
-                message.joint_names,
-                [seconds(point.time_from_start) for point in points],
-                [point.positions for point in points],
-                [point.velocities for point in points],
-                self.now(),
+                nanoseconds(header.stamp), header.frame_id, path, self.now()
             )
         )
 
@@ -382,6 +380,7 @@ class ControllerNode(ModelNode):
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
+        self._system.publish()
         self.publish_events(self._supervisor.events)
         if self._supervisor.requests.due():
             self.publish_diagnostics()

@@ -1,4 +1,4 @@
-"""Force command of the axial supervisor, and the result of a service call."""
+"""Force command of the axial supervisor."""
 
 from __future__ import annotations
 
@@ -27,11 +27,3 @@ class ForceCommand(NamedTuple):
     torque: float = 0.0
     reference: tuple[float, ...] = ()
     error: tuple[float, ...] = ()
-
-
-class ServiceResult(NamedTuple):
-    """Result of a service call, with a force command to publish or None."""
-
-    success: bool
-    message: str
-    answer: ForceCommand | None = None

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Generic, TypeVar
 
 from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_ros.contract import ENTRY, INSERTION, Topic
-from needle_ros.event_log import EventLog
+from needle_ros.event_log import EventLog, Severity
 from needle_ros.requests import RequestLog, Verdict
+from needle_ros.system_state import Authority, Mode
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
+_Command = TypeVar('_Command')
 
-class StateMachine(ABC):
+
+class StateMachine(ABC, Generic[_Command]):
     """
     Events, requests, clock and inputs of the axial supervisor and the steering executive.
 
-    `steady` is as for `EventLog`, `takes` as for `RequestLog`.
+    `authority` is the state of the whole system, which the machine follows. `steady` is as for
+    `EventLog`, `takes` as for `RequestLog`.
     """
 
     def __init__(self, steady: Callable[[], float], takes: Mapping[Topic, Sequence[str]]) -> None:
         self._steady = steady
         self.events = EventLog(steady)
+        self.authority = Authority()
+        #: Mode of the system that is followed.
+        self._obeyed = Mode.RUNNING
         #: Time of the last event [ns].
         self._time = 0
         self._take_requests(takes)
@@ -30,6 +38,52 @@ class StateMachine(ABC):
     def _take_requests(self, takes: Mapping[Topic, Sequence[str]]) -> None:
         """Set which requests are accepted."""
         self.requests = RequestLog(takes, ('', ENTRY), self._steady)
+
+    def request(self, word: str, now: int) -> tuple[bool, str, _Command | None]:
+        """
+        Execute a request of a user, as `Authority.request`, and follow the new state.
+
+        Returns whether it succeeded, a line for the user, and the command to publish.
+        """
+        success, message = self.authority.request(word, self._obstacle(word, now))
+        if not success:
+            self.events.reject(message)
+        return success, message, self.obey(now)
+
+    @abstractmethod
+    def _obstacle(self, word: str, now: int, /) -> str:
+        """Return why a request of a user cannot be executed, or ''."""
+
+    def obey(self, now: int) -> _Command | None:
+        """
+        Follow the state of the system.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        command or None
+            Command to publish.
+
+        """
+        mode, before = self.authority.mode, self._obeyed
+        self._obeyed = mode
+        if mode is before:
+            return None
+        self.events.add(Severity.INFO)
+        return self._change_mode(mode, before, now)
+
+    @abstractmethod
+    def _change_mode(self, mode: Mode, before: Mode, now: int, /) -> _Command | None:
+        """Stop, pause, retract or continue; return the command to publish."""
+
+    def _end_retraction(self) -> None:
+        """Continue with a motion that a user has requested."""
+        self.authority.run()
+        self._obeyed = self.authority.mode
 
     def _is_new(self, topic: Topic, stamp: int, frame: str, now: int) -> bool:
         """Return whether a request must be executed; log why it is rejected."""

@@ -33,6 +33,8 @@ from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
 from needle_ros.status import Diagnosis, SteeringStatus
+from needle_ros.system_state import Authority
+from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 import numpy as np
@@ -42,7 +44,6 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration as Delay
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
@@ -68,8 +69,10 @@ class SteeringNode(CompiledNode):
     messages and ``~/stop`` do not wait for it. A target out of reach is rejected with the
     reachable range. Each motion is sent again until the robot follows it. The needle stops when
     the tip measurement freezes, is missing, slips or is implausible, when a node rejects a motion,
-    when a joint does not arrive, and by ``~/stop``. ``tip_expected`` is the
-    expected position of the tip at the target depth, if the law predicts it.
+    when a joint does not arrive, and by ``~/stop`` of any node. ``~/pause`` holds needle and
+    guide, ``~/retract`` withdraws the needle to ``retract_depth`` and returns the guide to its
+    zero. ``tip_expected`` is the expected position of the tip at the target depth, if the law
+    predicts it.
 
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
@@ -114,7 +117,9 @@ class SteeringNode(CompiledNode):
             self.listen(topic, self._passing(take), self._watch)
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
-        self.create_service(Trigger, '~/stop', self._on_stop)
+        #: State of the system, also before the node is configured.
+        self._authority = Authority()
+        self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
         #: Reports the processed sample, with simulated time.
         self._processed: Publisher | None = None
         #: Processed sample that is not reported yet: a plan is computed first.
@@ -143,6 +148,7 @@ class SteeringNode(CompiledNode):
         law = self.text('law')
         find_law(law)
         self._loop = SteeringExecutive(needle, steering, prior, settings, start=ThreadJob, law=law)
+        self._loop.authority = self._authority
 
     def cleanup(self) -> None:
         """Discard the steering executive."""
@@ -151,13 +157,14 @@ class SteeringNode(CompiledNode):
     def activate(self) -> None:
         """Start to process measurements, and to check for missing inputs."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
+        self._obey()
         if self.get_parameter('use_sim_time').value:
             self._processed = self.publisher(contract.PROCESSED, always=True)
 
     def deactivate(self) -> None:
         """Bring needle and guide to rest."""
         if self._loop is not None:
-            self._act(self._loop.stop('the node was deactivated', self.now()))
+            self._act(self._loop.halt('the node was deactivated', self.now()))
         self.destroy_timer(self._timer)
         if self._processed is not None:
             self.destroy_publisher(self._processed)
@@ -229,18 +236,17 @@ class SteeringNode(CompiledNode):
                 node = printable(status.name.rpartition('/')[2])
                 self._act(self._loop.hear(node, answers, self.now()))
 
-    def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        loop = self._loop
-        if loop is not None and loop.steers:
-            response.message = 'stopped; retract the needle before the next target'
-        elif loop is not None and loop.busy:
-            response.message = 'planning cancelled'
-        else:
-            response.message = 'no insertion is under way'
-        if loop is not None:
-            self._act(loop.stop('~/stop', self.now()))
-        response.success = True
-        return response
+    def _on_request(self, word: str) -> tuple[bool, str]:
+        if self._loop is None:
+            return self._authority.request(word)
+        success, line, move = self._loop.request(word, self.now())
+        self._act(move)
+        return success, line
+
+    def _obey(self) -> None:
+        """Follow the state of the system."""
+        if self._loop is not None and self.is_active:
+            self._act(self._loop.obey(self.now()))
 
     def _watch(self, _came: int = 0) -> None:
         """Check for missing inputs, for duplicate publishers, and for a plan that is computed."""
@@ -261,6 +267,7 @@ class SteeringNode(CompiledNode):
         if move is not None:
             self._trajectory.publish(self._message(move))
             self._moved = True
+        self._system.publish()
         if loop.expected is not self._told:
             self._told = loop.expected
             if loop.expected is not None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import monotonic
 from typing import Final
 
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
-from needle_controller.force_command import ForceCommand, ServiceResult
+from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
@@ -20,20 +20,21 @@ from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
-from needle_controller.waiting_request import AxialRequest, follow_trajectory, WaitingRequest
+from needle_controller.waiting_request import AxialRequest, follow_path, JointPath, WaitingRequest
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.requests import Verdict
 from needle_ros.status import ControllerPhase, ControllerStatus
+from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'
 
 
-class Supervisor(StateMachine):
+class Supervisor(StateMachine[ForceCommand]):
     """
     Answer each measurement with a force command, and command zero force on any fault.
 
@@ -53,9 +54,10 @@ class Supervisor(StateMachine):
         self.fault: str | None = None
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
-        self._deflection_ignored = False
         self._last = ForceCommand(0)
         self._following = ResponseMonitor()
+        #: Last measured insertion depth [m].
+        self._depth: float | None = None
         #: The controller while configured, and while measurements are answered.
         self.controller: Controller | None = None
         self._active: Controller | None = None
@@ -122,6 +124,9 @@ class Supervisor(StateMachine):
         self._begin(now)
         self.safety.count_publishers(publishers)
         self._active = self.controller
+        if self._obeyed is not Mode.STOPPED:
+            self._obeyed = Mode.RUNNING
+            self.obey(now)
 
     def deactivate(self, now: int) -> ForceCommand:
         """Command zero force, and discard the motion and its target."""
@@ -136,6 +141,7 @@ class Supervisor(StateMachine):
         self._waiting = WaitingRequest(self.requests)
         self._time = now
         self.safety.begin(now)
+        self._depth = None
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
@@ -153,6 +159,7 @@ class Supervisor(StateMachine):
 
     def receive(self, *, targets: bool) -> None:
         """Set which requests are accepted."""
+        self._targets = targets
         topics = (TARGET, JOINT_TRAJECTORY) if targets else (JOINT_TRAJECTORY,)
         self._take_requests(dict.fromkeys(topics, (INSERTION,)))
         self._waiting = WaitingRequest(self.requests)
@@ -164,32 +171,20 @@ class Supervisor(StateMachine):
 
         def aim(controller: Controller) -> None:
             controller.set_target(depth)
-            if deflection != 0.0 and not self._deflection_ignored:
-                self._deflection_ignored = True
-                self.events.add(
-                    Severity.WARNING,
+            if deflection != 0.0:
+                self._warn(
+                    'target deflection',
                     f'target deflection {deflection:g} m is ignored: force and torque at the '
                     'base cannot reach it; the depth is taken',
                 )
 
         return self._request(TARGET, stamp, frame, now, aim)
 
-    def trajectory(
-        self,
-        stamp: int,
-        frame: str,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        velocities: Sequence[Sequence[float]],
-        now: int,
-    ) -> ForceCommand | None:
-        """Take a path: times from now [s], positions [m], velocities [m/s] or none, by joint."""
-
-        def follow(controller: Controller) -> None:
-            follow_trajectory(controller, joints, times, positions, velocities)
-
-        return self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
+    def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
+        """Take a path."""
+        return self._request(
+            JOINT_TRAJECTORY, stamp, frame, now, lambda controller: follow_path(controller, path)
+        )
 
     def _request(
         self, topic: Topic, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
@@ -210,67 +205,83 @@ class Supervisor(StateMachine):
         request = self._waiting.take(stamp)
         if request is None:
             return
+        if self.authority.mode is Mode.RETRACTING and not self._targets:
+            # The motion is from the node `steering`, not from a user.
+            topic, stamp, _ = request
+            self.requests.answer(topic, stamp, Verdict.SUPERSEDED, 'the needle is retracted')
+            return
         try:
             if self._active is None:
                 raise JobError('the controller is not active')
             if self.safety.stop is not None:
                 raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
             request.execute(self._active)
+            self._end_retraction()
         except (JobError, ParameterError) as error:
             self._reject(request.topic, request.stamp, str(error))
         else:
             self._accept(request.topic, request.stamp)
 
-    def emergency_stop(self, now: int) -> ServiceResult:
-        """Stop until it is cleared."""
-        self.requests.supersede(now)
-        answer = self._stop_for('emergency stop', now)
-        return ServiceResult(True, 'stopped; ~/clear_stop releases', answer)
+    def _obstacle(self, word: str, now: int) -> str:
+        if word == STOP:
+            return ''
+        if word != CLEAR_STOP:
+            if self._active is None:
+                return 'the controller is not active'
+            return _WAITING if word == RETRACT and self._depth is None else ''
+        self._check_clock(now)
+        return self.safety.obstacle(now) or ''
 
-    def clear_stop(self, now: int) -> ServiceResult:
-        """Release the stop, unless a measurement is still beyond a limit."""
-        if self.safety.stop is None:
-            return ServiceResult(True, 'there was no stop')
-        answer = self._check_clock(now)
+    def _change_mode(self, mode: Mode, before: Mode, now: int) -> ForceCommand | None:
+        if mode is Mode.STOPPED:
+            return self._stop(self.authority.reason, now)
+        if before is Mode.STOPPED and not self._clear(now):
+            return None
+        if self._active is not None:
+            guide = self._active.guide
+            (guide.pause if mode is Mode.PAUSED else guide.resume)()
+            if mode is Mode.RETRACTING:
+                self._retract(self._active, self._depth, now)
+        return None
+
+    def _stop(self, reason: str, now: int) -> ForceCommand:
+        """Latch a stop: zero force, and no motion until the next request."""
+        self.safety.latch(reason)
+        self.requests.supersede(now)
+        self.bending.forget()
+        self.fault = reason
+        if self.controller is not None:
+            self.controller.guide.forget()
+        self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
+        return self._release(now)
+
+    def _clear(self, now: int) -> bool:
+        """Release the stop, or stop the system again because of a measurement."""
         reason = self.safety.clear(now)
         if reason is not None:
-            message = f'clear_stop refused: {reason}'
-            self.events.reject(message)
-            return ServiceResult(False, message, answer)
+            self.authority.stop(reason)
+            self._obeyed = Mode.STOPPED
+            return False
         self.fault = _WAITING
         self.bending.forget()
         self.events.add(Severity.INFO, 'the stop is cleared')
-        return ServiceResult(True, 'cleared; the motion restarts', answer)
+        return True
 
-    def pause(self, hold: bool) -> ServiceResult:
-        """Brake the reference to rest and hold it, or let it continue."""
-        if self._active is None:
-            return ServiceResult(False, 'pause refused: the controller is not active')
-        guide = self._active.guide
-        (guide.pause if hold else guide.resume)()
-        self.events.add(Severity.INFO)
-        return ServiceResult(True, 'paused' if hold else 'resumed')
-
-    def retract(self, now: int) -> ServiceResult:
-        """Retract to `retract_depth`."""
-        if self._active is None or self.safety.stop is not None:
-            why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
-            return ServiceResult(False, f'retract refused: the controller is {why}')
+    def _retract(self, controller: Controller, depth: float | None, now: int) -> None:
+        """Withdraw a needle at a depth [m]; one that is less deep rests."""
         self.requests.supersede(now)
         self._waiting.discard('the needle is retracted', Verdict.SUPERSEDED)
-        self._active.guide.resume()
-        self._active.set_target(self.retract_depth)
-        return ServiceResult(True, f'retracting to {self.retract_depth:g} m')
-
-    # Sensors.
+        if depth is not None:
+            low, high = controller.settings.depths(controller.parameters)
+            controller.set_target(min(max(min(self.retract_depth, depth), low), high))
 
     def tip(self, reading: Reading, now: int) -> ForceCommand | None:
         """Take a `tip_deflection` measurement."""
         if self._active is None:
             return None
-        answer, deflection = self._check_clock(now), reading.values[0][2]
+        answer, (x, depth, deflection) = self._check_clock(now), reading.values[0]
         if self._is_valid(self.safety.streams['tip_deflection'], reading, [deflection], now):
-            answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
+            answer = self._stop_for(self.safety.guard.tip(deflection, depth, x), now) or answer
             # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
                 self.bending.take_tip(reading.stamp, deflection)
@@ -280,10 +291,11 @@ class Supervisor(StateMachine):
         """Take a `base_wrench` measurement."""
         if self._active is None:
             return None
-        answer, (_, axial, lateral, moment, _, _) = self._check_clock(now), reading.values[0]
+        answer, values = self._check_clock(now), reading.values[0]
+        _, axial, lateral, moment, _, _ = values
         stream, guard = self.safety.streams['base_wrench'], self.safety.guard
         if self._is_valid(stream, reading, [lateral, moment, axial], now):
-            answer = self._stop_for(guard.wrench(axial, lateral, moment), now) or answer
+            answer = self._stop_for(guard.wrench(values[:3], values[3:]), now) or answer
             # The sensor also measures the commanded torque of the base.
             moment -= self._last.torque
             newest = self.safety.streams['joint_states'].last
@@ -308,8 +320,9 @@ class Supervisor(StateMachine):
         """Log that a measurement is refused, once a second."""
         self._warn(f'{stream.name} {refusal.kind}', f'{refusal.line}; ignored')
 
-    def _warn(self, kind: str, line: str) -> None:
-        self.events.add(Severity.WARNING, line, kind)
+    def _warn(self, kind: str, line: str | None) -> None:
+        if line is not None:
+            self.events.add(Severity.WARNING, line, kind)
 
     def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
         """Answer `joint_states`; a repeated message gets the same command, a late one none."""
@@ -336,12 +349,12 @@ class Supervisor(StateMachine):
                 if self.safety.stop is not None:
                     return self._command(ForceCommand(stamp))
                 return self._release_for('joint_states is beyond a limit', stamp)
+            self._depth = measured.depth
             try:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
                 self._warn('observer', f'observer: {error}')
-            if self.bending.warning is not None:
-                self._warn('doubt', self.bending.warning)
+            self._warn('doubt', self.bending.warning)
         return self._answer(controller, stamp, measured)
 
     def _again(self, stamp: int) -> ForceCommand:
@@ -374,25 +387,22 @@ class Supervisor(StateMachine):
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
         if stopped is not None:
             return stopped
-        lost = self._following.update(
-            stamp, measured.depth, aim.position, self._last.force, measured.force
-        )
+        force, depth = self._last.force, measured.depth
+        lost = self._following.update(stamp, depth, aim.position, force, measured.force)
         if lost != controller.guide.waits:
             controller.guide.wait(lost)
         if lost:
             controller.unwind()
             self._log_fault(
                 'the plant does not follow: it reports '
-                f'{measured.force:.3g} N, {self._last.force:.3g} N is commanded',
+                f'{measured.force:.3g} N, {force:.3g} N is commanded',
                 'the reference waits',
             )
         elif self.fault is not None:
             self.fault = None
             self.events.add(Severity.INFO, kind='recovery')
         force, torque, limits = command.force, command.torque, controller.settings
-        buckling = buckling_warning(controller.parameters, measured.depth, force)
-        if buckling is not None:
-            self._warn('buckling', buckling)
+        self._warn('buckling', buckling_warning(controller.parameters, depth, force))
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
         return self._command(ForceCommand(stamp, force, torque, aim[:2], error))
@@ -416,20 +426,15 @@ class Supervisor(StateMachine):
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
         rate = self._timing.compare_rate(joints)
-        if rate is not None:
-            self._warn('pace', rate)
+        self._warn('pace', rate)
         return answer
 
-    # Zero force.
-
     def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
-        """Latch a stop, if there is a reason and no stop yet."""
-        if not self.safety.latch(reason):
+        """Stop the system, if there is a reason and no stop yet."""
+        if reason is None or self.authority.reason:
             return None
-        self.fault = reason
-        self.bending.forget()
-        self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
-        return self._release(stamp)
+        self.authority.stop(reason)
+        return self.obey(stamp)
 
     def _release_for(self, fault: str, stamp: int) -> ForceCommand:
         """Command zero force on a fault, and log its beginning."""
@@ -456,8 +461,6 @@ class Supervisor(StateMachine):
         self._last = answer
         return answer
 
-    # Status.
-
     @property
     def _phase(self) -> ControllerPhase:
         if self.safety.stop is not None:
@@ -474,21 +477,16 @@ class Supervisor(StateMachine):
         if active is not None:
             warning = safety.warning(now) or self.bending.warning or self._timing.warning(now)
         return replace(
-            ControllerStatus() if control is None else control.status(),
+            safety.status(ControllerStatus() if control is None else control.status(), now),
             phase=self._phase,
+            system=self.authority.mode,
             fault=self.fault or '',
-            stop=safety.stop or '',
-            stops=safety.stops,
             warning=warning or '',
-            duplicate_publishers=safety.duplicate_publishers or '',
             observer=self.bending.status(),
             latency=self._timing.status(),
-            command_rate=safety.saturation.rate(now),
-            saturated_fraction=safety.saturation.share(now),
-            input=safety.inputs(now),
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,
-            requests=self.requests.status(paused=active is not None and active.guide.paused),
+            requests=self.requests.status(),
         )
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:

@@ -52,14 +52,18 @@ class WaitingRequest:
         self._request = None
 
 
-def follow_trajectory(
-    controller: Controller,
-    joints: Sequence[str],
-    times: Sequence[float],
-    positions: Sequence[Sequence[float]],
-    velocities: Sequence[Sequence[float]],
-) -> None:
-    """Follow the insertion in the points of a trajectory; see `Supervisor.trajectory`."""
+class JointPath(NamedTuple):
+    """Path of joints: times from now [s], positions [m] and velocities [m/s] or none, by joint."""
+
+    joints: Sequence[str]
+    times: Sequence[float]
+    positions: Sequence[Sequence[float]]
+    velocities: Sequence[Sequence[float]] = ()
+
+
+def follow_path(controller: Controller, path: JointPath) -> None:
+    """Follow the insertion in a path."""
+    joints, times, positions, velocities = path
     if len(times) > MOST_POINTS:
         raise ParameterError(f'a path may have at most {MOST_POINTS} points')
     lengths, rates = (

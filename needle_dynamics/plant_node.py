@@ -24,6 +24,8 @@ from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, PlantPhase, PlantStatus
+from needle_ros.system_state import Authority, Mode
+from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
@@ -69,9 +71,10 @@ class PlantNode(ModelNode):
     ``publish_clock`` or ``lockstep`` this time is /clock. `Commands` selects the command that acts
     from one sample to the next. A command carries the stamp of the sample to which it responds;
     with ``lockstep`` the next sample waits for this command, and for all nodes that report
-    processed samples, such as `steering`. ``~/pause`` stops time, ``~/step`` takes one sample,
-    ``~/reset`` restores the initial state of needle and noise while time continues. ``~/events``
-    records every input other than commands, so that the run can be recomputed.
+    processed samples, such as `steering`. ``~/pause_time`` stops time, ``~/step`` takes one
+    sample, ``~/reset`` restores the initial state of needle and noise while time continues.
+    ``~/events`` records every input other than commands, so that the run can be recomputed.
+    While the system is stopped, no command or trajectory acts, see `needle_ros.system_state`.
     """
 
     LIVE = frozenset(
@@ -147,7 +150,9 @@ class PlantNode(ModelNode):
         )
         self._reports = SampleReports(self, self._on_timer)
         self.create_service(Trigger, '~/tare', self._on_tare)
-        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.create_service(SetBool, '~/pause_time', self._on_pause)
+        self._authority, self._mode = Authority(), Mode.RUNNING
+        self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
         self.create_service(Trigger, '~/step', self._on_step)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
@@ -178,6 +183,8 @@ class PlantNode(ModelNode):
         recorded = publishes or own.real_time_factor != 1.0
         self._reports.configure(self._time, processed=lockstep, recorded=recorded)
         self._trajectories.configure(constants.mode, steered=constants.steered)
+        self._mode = Mode.RUNNING
+        self._obey()
 
     def cleanup(self) -> None:
         """Discard the plant."""
@@ -273,6 +280,26 @@ class PlantNode(ModelNode):
             self._time.answered(plant_run.commands.newest.stamp)
             self._on_timer()
 
+    def _on_request(self, word: str) -> tuple[bool, str]:
+        result = self._authority.request(word)
+        self._obey()
+        return result
+
+    def _obey(self) -> None:
+        """End every force and motion while the system is stopped; withdraw the needle."""
+        mode, before, reason = self._authority.mode, self._mode, self._authority.reason
+        self._mode = mode
+        if self._run is None or mode is before:
+            return
+        self._trajectories.stopped = f'stopped: {reason}' if reason else ''
+        if mode is Mode.STOPPED:
+            self.get_logger().error(f'stopped: {reason}; no force or motion until ~/clear_stop')
+            self._run.halt()
+        elif mode is Mode.RETRACTING:
+            self._run.withdraw()
+        self._run.commands.stopped = mode is Mode.STOPPED
+        self.publish_diagnostics()
+
     def _follow(self, content: dict[str, Any]) -> None:
         """Execute a trajectory."""
         if self._run is None:
@@ -308,7 +335,7 @@ class PlantNode(ModelNode):
             self._time.resume(self.now())
             return 'time resumed'
 
-        return self._answer(response, 'pause', pause)
+        return self._answer(response, 'pause_time', pause)
 
     def _on_step(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def step(_run: PlantRun) -> str:
@@ -406,6 +433,7 @@ class PlantNode(ModelNode):
         return replace(
             plant_run.plant.report,
             phase=self._phase,
+            system=self._authority.mode,
             halt=self._halted or '',
             time=clock.stamp / NANOSECONDS,
             real_time_factor=samples.rate.rate(now) / plant_run.constants.own.rate,

@@ -23,6 +23,7 @@ class PlantTrajectories:
 
     `simulated` returns the simulated time [ns] while the plant is active, and `follow` executes
     the content of a trajectory or raises ParameterError. `rejected` counts rejected requests.
+    While `stopped` is not empty, no request is executed.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class PlantTrajectories:
         self._moved: tuple[str, ...] = ()
         self.requests = RequestLog({})
         self.rejected = 0
+        self.stopped = ''
 
     def configure(self, mode: str, *, steered: bool) -> None:
         """Subscribe, if any joint follows trajectories."""
@@ -68,6 +70,10 @@ class PlantTrajectories:
         if known is not None:
             if known.verdict is Verdict.REJECTED:
                 self._reject(known.reason)
+        elif self.stopped:
+            # A stop of the node `steering` is not an error of its sender.
+            verdict = Verdict.SUPERSEDED
+            self.requests.answer(contract.JOINT_TRAJECTORY, stamp, verdict, self.stopped)
         else:
             verdict, reason = Verdict.ACCEPTED, ''
             try:

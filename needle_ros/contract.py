@@ -366,6 +366,24 @@ TARGET: Final = Topic(
     stamp=Stamp.REQUEST,
 )
 
+SYSTEM_STATE: Final = Topic(
+    'system_state',
+    'diagnostic_msgs/msg/DiagnosticStatus',
+    'controller, steering, plant',
+    'mode of the system (running, paused, retracting, stopped) with the reason of a stop; on '
+    'change and 1 Hz',
+    # Several nodes publish.
+    qos=LATCHED._replace(depth=10),
+)
+
+EMERGENCY_STOP: Final = Topic(
+    'emergency_stop',
+    'std_msgs/msg/Bool',
+    USER,
+    'true stops the system, as `~/stop` of any node',
+    qos=COMMAND,
+)
+
 TIP_EXPECTED: Final = Topic(
     'tip_expected',
     'geometry_msgs/msg/PoseWithCovarianceStamped',

@@ -39,7 +39,6 @@ _PAUSE: Final = 0.05
 #: Keys and key prefixes in a status.
 _TAKES: Final = 'takes '
 _REQUEST: Final = 'request '
-_PAUSED: Final = 'paused'
 
 _MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
 
@@ -81,13 +80,10 @@ class RequestStatus:
     takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: The latest answers, the newest last.
     answers: tuple[Acknowledgement, ...] = ()
-    #: Whether a user has paused the motion, for an unlimited time.
-    paused: bool = False
 
     def to_values(self) -> dict[str, str]:
         """Return the fields as values of a DiagnosticStatus."""
         values = {f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()}
-        values[_PAUSED] = str(self.paused)
         for one in self.answers:
             key = f'{_REQUEST}{one.topic} {one.stamp}'
             values[key] = f'{one.verdict.value}: {one.reason}' if one.reason else one.verdict.value
@@ -106,7 +102,7 @@ class RequestStatus:
                 verdict, _, reason = value.partition(': ')
                 if stamp.isdecimal() and verdict in _VERDICTS:
                     answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
-        return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
+        return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
         """Return the answer to a request with a topic and stamp [ns], or None."""
@@ -219,10 +215,10 @@ class RequestLog:
         self._changed, self._published = False, now
         return True
 
-    def status(self, *, paused: bool = False) -> RequestStatus:
+    def status(self) -> RequestStatus:
         """Return the status with the latest answers."""
         answers = tuple(self._answers.values())[-_PUBLISHED:]
-        return RequestStatus(self._takes, answers, paused)
+        return RequestStatus(self._takes, answers)
 
 
 class PendingRequest:

@@ -28,6 +28,7 @@ from typing import (
 
 from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus
+from needle_ros.system_state import Mode
 
 #: Key of the kind of a status.
 _KIND: Final = 'kind'
@@ -70,6 +71,7 @@ class SteeringPhase(Enum):
     GUIDING = 'guiding'
     INSERTING = 'inserting'
     MEASURING = 'measuring'
+    RETRACTING = 'retracting'
     DONE = 'done'
     STOPPED = 'stopped'
 
@@ -168,6 +170,7 @@ class ControllerStatus(NodeStatus):
     KIND: ClassVar[str] = 'controller'
 
     phase: ControllerPhase = entry(ControllerPhase.INACTIVE, '', 'phase')
+    system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
     fault: str = entry('', '', 'why no force is commanded or the reference waits')
     stop: str = entry('', '', 'reason of the latched stop')
     warning: str = entry('', '', 'inputs, observer or rate that need attention')
@@ -202,9 +205,9 @@ class SteeringStatus(NodeStatus):
     KIND: ClassVar[str] = 'steering'
 
     phase: SteeringPhase = entry(SteeringPhase.INACTIVE, '', 'phase')
+    system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
     fault: str = entry('', '', 'reason of the stop')
     planned_fraction: float | None = entry(None, '', 'completed fraction of the planning')
-    paused_by: str = entry('', '', 'node that a user has paused')
     target: tuple[float, float, float] | None = entry(None, 'm', 'target x, y, z of the tip')
     step: int = entry(0, '', 'completed steps')
     steps: int = entry(0, '', 'steps of the insertion')
@@ -239,6 +242,7 @@ class PlantStatus(NodeStatus):
     KIND: ClassVar[str] = 'plant'
 
     phase: PlantPhase = entry(PlantPhase.INACTIVE, '', 'phase')
+    system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
     halt: str = entry('', '', 'error that has halted the plant')
     time: float = entry(0.0, 's', 'simulated time')
     insertion_depth: float | None = entry(None, 'm', 'insertion depth')

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import hypot, isnan, nan
 from typing import Final
 
 from needle_controller.controller import Measurement
@@ -21,6 +23,11 @@ def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -
         f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the tissue: "
         'without a guide it buckles; lower force_limit'
     )
+
+
+def _measured(value: float) -> float:
+    """Return zero for a value that is not measured, NaN."""
+    return 0.0 if isnan(value) else value
 
 
 class Guard:
@@ -122,14 +129,15 @@ class Guard:
         limit = self.limits.tracking_error
         return self._hold('reference', ('tracking error', error, limit, 'm', 'tracking_error'))
 
-    def wrench(self, axial: float, lateral: float, moment: float) -> str | None:
+    def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
         """
-        Check the forces and the moment on the sensor against their limits.
+        Check the forces and the torques on the sensor against their limits.
 
         Parameters
         ----------
-        axial, lateral, moment : float
-            Forces along y and z [N], and moment about x [N m].
+        force, torque : sequence of float
+            Components x, y and z [N, N m]; y is along the needle. A component that is not
+            measured, NaN, counts as zero.
 
         Returns
         -------
@@ -137,21 +145,25 @@ class Guard:
             Description of the violated limit; None within the limits.
 
         """
+        x, axial, z = map(_measured, force)
+        around_x, torsion, around_z = map(_measured, torque)
+        lateral, moment = hypot(x, z), hypot(around_x, around_z)
         return self._hold(
             'base_wrench',
             ('axial force', axial, self.limits.axial_load, 'N', 'axial_load'),
             ('lateral force', lateral, self.limits.lateral_load, 'N', 'lateral_load'),
             ('moment', moment, self.limits.moment_load, 'N m', 'moment_load'),
+            ('torque about the needle', torsion, self.limits.torsion_load, 'N m', 'torsion_load'),
         )
 
-    def tip(self, deflection: float) -> str | None:
+    def tip(self, deflection: float, depth: float = nan, lateral: float = 0.0) -> str | None:
         """
-        Check the deflection of the tip against its limit.
+        Check deflection and depth of the tip against their limit.
 
         Parameters
         ----------
-        deflection : float
-            Deflection [m].
+        deflection, depth, lateral : float
+            Position of the tip along z, y and x [m]; NaN if it is not measured.
 
         Returns
         -------
@@ -160,9 +172,14 @@ class Guard:
 
         """
         limit = self.limits.tip_deflection
+        low, high = self._depths
+        outside = max(_measured(low - depth), _measured(depth - high), 0.0)
+        across = hypot(deflection, _measured(lateral))
         return self._hold(
-            'tip_deflection', ('tip deflection', deflection, limit, 'm', 'tip_deflection')
-        )
+            'tip_deflection',
+            ('tip deflection', across, limit, 'm', 'tip_deflection'),
+            ('distance of the tip from the depth range', outside, limit, 'm', 'tip_deflection'),
+        )  # fmt: skip
 
     def forget(self, topic: str) -> None:
         """

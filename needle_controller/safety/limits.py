@@ -32,17 +32,25 @@ class SafetyLimits:
         1000.0, 'rad', 'largest angle of the base, in both directions', open_low=True
     )
     tip_deflection: float = constant(
-        0.05, 'm', 'largest deflection of the tip, in both directions', open_low=True
+        0.05,
+        'm',
+        'largest deflection of the tip in any direction, and distance of its depth '
+        'from the range of depths',
+        open_low=True,
     )
     axial_load: float = constant(
         30.0, 'N', 'largest axial force on the force sensor, in both directions', open_low=True
     )
     lateral_load: float = constant(
-        10.0, 'N', 'largest lateral force on the force sensor, in both directions', open_low=True
+        10.0, 'N', 'largest lateral force on the force sensor, in any direction', open_low=True
     )
     moment_load: float = constant(
-        1.0, 'N m', 'largest moment on the force sensor, in both directions', open_low=True
+        1.0, 'N m', 'largest bending moment on the force sensor, in any direction', open_low=True
     )
+    torsion_load: float = constant(
+        1.0, 'N m', 'largest torque about the needle on the force sensor, in both directions',
+        open_low=True,
+    )  # fmt: skip
     tip_jump: float = constant(
         0.02, 'm', 'change of tip_deflection between two samples that is a sensor fault',
         open_low=True,

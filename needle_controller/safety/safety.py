@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 from needle_controller.controller import ControllerSettings
@@ -11,7 +12,7 @@ from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import BASE
-from needle_ros.status import InputStatus
+from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
 #: Topics whose absence or duplicate publishers prevent any force.
@@ -139,7 +140,7 @@ class Safety:
 
     def clear(self, now: int) -> str | None:
         """
-        Release the stop, or return why not.
+        Release the stop, or return why not; see `obstacle`.
 
         Parameters
         ----------
@@ -152,15 +153,32 @@ class Safety:
             Why the stop stays; None if it is released.
 
         """
+        reason = self.obstacle(now)
+        if reason is None:
+            self.stop = None
+        return reason
+
+    def obstacle(self, now: int) -> str | None:
+        """
+        Return why a stop cannot be released.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str or None
+            Measurement beyond a limit, or a required measurement that is missing; or None.
+
+        """
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None
-        reason = self.guard.violated or required
-        if reason is None:
-            self.stop = None
-        return reason
+        return self.guard.violated or required
 
     def count_publishers(self, publishers: Mapping[str, int]) -> None:
         """
@@ -267,14 +285,14 @@ class Safety:
         )
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
-    def inputs(self, now: int) -> dict[str, InputStatus]:
-        """
-        Return the status of each input with messages, by topic.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
-        return {name: one.status(now) for name, one in self.streams.items() if one.counts}
+    def status(self, status: ControllerStatus, now: int) -> ControllerStatus:
+        """Return a status of the controller with stop, publishers, commands and inputs."""
+        return replace(
+            status,
+            stop=self.stop or '',
+            stops=self.stops,
+            duplicate_publishers=self.duplicate_publishers or '',
+            command_rate=self.saturation.rate(now),
+            saturated_fraction=self.saturation.share(now),
+            input={name: one.status(now) for name, one in self.streams.items() if one.counts},
+        )

@@ -17,13 +17,19 @@ from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import DESCRIPTIONS, InsertionStrategy
+from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion_status import describe, describe_phase
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl
-from needle_controller.steering.planner import InsertionPlanner, PlannedInsertion
+from needle_controller.steering.planner import (
+    describe_target,
+    InsertionPlanner,
+    PlannedInsertion,
+)
 from needle_controller.steering.planning import ComputedJob, StartJob
 from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.retraction import Retraction
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering.stepped import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
@@ -35,20 +41,21 @@ from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
+from needle_ros.system_state import Mode, RETRACT
 from needle_ros.wire import Reading
 import numpy as np
 
 #: Changes from one message to the next that are implausible [m, rad].
 _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
+#: Phases with motions of this executive.
+_MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
+
 #: Tolerance of equal depths [m].
 _SAME: Final = 1e-6
 
-#: Noise of the readings of the tip, as a multiple of the configured noise, that is reported.
-_SCATTERED: Final = 3.0
 
-
-class SteeringExecutive(StateMachine):
+class SteeringExecutive(StateMachine[JointMotion]):
     """
     Execute a steered insertion, and stop it on any fault.
 
@@ -101,14 +108,16 @@ class SteeringExecutive(StateMachine):
         self._motions = MotionControl(settings, self.events)
         #: The latest insertion.
         self._insertion: InsertionStrategy | None = None
-        #: Stamp of the latest joint states [ns].
-        self._latest = 0
+        #: The retraction after it.
+        self._retraction: Retraction | None = None
 
     @property
     def phase(self) -> Phase:
         """State."""
         if self._planner.job is not None:
             return Phase.PLANNING
+        if self._retraction is not None:
+            return Phase.IDLE if self._retraction.done else Phase.RETRACTING
         if self._insertion is None:
             return Phase.IDLE
         return Phase.STOPPED if self.fault else self._insertion.phase
@@ -138,8 +147,6 @@ class SteeringExecutive(StateMachine):
         """Depth of the target of the latest insertion [m]."""
         return 0.0 if self._insertion is None else float(self._insertion.law.depths[-1])
 
-    # Requests.
-
     def target(
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> JointMotion | None:
@@ -168,6 +175,7 @@ class SteeringExecutive(StateMachine):
         try:
             if not np.isfinite(point).all():
                 raise ParameterError(f'target must be finite, got {list(point)}')
+            self._check_mode()
             if self.steers:
                 self._aim(point)
             else:
@@ -175,9 +183,19 @@ class SteeringExecutive(StateMachine):
         except NeedleError as error:
             self._reject(TARGET, stamp, str(error))
             return None
+        self._end_retraction()
         planning = self.phase is Phase.PLANNING
         self._accept(TARGET, stamp, Verdict.RECEIVED if planning else Verdict.ACCEPTED)
         return self._begin_if_planned(now) if planning else None
+
+    def _check_mode(self) -> None:
+        """Raise `JobError` if the system does not permit an insertion now."""
+        if self.authority.reason:
+            raise JobError(f'stopped: {self.authority.reason}; ~/clear_stop releases')
+        if self.phase is Phase.RETRACTING:
+            raise JobError('the needle is withdrawn; wait until it rests, or stop it')
+        if self._obeyed is Mode.PAUSED and not self.steers:
+            raise JobError('paused; resume before the next insertion')
 
     def _aim(self, point: tuple[float, float, float]) -> None:
         depth = self.depth
@@ -187,7 +205,7 @@ class SteeringExecutive(StateMachine):
                 f'{1e3 * point[1]:.2f} mm; ~/stop ends it'
             )
         self._insertion.law.aim(np.array([point[0], point[2]]))
-        self.events.add(Severity.INFO, f'target changed to {_words(point)}')
+        self.events.add(Severity.INFO, f'target changed to {describe_target(point)}')
 
     def _check_ready(self, now: int) -> FloatArray:
         """Return the positions of the joints, if an insertion can begin."""
@@ -208,7 +226,9 @@ class SteeringExecutive(StateMachine):
         depths = self._planner.depths(point, at, begun)
         self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
         self._planner.start(PlannedInsertion(stamp, point, depths, at))
-        self.events.add(Severity.INFO, f'planning to {_words(point)} in {len(depths) - 1} steps')
+        self.events.add(
+            Severity.INFO, f'planning to {describe_target(point)} in {len(depths) - 1} steps'
+        )
 
     def _cancel(self, verdict: Verdict, why: str) -> None:
         """Cancel the computation of a plan, if it is under way."""
@@ -220,7 +240,7 @@ class SteeringExecutive(StateMachine):
 
     def _begin_if_planned(self, now: int) -> JointMotion | None:
         """Begin the insertion once its plan is computed."""
-        taken = self._planner.take()
+        taken = None if self._obeyed is Mode.PAUSED else self._planner.take()
         if taken is None:
             return None
         (stamp, point, depths, planned), job = taken
@@ -237,15 +257,52 @@ class SteeringExecutive(StateMachine):
         guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
         strategy = ContinuousInsertion if settings.continuous else SteppedInsertion
         self._insertion, self.fault = strategy(guarded, motions, settings), ''
+        self._retraction = None
         motions.discard_stop()
-        self.events.add(
-            Severity.INFO, f'insertion to {_words(point)} in {len(depths) - 1} steps begins'
-        )
+        line = f'insertion to {describe_target(point)} in {len(depths) - 1} steps begins'
+        self.events.add(Severity.INFO, line)
         return self._insertion.begin(at, now)
 
-    def stop(self, why: str, now: int, silence: float = 0.0) -> JointMotion | None:
+    def _obstacle(self, word: str, _now: int) -> str:
+        if word == RETRACT and not self._motions.known:
+            return 'no positions of needle and guide received'
+        return ''
+
+    def _change_mode(self, mode: Mode, before: Mode, now: int) -> JointMotion | None:
+        if mode is Mode.STOPPED:
+            return self.halt(self.authority.reason, now)
+        # A stop before is not sent again: it would end the motion that a user requests.
+        self._motions.discard_stop()
+        if mode is Mode.RETRACTING:
+            return self._retract(now)
+        if mode is Mode.PAUSED:
+            return self._motions.pause(now) if self.phase in _MOVING else None
+        if before is Mode.PAUSED:
+            return self._run(lambda insertion: insertion.resume(now), now)
+        return None
+
+    def _retract(self, now: int) -> JointMotion | None:
+        """Withdraw the needle, and return the guide to its zero; this ends an insertion."""
+        self.requests.supersede(now)
+        self._cancel(Verdict.SUPERSEDED, 'the needle is retracted')
+        if not self._motions.known:
+            return None
+        if self.steers:
+            self.fault = 'a user has requested the retraction'
+        self._motions.monitor.forget()
+        if self._retraction is None or self._retraction.done:
+            self._retraction = Retraction(self._motions, self.settings)
+            self.events.add(Severity.INFO, 'the needle is withdrawn')
+        return self._retraction.follow(now)
+
+    def _stop(self, why: str, now: int) -> JointMotion | None:
+        """Stop the whole system: axial force, needle and guide."""
+        self.authority.stop(why)
+        return self.obey(now)
+
+    def halt(self, why: str, now: int) -> JointMotion | None:
         """
-        Stop the insertion: needle and guide brake to rest at their positions; cancel a plan.
+        End the insertion or retraction: needle and guide brake to rest; cancel a plan.
 
         Parameters
         ----------
@@ -253,18 +310,17 @@ class SteeringExecutive(StateMachine):
             Reason for the user.
         now : int
             Time [ns].
-        silence : float
-            Age of the latest positions [s].
 
         """
         self.requests.supersede(now)
         self._cancel(Verdict.REJECTED, f'stopped: {why}')
-        if not self.steers:
+        moves = self.phase in _MOVING
+        if not (self.steers or moves):
             return None
-        moves, self.fault = self.phase is not Phase.MEASURING, why
+        self.fault, self._retraction = why, None
         self._motions.monitor.forget()
         self.events.add(Severity.ERROR, f'stopped: {why}')
-        return self._motions.stop(now, silence) if moves else None
+        return self._motions.stop(now) if moves else None
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
         """
@@ -284,14 +340,12 @@ class SteeringExecutive(StateMachine):
         if not refusal:
             return None
         if self.steers:
-            return self.stop(refusal, now)
+            return self._stop(refusal, now)
         # Only once: the answer is repeated each second.
         self._motions.monitor.forget()
         if self.phase is Phase.STOPPED:
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
-
-    # Measurements.
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
         """
@@ -305,34 +359,32 @@ class SteeringExecutive(StateMachine):
             Time [ns].
 
         """
-        names, (positions, *_) = reading.names, reading.values
-        found = dict(zip(names, positions, strict=False))
-        joints = self.settings.joints
-        missing = [name for name in joints if name not in found]
+        found = dict(zip(reading.names, reading.values[0], strict=False))
+        missing = [name for name in self.settings.joints if name not in found]
         if missing:
+            names = ', '.join(missing)
             self.events.reject(
-                f'joint_states lacks a position of {", ".join(missing)}, got names {list(names)}'
+                f'joint_states lacks a position of {names}, got names {list(reading.names)}'
             )
             return None
-        at = [found[name] for name in joints]
+        at = [found[name] for name in self.settings.joints]
         if not self._is_valid(self._joint_stream, reading, at, now):
             return None
         motions, stamp = self._motions, reading.stamp
-        motions.at = np.array(at)
-        elapsed = stamp - self._latest if self._latest else 0
-        self._latest = stamp
+        motions.measure(np.array(at), stamp)
         if self.phase is Phase.STOPPED:
             return motions.stop_again(stamp, now)
-        if not self.steers:
+        if self._obeyed is Mode.PAUSED:
             return None
+        if not self.steers:
+            retraction = self._retraction
+            return None if retraction is None else retraction.follow(now)
         if motions.astray():
-            return self.stop(motions.astray(), now)
+            return self._stop(motions.astray(), now)
         if self.phase is Phase.MEASURING:
             missed = motions.missed()
-            if missed:
-                return self.stop(f'during the measurement of the tip {missed}', now)
-            return None
-        motions.extend_if_paused(elapsed)
+            line = f'during the measurement of the tip {missed}'
+            return self._stop(line, now) if missed else None
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)
@@ -342,12 +394,12 @@ class SteeringExecutive(StateMachine):
     ) -> JointMotion | None:
         """Pass an event to the insertion under way, and stop it on a fault."""
         insertion = self._insertion
-        if insertion is None or not self.steers:
+        if insertion is None or not self.steers or self._obeyed is Mode.PAUSED:
             return None
         try:
             move = process(insertion)
         except NeedleError as error:
-            return self.stop(str(error), now)
+            return self._stop(str(error), now)
         if insertion.phase is Phase.DONE:
             self.events.add(Severity.INFO, f'done: {insertion.law.outcome()}')
         return move
@@ -386,7 +438,7 @@ class SteeringExecutive(StateMachine):
             for stream in self._streams:
                 stream.forget()
             self._motions.restart()
-            halt = self.stop(f'the clock went back by {back:.3f} s', now)
+            halt = self._stop(f'the clock went back by {back:.3f} s', now)
             self.requests.forget()
             return halt
         if self.phase is Phase.PLANNING:
@@ -395,10 +447,10 @@ class SteeringExecutive(StateMachine):
             return None
         for stream in self._streams:
             if stream.publishers > 1:
-                return self.stop(f'{stream.publishers} nodes publish {stream.name}', now)
+                return self._stop(f'{stream.publishers} nodes publish {stream.name}', now)
         silence = self._joint_stream.silence(now)
         if silence > timeout:
-            return self.stop(f'no joint_states received within {silence:.2f} s', now, silence)
+            return self._stop(f'no joint_states received within {silence:.2f} s', now)
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
@@ -414,36 +466,6 @@ class SteeringExecutive(StateMachine):
         self._joint_stream.publishers = joint_states
         self._tip_stream.publishers = tip_deflection
 
-    # Status.
-
-    def _describe_control(self) -> tuple[SteeringStatus, str]:
-        """Return the status of the law, and its warning."""
-        if self._insertion is None:
-            return SteeringStatus(), ''
-        guarded, law = self._insertion.law, self._insertion.law.law
-        x, z = np.asarray(law.target).tolist()
-        _, guide_x, guide_z = self._motions.goal[:3].tolist()
-        values = dict(law.status())
-        turns = values.pop('turns_left', None)
-        status = SteeringStatus(
-            target=(x, self.depth, z),
-            step=min(guarded.step, guarded.steps),
-            steps=guarded.steps,
-            guide_setpoint=(guide_x, guide_z),
-            turns_left=None if turns is None else int(turns),
-            hit_probability=values.pop('hit_probability', None),
-            bending_length_ratio=values.pop('bending_length_ratio', None),
-            law=values,
-        )
-        if guarded.expected is not None:
-            half = guarded.expected.half_width
-            status = replace(
-                status,
-                expected_tip=tuple(guarded.expected.mean.tolist()),
-                expected_tip_half_width=tuple(half.tolist()),
-            )
-        return status, law.warning if self.steers else ''
-
     def diagnose(self, now: int) -> tuple[Severity, str, SteeringStatus]:
         """
         Return severity, the state in one line, and status.
@@ -454,26 +476,14 @@ class SteeringExecutive(StateMachine):
             Time [ns].
 
         """
-        (status, warning), insertion = self._describe_control(), self._insertion
-        if insertion is not None and insertion.law.seen is not None:
-            seen, noise = insertion.law.seen, self._noise
-            status = replace(
-                status,
-                last_measurement_readings=seen.readings,
-                last_measurement_error=seen.error,
-            )
-            if not warning and seen.error > _SCATTERED * noise:
-                warning = (
-                    f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
-                    f'configured {1e3 * noise:.2f} mm (prior.noise)'
-                )
-        job, paused = self._planner.job, self._motions.monitor.paused if self.steers else ''
+        insertion, job = self._insertion, self._planner.job
+        status, warning = describe(insertion, self._motions.goal, self._noise, active=self.steers)
         status = replace(
             status,
             phase=self.phase,
+            system=self.authority.mode,
             fault=self.fault,
             planned_fraction=None if job is None else job.fraction,
-            paused_by=paused,
             warning=warning,
             input={stream.name: stream.status(now) for stream in self._streams},
             rejected=self.events.rejected,
@@ -486,14 +496,4 @@ class SteeringExecutive(StateMachine):
             return Severity.WARNING, warning, status
         if insertion is not None and self.phase is Phase.DONE:
             return Severity.INFO, f'done: {insertion.law.outcome()}', status
-        state = DESCRIPTIONS[self.phase]
-        if job is not None:
-            state = f'{state}: {job.fraction:.0%}'
-        elif paused:
-            state = f'{state}; {paused} is paused'
-        return Severity.INFO, state, status
-
-
-def _words(point: tuple[float, float, float]) -> str:
-    x, y, z = (1e3 * one for one in point)
-    return f'x = {x:.2f} mm, z = {z:.2f} mm at a depth of {y:.2f} mm'
+        return Severity.INFO, describe_phase(status), status

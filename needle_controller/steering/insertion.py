@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final
 
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
@@ -15,15 +14,6 @@ from needle_dynamics.arrays import FloatArray
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-
-#: Descriptions of the phases for the user.
-DESCRIPTIONS: Final = {
-    Phase.IDLE: 'waits for a target',
-    Phase.PLANNING: 'computes the plan',
-    Phase.GUIDING: 'the guide moves',
-    Phase.INSERTING: 'the needle is inserted',
-    Phase.MEASURING: 'measures the tip',
-}
 
 
 class InsertionStrategy(ABC):
@@ -76,6 +66,15 @@ class InsertionStrategy(ABC):
         """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         return self._motions.send(goal, now)
+
+    def resume(self, now: int) -> JointMotion | None:
+        """Continue after a pause: move on, or measure again."""
+        self._rest = None
+        if self.phase is not Phase.MEASURING:
+            return self._motions.resume(now)
+        self.phase = Phase.INSERTING if self.law.step else Phase.GUIDING
+        self._look, self._motions.due = None, now
+        return None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Process new positions of the joints during a motion."""

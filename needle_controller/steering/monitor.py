@@ -89,10 +89,6 @@ class MotionMonitor:
         """Add a motion that is soon replaced by the next: only its answers are monitored."""
         self._streamed.append(move.stamp)
 
-    def wait(self, duration: int) -> None:
-        """Extend the deadline by the time in which a user paused the motion [ns]."""
-        self._overdue += duration
-
     def is_late(self, at: FloatArray, stamp: int) -> bool:
         """
         Return whether the motion is overdue and must be repeated.
@@ -134,11 +130,6 @@ class MotionMonitor:
             return answer.stamp in self._stamps or answer.stamp in self._streamed
         # The motions before the newest are superseded by it.
         return answer.verdict is Verdict.SUPERSEDED and answer.stamp in self._stamps[-1:]
-
-    @property
-    def paused(self) -> str:
-        """Name of a node whose motion a user has paused, '' if none is paused."""
-        return next((node for node, status in self._receivers.items() if status.paused), '')
 
     @property
     def pending(self) -> BoolArray:

@@ -25,6 +25,9 @@ LAGGING: Final = 5.0
 #: it is sent.
 _STOP_AGAIN, _STOPS = 0.5, 4
 
+#: Time over which the velocity of the needle is measured [s].
+_SPAN: Final = 0.05
+
 #: Largest displacement of a needle at rest [m].
 STILL: Final = 1e-4
 
@@ -62,6 +65,9 @@ class MotionControl:
         self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
         self.at = np.full(len(settings.joints), np.nan)
+        #: Velocity of the needle [m/s]; stamp [ns] and depth [m] from which it is measured.
+        self.velocity = 0.0
+        self._before: tuple[int, float] | None = None
         self.origin = self.goal = np.zeros(len(settings.joints))
         self.due = 0
         self.again: Callable[[int], JointMotion | None] = lambda _now: None
@@ -80,7 +86,17 @@ class MotionControl:
 
     def restart(self) -> None:
         """Accept earlier times, after a clock was set back."""
-        self._stamp = 0
+        self._stamp, self._before = 0, None
+
+    def measure(self, at: FloatArray, stamp: int) -> None:
+        """Take measured positions of the joints [m, rad] with their stamp [ns]."""
+        self.at = at
+        before = self._before or (stamp, float(at[0]))
+        elapsed = (stamp - before[0]) / NANOSECONDS
+        if elapsed >= _SPAN:
+            self.velocity = (float(at[0]) - before[1]) / elapsed
+        if self._before is None or elapsed >= _SPAN:
+            self._before = stamp, float(at[0])
 
     # Motions.
 
@@ -126,18 +142,24 @@ class MotionControl:
         )
         return self._stamped(move, now)
 
+    def withdraw(self, depth: float, now: int) -> JointMotion:
+        """Send the needle alone to a smaller depth [m]."""
+        begin, end = self.at[:1], np.array([depth])
+        duration = duration_of(np.array([depth - self.at[0], 0.0, 0.0]), self._settings)
+        return self._stamped(smooth(self._settings.joints[:1], begin, end, duration), now)
+
+    def guide_toward(self, position: FloatArray, duration: float, now: int) -> JointMotion:
+        """Send the guide to a position [m], in a duration [s] or at `guide_speed`."""
+        way = position - self.at[1:3]
+        duration = max(duration, float(np.hypot(*way)) / self._settings.guide_speed)
+        return self.guide_to(position, way / duration, duration, now)
+
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
         self._stamp = max(now, self._stamp + 1)
         return move._replace(stamp=self._stamp)
 
     # Checks.
-
-    def extend_if_paused(self, elapsed: int) -> None:
-        """Extend the deadlines by a time [ns], if a user has paused the motion."""
-        if self.monitor.paused:
-            self.due += elapsed
-            self.monitor.wait(elapsed)
 
     def repeat(self, now: int) -> JointMotion | None:
         """Send the motion again: the message may have been lost."""
@@ -175,15 +197,30 @@ class MotionControl:
 
     # Stops.
 
-    def stop(self, now: int, silence: float = 0.0) -> JointMotion:
-        """Brake needle and guide to rest at their positions, measured ``silence`` [s] ago."""
-        end, limit = self.at.copy(), self._settings.guide_limit
-        # Includes the braking distance; clipped, because the positions may be implausible.
-        end[0] += (0.5 * BRAKING + silence) * self._settings.speed
-        end[0] = min(max(end[0], self.origin[0]), self.goal[0])
-        end[1:3] = np.clip(end[1:3], -limit, limit)
+    def stop(self, now: int) -> JointMotion:
+        """Brake needle and guide to rest at their positions, and monitor that they rest."""
         self._halted, self._stops = None, _STOPS
-        return self._send_stop(end, now)
+        return self._send_stop(self._braked(), now)
+
+    def pause(self, now: int) -> JointMotion:
+        """Brake needle and guide to rest at their positions."""
+        self.discard_stop()
+        return self._brake(self._braked(), now)
+
+    def resume(self, now: int) -> JointMotion | None:
+        """Continue the motion after a pause."""
+        self.monitor.forget()
+        return self.again(now)
+
+    def _braked(self) -> FloatArray:
+        """Return the positions at which needle and guide come to rest [m, rad]."""
+        end, limit = self.at.copy(), self._settings.guide_limit
+        # A needle that rests, or whose positions are implausible, is not moved into the tissue.
+        moving = min(max(self.velocity, 0.0), self._settings.speed)
+        end[0] = min(end[0] + 0.5 * BRAKING * moving, self.goal[0])
+        end[0] = max(end[0], min(self.origin[0], 0.0))
+        end[1:3] = np.clip(end[1:3], -limit, limit)
+        return end
 
     def discard_stop(self) -> None:
         """Do not send the last stop again."""
@@ -191,8 +228,11 @@ class MotionControl:
 
     def _send_stop(self, end: FloatArray, now: int) -> JointMotion:
         self._halt = end
-        joints, rest = self._settings.joints, np.zeros((1, len(end)))
         self._stops -= 1
+        return self._brake(end, now)
+
+    def _brake(self, end: FloatArray, now: int) -> JointMotion:
+        joints, rest = self._settings.joints, np.zeros((1, len(end)))
         halt = self._stamped(JointMotion(joints, np.array([BRAKING]), end[np.newaxis], rest), now)
         self.monitor.forget()
         self.monitor.stream(halt)

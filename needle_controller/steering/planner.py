@@ -133,3 +133,9 @@ class InsertionPlanner:
         request = self.request
         self.request = self.job = None
         return request
+
+
+def describe_target(point: tuple[float, float, float]) -> str:
+    """Describe a target x, y, z [m] for users."""
+    x, y, z = (1e3 * one for one in point)
+    return f'x = {x:.2f} mm, z = {z:.2f} mm at a depth of {y:.2f} mm'

@@ -11,6 +11,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, flag
+from needle_ros.system_state import RETRACT_DEPTH
 import numpy as np
 
 #: Least number of guide commands within a step.
@@ -58,6 +59,9 @@ class ExecutiveSettings(SteeringLimits):
         3e-3, 'm', 'largest change of the difference between tip depth and insertion depth '
         'since the first measurement', open_low=True,
     )  # fmt: skip
+    retract_depth: float = constant(
+        RETRACT_DEPTH, 'm', 'insertion depth of ~/retract; a needle that is less deep rests'
+    )
     patience: float = constant(
         5.0,
         's',

@@ -53,6 +53,7 @@ class Commands:
         #: Number of commands that were invalid, had a stamp outside the timeout, and arrived after
         #: a newer one (out of order).
         self.refused = self.stale = self.overtaken = 0
+        self.stopped = False
         self.begin()
 
     def begin(self) -> None:
@@ -132,7 +133,12 @@ class Commands:
 
     def may_move(self, now: int) -> bool:
         """Return whether commands may act at a time [ns], with a single sender."""
-        return not self.duplicates and now >= self._quiet
+        return not (self.stopped or self.duplicates) and now >= self._quiet
+
+    def stop(self) -> None:
+        """End the force; no command acts while `stopped`."""
+        self.stopped = True
+        self.newest = AppliedForces(self.newest.stamp)
 
     def hush(self, now: int) -> None:
         """Ignore commands for the timeout; a short-lived node may have sent some."""

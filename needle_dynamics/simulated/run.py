@@ -7,14 +7,17 @@ performs it again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces, Commands
+from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
+from needle_dynamics.simulated.joint_commands import moved_joints
 from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
 from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
+from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -26,6 +29,12 @@ MOTION: Final = 'motion'
 PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
+
+#: Time in which joints come to rest at their positions [s].
+_HALT: Final = 0.05
+
+#: Mean velocity of a retraction [m/s].
+_WITHDRAWAL: Final = 0.01
 
 #: Tolerance of the period due to the rounding of stamps [ns].
 _ROUNDING: Final = 2
@@ -115,6 +124,31 @@ class PlantRun:
         # The last measurement, with the positions first.
         values = self._measured[-1][2]
         return {joint.name: value for joint, value in zip(joints, values, strict=False)}
+
+    def halt(self) -> None:
+        """End every force and motion, of the needle and of all joints that move by themselves."""
+        self.commands.stop()
+        mode, steered = self.constants.mode, self.constants.steered
+        joints, at = moved_joints(mode, steered=steered), self._positions()
+        positions, efforts = [at[name] for name in joints], list[float]()
+        if mode == 'indenter':
+            joints, positions, efforts = PRESS_JOINTS, [], [0.0] * len(PRESS_JOINTS)
+        if joints:
+            self._follow(joints, _HALT, positions, efforts)
+
+    def withdraw(self) -> None:
+        """Withdraw the needle by its own base, if it has one."""
+        if self.constants.mode == 'robot':
+            at = self._positions()[INSERTION]
+            end = min(at, RETRACT_DEPTH)
+            self._follow((INSERTION,), (at - end) / _WITHDRAWAL + _HALT, [end], [])
+
+    def _follow(
+        self, joints: Sequence[str], time: float, positions: list[float], efforts: list[float]
+    ) -> None:
+        """Perform a trajectory with one point at a time from now [s]."""
+        content = {'joints': [*joints], 'times': [time], 'positions': [positions]}
+        self.perform(Event(TRAJECTORY, {**content, 'efforts': [efforts]}))
 
     # Events.
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RETRACT, STOP
+
 CONTROLLER: Final = 'controller'
 STEERING: Final = 'steering'
+PLANT: Final = 'plant'
 
 
 class Request(NamedTuple):
@@ -18,11 +21,18 @@ class Request(NamedTuple):
     data: bool | None = None
 
 
-#: Services by command. Nodes that do not run are skipped, if another node offers a service.
+#: Service by command, and the request of a `SetBool`.
+_SERVICES: Final[Mapping[str, tuple[str, bool | None]]] = {
+    'pause': (PAUSE, True),
+    'resume': (PAUSE, False),
+    'retract': (RETRACT, None),
+    'stop': (STOP, None),
+    'clear': (CLEAR_STOP, None),
+}
+
+#: Services by command: of every node, since one of them may be busy or stopped. Nodes that do not
+#: run are skipped, if another node offers the service.
 REQUESTS: Final[Mapping[str, tuple[Request, ...]]] = {
-    'pause': (Request(CONTROLLER, 'pause', data=True),),
-    'resume': (Request(CONTROLLER, 'pause', data=False),),
-    'retract': (Request(CONTROLLER, 'retract'),),
-    'stop': (Request(STEERING, 'stop'), Request(CONTROLLER, 'emergency_stop')),
-    'clear': (Request(CONTROLLER, 'clear_stop'),),
+    word: tuple(Request(node, service, data) for node in (CONTROLLER, STEERING, PLANT))
+    for word, (service, data) in _SERVICES.items()
 }

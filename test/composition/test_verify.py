@@ -767,10 +767,10 @@ def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
         )
         assert changed.results[0].successful
         further(40)
-        assert call(SetBool, 'pause', SetBool.Request(data=True)).success
+        assert call(SetBool, 'pause_time', SetBool.Request(data=True)).success
         # A pause of some periods.
         time.sleep(0.05)
-        assert call(SetBool, 'pause', SetBool.Request(data=False)).success
+        assert call(SetBool, 'pause_time', SetBool.Request(data=False)).success
         further(40)
         assert call(Trigger, 'reset', Trigger.Request()).success
         further(40)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from needle_controller import Observer, ObserverSettings
 from needle_controller.controller import LAWS
 from needle_dynamics import NeedleParameters, ParameterError
+from needle_ros.system_state import CLEAR_STOP
 import pytest
 
 PHANTOM = NeedleParameters.preset('phantom')
@@ -55,7 +56,7 @@ def test_controller_recovers_from_implausible_inputs(
         loop.step(topic, Insane(values) if insane else None)
         assert abs(loop.acting) <= 15.0
     if loop.supervisor.safety.stop is not None:
-        assert loop.supervisor.clear_stop(loop.now).success
+        assert loop.supervisor.request(CLEAR_STOP, loop.now)[0]
     loop.target(0.03)
     for _ in range(SANE):
         loop.step()

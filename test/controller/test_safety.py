@@ -18,6 +18,9 @@ import numpy as np
 import pytest
 
 SECOND = 1_000_000_000
+
+#: No force or torque.
+NONE = (0.0, 0.0, 0.0)
 MILLISECOND = SECOND // 1000
 
 
@@ -149,10 +152,11 @@ GUARD = [
     ('encoders', (encoded(0.05, 0.0, 1001.0),), 'angle 1001 rad'),
     ('encoders', (encoded(0.05, 0.0, 0.0, -101.0),), 'angular speed -101 rad/s'),
     ('tracking', (0.011,), 'tracking error 0.011 m is beyond the limit of 0.01 m'),
-    ('wrench', (-31.0, 0.0, 0.0), 'axial force -31 N is beyond the limit of 30 N'),
-    ('wrench', (0.0, 10.5, 0.0), 'lateral force 10.5 N'),
-    ('wrench', (0.0, 0.0, -1.1), 'moment -1.1 N m'),
-    ('tip', (-0.051,), 'tip deflection -0.051 m is beyond the limit of 0.05 m'),
+    ('wrench', ((0.0, -31.0, 0.0), NONE), 'axial force -31 N is beyond the limit of 30 N'),
+    ('wrench', ((6.3, 0.0, -8.4), NONE), 'lateral force 10.5 N'),
+    ('wrench', (NONE, (-0.66, 0.0, 0.88)), 'moment 1.1 N m'),
+    ('wrench', (NONE, (0.0, -1.1, 0.0)), 'torque about the needle -1.1 N m'),
+    ('tip', (-0.051,), 'tip deflection 0.051 m is beyond the limit of 0.05 m'),
 ]
 
 
@@ -162,7 +166,7 @@ def test_two_readings_beyond_a_limit_violate_it(
 ) -> None:
     """Quantity, value, limit and unit in one line; a single reading does not violate it."""
     guard = Guard(SafetyLimits(), (0.001, 0.1))
-    good = {'encoders': (encoded(0.05, 0.0),), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
+    good = {'encoders': (encoded(0.05, 0.0),), 'wrench': (NONE, NONE)}.get(name, (0.0,))
     hold = getattr(guard, name)
     assert [hold(*v) for v in (good, values, good, values)] == [None] * 4
     line = hold(*values)
@@ -185,7 +189,13 @@ def test_readings_at_a_limit_are_within_it() -> None:
             angular_velocity=-limits.angular_speed,
         )
         assert guard.encoders(edge) is None
-        assert guard.wrench(-limits.axial_load, limits.lateral_load, limits.moment_load) is None
+        assert (
+            guard.wrench(
+                (0.0, -limits.axial_load, limits.lateral_load),
+                (limits.moment_load, limits.torsion_load, 0.0),
+            )
+            is None
+        )
         assert guard.tip(limits.tip_deflection) is None
         assert guard.tracking(-limits.tracking_error) is None
 
@@ -196,13 +206,13 @@ def test_stop_cannot_be_cleared_beyond_a_limit() -> None:
     now = 10 * SECOND
     for _ in range(2):
         whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
-        began = whole.latch(whole.guard.wrench(40.0, 0.0, 0.0))
+        began = whole.latch(whole.guard.wrench((0.0, 40.0, 0.0), (0.0, 0.0, 0.0)))
     assert began
     assert 'axial force 40 N' in whole.stop
     assert not whole.latch('emergency stop')
     assert 'axial force 40 N' in whole.clear(now)
     assert whole.stop is not None
-    whole.guard.wrench(1.0, 0.0, 0.0)
+    whole.guard.wrench((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
     assert whole.clear(now) is None
     assert (whole.stop, whole.stops) == (None, 1)
 
@@ -212,7 +222,7 @@ def test_silent_sensor_does_not_block_clearing_the_stop() -> None:
     whole = safety()
     now = 10 * SECOND
     whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
-    whole.guard.wrench(40.0, 0.0, 0.0)
+    whole.guard.wrench((0.0, 40.0, 0.0), (0.0, 0.0, 0.0))
     whole.latch('emergency stop')
     assert whole.clear(now + SECOND // 2) is not None
     assert whole.clear(now + 2 * SECOND) is None

@@ -17,8 +17,10 @@ from needle_controller import (
     SafetyLimits,
 )
 from needle_controller.supervisor import Supervisor
+from needle_controller.waiting_request import JointPath
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
@@ -82,10 +84,13 @@ class Loop:
         return self.watch()
 
     def stop(self) -> ForceCommand | None:
-        return self.supervisor.emergency_stop(self.now).answer
+        return self.request(STOP)
 
     def clear(self) -> ForceCommand | None:
-        return self.supervisor.clear_stop(self.now).answer
+        return self.request(CLEAR_STOP)
+
+    def request(self, word: str) -> ForceCommand | None:
+        return self.supervisor.request(word, self.now)[2]
 
     def pushes(self) -> ForceCommand:
         """Measure until a force is commanded."""
@@ -121,9 +126,9 @@ EVENTS: list[Callable[[Loop], ForceCommand | None]] = [
     lambda loop: loop.passes(-SECOND),
     lambda loop: loop.aim(0.05),
     lambda loop: loop.aim(nan),
-    lambda loop: loop.supervisor.pause(True).answer,
-    lambda loop: loop.supervisor.pause(False).answer,
-    lambda loop: loop.supervisor.retract(loop.now).answer,
+    lambda loop: loop.request(PAUSE),
+    lambda loop: loop.request(RESUME),
+    lambda loop: loop.request(RETRACT),
     Loop.stop,
 ]
 events = st.lists(st.sampled_from(EVENTS), max_size=40)
@@ -182,7 +187,7 @@ def test_valid_measurements_restart_the_motion_after_faults(
         event(loop)
     loop.depth = 0.02
     loop.passes(2 * SECOND)
-    loop.supervisor.pause(False)
+    loop.request(RESUME)
     for _ in range(10):
         loop.measure()
         loop.wrench()
@@ -334,17 +339,19 @@ def test_inactive_supervisor_accepts_only_the_stop() -> None:
     """The stop survives configuration, and measurements are not answered."""
     supervisor = Supervisor()
     reading = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
-    assert supervisor.emergency_stop(SECOND).answer == ForceCommand(SECOND)
+    assert supervisor.request(STOP, SECOND)[2] == ForceCommand(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
     assert supervisor.events.last_rejection == 'target rejected: the controller is not active'
-    assert supervisor.pause(True).message == 'pause refused: the controller is not active'
+    assert supervisor.request(PAUSE, SECOND)[1] == (
+        'pause refused: stopped: requested by a user; ~/clear_stop releases'
+    )
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
     assert supervisor.encoders(reading, SECOND) == ForceCommand(SECOND)
     assert supervisor.diagnose(SECOND)[:2] == (
         Severity.ERROR,
-        'emergency stop; ~/clear_stop releases',
+        'requested by a user; ~/clear_stop releases',
     )
 
 
@@ -425,12 +432,12 @@ def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
     loop.said()
     many = [[float(k)] for k in range(MOST_POINTS + 1)]
     times = [float(k) for k in range(MOST_POINTS + 1)]
-    loop.supervisor.trajectory(0, '', ['insertion'], times, many, [], loop.now)
+    loop.supervisor.trajectory(0, '', JointPath(['insertion'], times, many), loop.now)
     (line,) = loop.said()
     assert line == f'joint_trajectory rejected: a path may have at most {MOST_POINTS} points'
     loop.seconds += 1.0
     evil = '\x1b]0;evil\x07\u202e' + 1000 * 'x'
-    loop.supervisor.trajectory(0, evil, ['insertion'], [1.0], [[0.03]], [], loop.now)
+    loop.supervisor.trajectory(0, evil, JointPath(['insertion'], [1.0], [[0.03]]), loop.now)
     line = loop.said()[-1]
     assert len(line) <= 500
     assert line.isprintable()
@@ -465,9 +472,8 @@ def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(
                 if what == 'target':
                     loop.supervisor.target(stamp, '', 0.1, 0.0, now)
                 else:
-                    loop.supervisor.trajectory(
-                        stamp, '', ['insertion'], [0.0, 1.0], [[0.02], [0.0205]], [], now
-                    )
+                    path = JointPath(['insertion'], [0.0, 1.0], [[0.02], [0.0205]])
+                    loop.supervisor.trajectory(stamp, '', path, now)
             answers.append(loop.measure())
         assert loop.said() == []
         return answers
@@ -485,7 +491,7 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
     loop = Loop(target=None)
     loop.measure()
     loop.supervisor.target(loop.now + 10 * PERIOD, '', 0.1, 0.0, loop.now)
-    assert loop.supervisor.retract(loop.now).success
+    assert loop.supervisor.request(RETRACT, loop.now)[0]
     for _ in range(30):
         loop.measure()
     assert loop.supervisor.controller is not None
@@ -498,3 +504,64 @@ def test_clock_set_back_is_detected() -> None:
     steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
     found = [supervisor.clock_went_back(round(t * SECOND), timeout) for t in steps]
     assert found == [0, 0, 0, 0, 0, 48.95, 0]
+
+
+@pytest.mark.parametrize(
+    ('topic', 'component', 'size'),
+    [
+        *(('wrench', k, size) for k, size in enumerate([11.0, 31.0, 11.0, 1.1, 1.1, 1.1])),
+        ('tip', 0, 0.051),
+        ('tip', 2, 0.051),
+    ],
+)
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_every_component_of_a_sensor_has_a_limit(
+    topic: str, component: int, size: float, sign: float
+) -> None:
+    """Two readings beyond the limit stop; readings just within all limits do not."""
+    loop = Loop()
+    loop.aim(0.05)
+    loop.pushes()
+    values = [0.0] * (6 if topic == 'wrench' else 3)
+
+    def read(scale: float) -> None:
+        loop.measure()
+        shown = [scale * one for one in values]
+        if topic == 'wrench':
+            loop.supervisor.wrench(Reading(loop.now, 'needle_base', (), (tuple(shown),)), loop.now)
+        else:
+            shown[1] += 0.02
+            loop.supervisor.tip(Reading(loop.now, 'needle_entry', (), (tuple(shown),)), loop.now)
+
+    values[component] = sign * size
+    # A jump of the sensor is discarded first.
+    for _ in range(3):
+        read(0.9)
+    assert loop.supervisor.authority.reason == ''
+    for _ in range(3):
+        read(1.0)
+    assert 'is beyond the limit' in loop.supervisor.authority.reason
+
+
+@pytest.mark.parametrize(('within', 'beyond'), [(0.25, 0.26), (-0.045, -0.055)])
+def test_depth_of_the_tip_has_a_limit(within: float, beyond: float) -> None:
+    """50 mm and the tolerance outside of the range of depths, 1 to 200 mm."""
+    guard = Loop().supervisor.safety.guard
+    assert guard.tip(0.0, within) is None
+    assert guard.tip(0.0, beyond) is None
+    assert 'distance of the tip' in (guard.tip(0.0, beyond) or '')
+
+
+def test_component_that_a_sensor_does_not_measure_is_no_fault() -> None:
+    """NaN in a component that the controller does not use."""
+    loop = Loop()
+    loop.aim(0.05)
+    loop.pushes()
+    for _ in range(5):
+        loop.measure()
+        wrench, tip = (nan, 1.0, 0.0, 0.0, nan, nan), (nan, nan, 1e-3)
+        loop.supervisor.wrench(Reading(loop.now, 'needle_base', (), (wrench,)), loop.now)
+        loop.supervisor.tip(Reading(loop.now, 'needle_entry', (), (tip,)), loop.now)
+    assert loop.supervisor.authority.reason == ''
+    status = loop.supervisor.diagnose(loop.now)[2]
+    assert status.input['base_wrench'].accepted == status.input['tip_deflection'].accepted == 5

@@ -15,6 +15,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.event_log import Severity
 from needle_ros.status import ControllerPhase, ControllerStatus, InputStatus
+from needle_ros.system_state import Mode
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -207,15 +208,17 @@ def test_zero_force_for_invalid_measurements(ros_graph: RosGraph, message: Joint
     assert 'joint_states' in bench.status.fault
 
 
-def test_emergency_stop_latches(ros_graph: RosGraph) -> None:
-    """The force is zero until the stop is cleared; then the motion restarts."""
+def test_stop_latches(ros_graph: RosGraph) -> None:
+    """The force is zero until the stop is cleared and a user sends a new target."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
-    assert bench.call('emergency_stop').success
+    assert bench.call('stop').success
     assert [bench.measure(0.02) for _ in range(3)] == [0.0, 0.0, 0.0]
-    assert bench.said() == 'emergency stop; ~/clear_stop releases'
+    assert bench.said() == 'requested by a user; ~/clear_stop releases'
     assert bench.call('clear_stop').success
+    assert [bench.measure(0.02) for _ in range(20)] == [0.0] * 20
+    bench.aim(0.1)
     assert bench.push() > 0.5
 
 
@@ -413,16 +416,16 @@ def test_pause_resume_and_retract(ros_graph: RosGraph) -> None:
     count = len(loop.aims)
     loop.until(lambda: len(loop.aims) > count + 40, 'a while')
     assert {m.position[0] for m in loop.aims[count:]} == {held}
-    assert loop.status.requests.paused
+    assert loop.status.system is Mode.PAUSED
     assert loop.call(SetBool, 'pause', SetBool.Request(data=False)).success
     loop.until(lambda: loop.speed() > 0.0, 'motion')
-    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting to 0.019 m'
+    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting'
     loop.until(lambda: loop.aims[-1].position[0] == 0.019, 'the way back')
     loop.until(lambda: abs(loop.states[-1].position[0] - 0.019) < 1e-4, 'the needle')
     # Continuous: one period at the limits, and rounding.
     aims = [(m.position[0], m.velocity[0]) for m in loop.aims]
     assert max(abs(b[0] - a[0]) for a, b in pairwise(aims)) < 0.01 * 0.2
-    assert loop.call(Trigger, 'emergency_stop', Trigger.Request()).success
+    assert loop.call(Trigger, 'stop', Trigger.Request()).success
     refused = loop.call(Trigger, 'retract', Trigger.Request())
     assert 'stopped' in refused.message
     assert not refused.success
@@ -541,7 +544,7 @@ def test_integral_is_frozen_during_a_stop(ros_graph: RosGraph) -> None:
     memory = bench.controller._supervisor.controller._insertion.memory
     bench.push()
     ros_graph.spin_until(lambda: bench.measure(0.02) and memory[INTEGRAL], 'the integral')
-    assert bench.call('emergency_stop').success
+    assert bench.call('stop').success
     learned = float(memory[INTEGRAL])
     assert [bench.measure(0.02) for _ in range(50)] == [0.0] * 50
     assert memory[INTEGRAL] == learned
@@ -589,7 +592,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
     refused = bench.call('clear_stop')
     assert not refused.success
     assert reason in refused.message
-    # Value within the limit: the motion restarts; the step back first counts as a jump.
+    # Value within the limit; the step back first counts as a jump.
     for _ in range(3):
         bench.wrench()
         bench.tip(0.0)
@@ -599,10 +602,9 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
     )
     assert bench.call('clear_stop').success
     assert bench.status.stops == 1
-    if limit == 'depth':
-        # The needle has moved: the target is discarded.
-        bench.measure(0.02)
-        bench.aim(0.1)
+    # The target is discarded.
+    assert bench.measure(0.02) == 0.0
+    bench.aim(0.1)
     assert bench.push() > 0.5
 
 
@@ -613,6 +615,7 @@ def test_frozen_encoders_cause_a_stop(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0 and bench.status.stop, 'the stop')
     assert 'tracking error' in bench.status.stop
     assert bench.call('clear_stop').success
+    bench.aim(0.1)
     assert bench.push() > 0.5
 
 
@@ -733,7 +736,7 @@ def test_repeated_measurement_after_a_stop_gets_zero_force(
     bench.aim(0.1)
     assert bench.push() > 0.5
     stamp = bench.commands[-1].header.stamp
-    assert bench.call('emergency_stop').success
+    assert bench.call('stop').success
     again = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
     again.header.stamp = stamp
     assert bench.ask(again) == 0.0
@@ -852,10 +855,10 @@ def test_target_with_wrong_frame_or_stamp_is_rejected(
 def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
     """Services report the state, targets are rejected, and a stop applies after activation."""
     bench = Bench(ros_graph, start=False)
-    assert bench.call('emergency_stop').success
+    assert bench.call('stop').success
     assert bench.controller.start()
     assert bench.controller.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
-    assert 'not active' in bench.call('pause', SetBool, data=True).message
+    assert 'stopped' in bench.call('pause', SetBool, data=True).message
     assert 'stopped' in bench.call('retract').message
     bench.target.publish(PointStamped())
     ros_graph.spin_until(
@@ -865,11 +868,11 @@ def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
     assert bench.controller.trigger_activate() == TransitionCallbackReturn.SUCCESS
     bench.target.publish(PointStamped())
     ros_graph.spin_until(
-        lambda: 'target rejected: stopped: emergency stop' in bench.status.last_rejection,
+        lambda: 'target rejected: stopped: requested by a user' in bench.status.last_rejection,
         'the rejection',
     )
     assert [bench.measure(0.02) for _ in range(5)] == [0.0] * 5
-    assert bench.status.stop == 'emergency stop'
+    assert bench.status.stop == 'requested by a user'
     assert bench.call('clear_stop').success
     assert bench.call('clear_stop').message == 'there was no stop'
     bench.aim(0.1)

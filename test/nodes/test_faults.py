@@ -237,6 +237,10 @@ def test_overload_latches_a_stop(ros_graph: RosGraph, topic: str, size: float, w
     loop.passes(0.1)
     loop.rests_without_force(ControllerPhase.STOPPED)
     assert loop.clears().success
+    # Nothing moves without a new target.
+    loop.passes(0.1)
+    assert loop.status.target is None
+    loop.aim(0.04)
     loop.arrives(0.04)
 
 

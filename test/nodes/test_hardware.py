@@ -466,7 +466,7 @@ def test_ended_process_leaves_zero_effort(
         class Faulty(ControllerNode):
             def __init__(self):
                 super().__init__()
-                self._supervisor.pause = lambda hold: 1 / 0
+                self._supervisor.request = lambda word, now: 1 / 0
         sys.exit(run(Faulty))
         """
     )
@@ -532,11 +532,11 @@ def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, 
     ros_graph.spin_until(says, said)
 
 
-def test_emergency_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
+def test_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph)
     bench.aim(0.15)
     bench.until(lambda: bench.values()[-1] < -0.5, 'a force')
-    client = bench.user.create_client(Trigger, 'controller/emergency_stop')
+    client = bench.user.create_client(Trigger, 'controller/stop')
     bench.until(client.service_is_ready, 'the service')
     future = client.call_async(Trigger.Request())
     bench.until(future.done, 'the answer')

@@ -85,7 +85,7 @@ def drive(
         clock = graph.latest(probe, Clock, '/clock', SENSOR)
         aim = probe.create_publisher(PointStamped, 'target', COMMAND)
         move = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
-        pause = probe.create_client(SetBool, 'plant/pause')
+        pause = probe.create_client(SetBool, 'plant/pause_time')
         graph.start('plant', {'lockstep': True, 'paused': True, **plant})
         graph.start('controller', {'use_sim_time': True, **controller})
         if bag is not None:

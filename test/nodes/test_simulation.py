@@ -45,7 +45,7 @@ class Bench:
         self.commands = self.probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
         self.services = {
             name: self.probe.create_client(kind, f'plant/{name}')
-            for name, kind in (('pause', SetBool), ('step', Trigger), ('reset', Trigger))
+            for name, kind in (('pause_time', SetBool), ('step', Trigger), ('reset', Trigger))
         }
         self.plant = ros_graph.add(PlantNode, parameters={**RATE, **parameters})
         self.until(
@@ -135,7 +135,7 @@ def test_pause_stops_time_and_steps_take_single_samples(ros_graph: RosGraph) -> 
     clocks = ros_graph.listen(bench.probe, Clock, '/clock', SENSOR)
     bench.further(20)
     assert bench.call('step') == (False, 'step refused: time is not paused; pause first')
-    granted, said = bench.call('pause', data=True)
+    granted, said = bench.call('pause_time', data=True)
     assert granted
     assert said.startswith('paused at ')
     bench.quiet()
@@ -147,7 +147,7 @@ def test_pause_stops_time_and_steps_take_single_samples(ros_graph: RosGraph) -> 
         bench.until(lambda seen=seen: len(bench.states) > seen, 'the sample')
         assert stamp_ns(bench.states[-1]) == before + k * PERIOD
         assert len(bench.states) == seen + 1
-    assert bench.call('pause', data=False) == (True, 'time resumed')
+    assert bench.call('pause_time', data=False) == (True, 'time resumed')
     first = bench.further(20)[0]
     assert stamp_ns(first) == before + 4 * PERIOD
     last = bench.states[-1].header.stamp
@@ -159,7 +159,7 @@ def test_start_in_pause(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, paused=True)
     bench.quiet()
     assert not bench.states
-    bench.call('pause', data=False)
+    bench.call('pause_time', data=False)
     bench.further(10)
 
 
@@ -167,14 +167,14 @@ def test_reset_restores_the_needle_and_keeps_time(ros_graph: RosGraph) -> None:
     """Initial depth, velocity and noise; stamps never go back, and the needle is not held."""
     bench = Bench(ros_graph, lockstep=True, paused=True, tip_deflection=5e-4)
     bench.force = 3.56
-    bench.call('pause', data=False)
+    bench.call('pause_time', data=False)
     bench.until(lambda: bench.states and bench.states[-1].position[0] > 0.0225, 'motion')
-    bench.call('pause', data=True)
+    bench.call('pause_time', data=True)
     bench.quiet()
     assert bench.call('reset')[0]
     moved, before = len(bench.states), bench.states[-1]
     begun = len(bench.wrenches)
-    bench.call('pause', data=False)
+    bench.call('pause_time', data=False)
     bench.until(lambda: len(bench.wrenches) >= begun + 40, 'samples')
     assert stamp_ns(bench.states[moved]) == stamp_ns(before) + PERIOD
     assert bench.states[moved].position[0] == bench.states[0].position[0]
@@ -198,7 +198,7 @@ def test_services_of_an_inactive_plant_are_rejected(ros_graph: RosGraph) -> None
     """Each with a reason."""
     bench = Bench(ros_graph)
     bench.plant.trigger_deactivate()
-    for name, data in (('pause', True), ('step', None), ('reset', None)):
+    for name, data in (('pause_time', True), ('step', None), ('reset', None)):
         assert bench.call(name, data) == (False, f'{name} refused: the plant is not active')
 
 

@@ -206,7 +206,7 @@ def test_button_without_nodes_is_reported(ros_graph: RosGraph) -> None:
             said = await reader.ask('stop')
             assert said == {
                 'asked': 'stop', 'success': False,
-                'words': 'no node offers steering/stop or controller/emergency_stop',
+                'words': 'no node offers controller/stop or steering/stop or plant/stop',
             }  # fmt: skip
 
     with watching(ros_graph.environment, '--control') as (_, url):

@@ -40,7 +40,6 @@ REQUESTS = st.builds(
         max_size=3,
         unique_by=lambda one: (one.topic, one.stamp),
     ).map(tuple),
-    st.booleans(),
 )
 
 

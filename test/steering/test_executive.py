@@ -15,6 +15,7 @@ from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics import ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase
+from needle_ros.system_state import CLEAR_STOP, STOP
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
@@ -451,10 +452,12 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
     while robot.loop.phase is not Phase.INSERTING or robot.at[0] < 0.032:
         robot.tick()
     depth = robot.at[0]
-    robot.follow(robot.loop.stop('~/stop', robot.now))
+    assert robot.request(STOP)
     robot.tick(200)
     assert depth <= robot.at[0] <= depth + 3e-3
-    assert robot.loop.stop('~/stop', robot.now) is None
+    assert robot.aim() == 'target rejected: stopped: requested by a user; ~/clear_stop releases'
+    assert robot.request(CLEAR_STOP)
+    robot.tick(200)
     assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
 
 

@@ -28,6 +28,7 @@ from needle_ros.requests import (
     Verdict,
 )
 from needle_ros.status import SteeringPhase as Phase
+from needle_ros.system_state import Mode, PAUSE, RESUME, STOP
 import numpy as np
 import pytest
 from support.steered_robot import CONTINUOUS, NEEDLE, PERIOD, Robot, SECOND, SETTINGS, STEERING
@@ -182,22 +183,24 @@ def test_rejected_motion_stops_the_insertion_with_its_reason(continuous: bool) -
     assert robot.at[0] == 0.0
 
 
-def test_pause_by_the_user_may_last() -> None:
-    """A minute within a step is no fault; the insertion then continues."""
-    robot = Relayed({}, own=QUICK)
+@pytest.mark.parametrize('continuous', [False, True])
+@pytest.mark.parametrize('depth', [0.004, 0.012, 0.021])
+def test_pause_by_the_user_may_last(continuous: bool, depth: float) -> None:
+    """Needle and guide rest for a minute; the insertion then continues to its target."""
+    robot = Relayed({}, own=QUICK_CONTINUOUS if continuous else QUICK)
     robot.tick(20)
     robot.aim()
-    while robot.at[0] < 0.02:
+    while robot.at[0] < depth:
         robot.tick()
-    held = robot.at.copy()
-    robot.paused = True
-    robot.moves = lambda _wanted: held.copy()
+    before = robot.at.copy()
+    assert robot.request(PAUSE)
     robot.tick(6000)
+    # Braking from the highest speed within 0.2 s, and a period.
+    assert before[0] <= robot.at[0] <= before[0] + (0.1 + 0.01) * QUICK.speed
+    assert np.abs(robot.at - robot.tracked[-5900]).max() < 1e-9
     assert robot.loop.steers
-    assert robot.loop.diagnose(robot.now)[2].paused_by == 'controller'
-    robot.paused = False
-    robot.moves = lambda wanted: wanted
-    robot.ways = [(times + 6000 * PERIOD, way) for times, way in robot.ways]
+    assert robot.loop.diagnose(robot.now)[2].system is Mode.PAUSED
+    assert robot.request(RESUME)
     while robot.loop.steers:
         robot.tick()
     assert robot.loop.phase is Phase.DONE
@@ -213,11 +216,11 @@ def test_lost_stop_is_repeated_and_supersedes_the_motion() -> None:
     number = robot.counts['joint_trajectory']
     robot.faults = {('joint_trajectory', number + 1): [], ('joint_trajectory', number + 2): []}
     depth = robot.at[0]
-    robot.follow(robot.loop.stop('~/stop', robot.now))
+    robot.request(STOP)
     robot.tick(300)
     # Half a second passes until the stop is repeated, at 19 mm/s at most.
     assert robot.at[0] < depth + 0.5 * 1.9 * SETTINGS.speed + 3e-3
-    assert robot.loop.fault == '~/stop'
+    assert robot.loop.fault == 'requested by a user'
 
 
 # Planning.
@@ -275,10 +278,10 @@ def test_messages_are_processed_during_planning() -> None:
 def test_stop_cancels_planning() -> None:
     robot = Planning()
     stamp = robot.aim_at()
-    assert robot.loop.stop('~/stop', robot.now) is None
+    assert robot.request(STOP)
     assert Manual.made[0].cancelled
     assert robot.loop.phase is Phase.IDLE
-    assert robot.verdict(stamp) == ('rejected', 'stopped: ~/stop')
+    assert robot.verdict(stamp) == ('rejected', 'stopped: requested by a user')
     # A target sent before the stop and received after it is not executed.
     assert robot.loop.target(stamp - 1, '', POINT, robot.now) is None
     assert robot.verdict(stamp - 1)[0] == 'superseded'
@@ -419,14 +422,13 @@ def test_stale_request_is_rejected(age: float, frame: str, reason: str) -> None:
         max_size=20,
         unique_by=lambda one: one[0],
     ),
-    paused=st.booleans(),
 )
-def test_status_values_round_trip(answers: list[tuple[int, Verdict, str]], paused: bool) -> None:
+def test_status_values_round_trip(answers: list[tuple[int, Verdict, str]]) -> None:
     """Its latest answers, for any reasons; other values are ignored."""
     own = log()
     for stamp, verdict, reason in answers:
         own.answer(JOINT_TRAJECTORY, stamp, verdict, reason)
-    status = own.status(paused=paused)
+    status = own.status()
     values = {'law': 'pid', 'request': 'x', 'request y z': 'accepted'}
     values |= {key: str(value) for key, value in status.to_values().items()}
     assert RequestStatus.from_values(values) == status

@@ -61,7 +61,6 @@ class Robot:
             for name, joints in self.moved.items()
         }
         self.rejects: Callable[[str, JointMotion], str] = lambda _name, _move: ''
-        self.paused = False
         #: Stamps of the executed motions, by joint.
         self.begun: list[int] = []
 
@@ -126,9 +125,15 @@ class Robot:
     def report(self) -> None:
         """Publish the status of all nodes with joints."""
         for name, log in self.logs.items():
-            status = log.status(paused=self.paused)
+            status = log.status()
             hear = partial(self.loop.hear, name)
             self.post('diagnostics', partial(self.take, hear, status))
+
+    def request(self, word: str) -> bool:
+        """Send a request of a user; return whether it is executed."""
+        success, _, move = self.loop.request(word, self.now)
+        self.follow(move)
+        return success
 
     def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
         """Send a target; return the reason of a rejection."""

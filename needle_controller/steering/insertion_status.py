@@ -1,0 +1,82 @@
+"""Status of a steered insertion: phase, law, expected tip and last measurement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from needle_controller.steering.insertion import InsertionStrategy
+from needle_dynamics.arrays import FloatArray
+from needle_ros.status import SteeringPhase as Phase
+from needle_ros.status import SteeringStatus
+from needle_ros.system_state import Mode
+import numpy as np
+
+#: Descriptions of the phases for the user.
+_DESCRIPTIONS: Final = {
+    Phase.IDLE: 'waits for a target',
+    Phase.PLANNING: 'computes the plan',
+    Phase.GUIDING: 'the guide moves',
+    Phase.INSERTING: 'the needle is inserted',
+    Phase.MEASURING: 'measures the tip',
+    Phase.RETRACTING: 'the needle is withdrawn',
+}
+
+#: Noise of the readings of the tip, as a multiple of the configured noise, that is reported.
+_SCATTERED: Final = 3.0
+
+
+def describe(
+    insertion: InsertionStrategy | None, goal: FloatArray, noise: float, *, active: bool
+) -> tuple[SteeringStatus, str]:
+    """
+    Return the status of an insertion, and its warning or ''.
+
+    ``goal`` are the goals of the joints [m, rad], ``noise`` is the configured noise of a tip
+    measurement [m], and ``active`` whether the insertion is under way.
+    """
+    if insertion is None:
+        return SteeringStatus(), ''
+    guarded, law = insertion.law, insertion.law.law
+    x, z = np.asarray(law.target).tolist()
+    _, guide_x, guide_z = goal[:3].tolist()
+    values = dict(law.status())
+    turns = values.pop('turns_left', None)
+    status = SteeringStatus(
+        target=(x, float(guarded.depths[-1]), z),
+        step=min(guarded.step, guarded.steps),
+        steps=guarded.steps,
+        guide_setpoint=(guide_x, guide_z),
+        turns_left=None if turns is None else int(turns),
+        hit_probability=values.pop('hit_probability', None),
+        bending_length_ratio=values.pop('bending_length_ratio', None),
+        law=values,
+    )
+    if guarded.expected is not None:
+        half = guarded.expected.half_width
+        status = replace(
+            status,
+            expected_tip=tuple(guarded.expected.mean.tolist()),
+            expected_tip_half_width=tuple(half.tolist()),
+        )
+    warning, seen = law.warning if active else '', guarded.seen
+    if seen is not None:
+        status = replace(
+            status,
+            last_measurement_readings=seen.readings,
+            last_measurement_error=seen.error,
+        )
+        if not warning and seen.error > _SCATTERED * noise:
+            warning = (
+                f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
+                f'configured {1e3 * noise:.2f} mm (prior.noise)'
+            )
+    return status, warning
+
+
+def describe_phase(status: SteeringStatus) -> str:
+    """Describe the phase for users."""
+    if status.planned_fraction is not None:
+        return f'{_DESCRIPTIONS[status.phase]}: {status.planned_fraction:.0%}'
+    paused = '; paused' if status.system is Mode.PAUSED else ''
+    return f'{_DESCRIPTIONS[status.phase]}{paused}'

@@ -1,0 +1,240 @@
+"""
+State of the whole system: running, paused, retracting or stopped, equal in all its nodes.
+
+Every node that moves needle or guide has an `Authority` and publishes its state on
+``system_state``. A node merges each received state into its own: the result does not depend on the
+order, and a repeated or lost message does no harm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from time import time_ns
+from typing import Final, NamedTuple
+
+from needle_ros.errors import printable
+
+#: Keys of a state as values of a DiagnosticStatus.
+_MODE: Final = 'mode'
+_STOP: Final = 'stop '
+_CLEARED: Final = 'cleared '
+_MOTION: Final = 'motion'
+
+_PAUSED: Final = 'paused'
+_RETRACTING: Final = 'retracting'
+
+#: Default insertion depth at the end of a retraction [m].
+RETRACT_DEPTH: Final = 0.01
+
+#: Requests of a user.
+STOP: Final = 'stop'
+CLEAR_STOP: Final = 'clear_stop'
+PAUSE: Final = 'pause'
+RESUME: Final = 'resume'
+RETRACT: Final = 'retract'
+REQUESTS: Final = (STOP, CLEAR_STOP, PAUSE, RESUME, RETRACT)
+
+
+class Mode(Enum):
+    """Mode of the system."""
+
+    RUNNING = 'running'
+    #: Needle and guide rest until a user resumes the motion.
+    PAUSED = _PAUSED
+    #: The needle is withdrawn, until a user requests another motion.
+    RETRACTING = _RETRACTING
+    #: No force and no motion of the guide until a user clears the stop.
+    STOPPED = 'stopped'
+
+
+class Stop(NamedTuple):
+    """Stop of a node: its time [ns], which identifies it, and its reason."""
+
+    time: int
+    reason: str
+
+
+class _Motion(NamedTuple):
+    """Latest request for the motion: its time [ns]; of two at the same time the later mode."""
+
+    time: int = 0
+    retracts: bool = False
+    paused: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SystemState:
+    """
+    Latest stop of each node, latest cleared stop of each node, and latest request of a user.
+
+    A stop is in effect until a user has cleared that stop; it has priority over all other
+    requests.
+    """
+
+    stops: Mapping[str, Stop] = field(default_factory=dict)
+    cleared: Mapping[str, int] = field(default_factory=dict)
+    motion: _Motion = field(default_factory=_Motion)
+
+    @property
+    def reason(self) -> str:
+        """Reasons of the stops in effect, the earliest first; '' without a stop."""
+        active = sorted(
+            stop for node, stop in self.stops.items() if stop.time > self.cleared.get(node, 0)
+        )
+        return '; '.join(dict.fromkeys(stop.reason for stop in active))
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the system."""
+        if self.reason:
+            return Mode.STOPPED
+        if self.motion.paused:
+            return Mode.PAUSED
+        return Mode.RETRACTING if self.motion.retracts else Mode.RUNNING
+
+    @property
+    def newest(self) -> int:
+        """Time of the newest entry [ns]."""
+        times = [stop.time for stop in self.stops.values()]
+        return max(self.motion.time, *self.cleared.values(), *times, 0)
+
+    def merged(self, other: SystemState) -> SystemState:
+        """Return the newest entries of two states."""
+        stops, cleared = dict(self.stops), dict(self.cleared)
+        for node, stop in other.stops.items():
+            stops[node] = max(stop, stops.get(node, stop))
+        for node, time in other.cleared.items():
+            cleared[node] = max(time, cleared.get(node, time))
+        return SystemState(stops, cleared, max(self.motion, other.motion))
+
+    def to_values(self) -> dict[str, str]:
+        """Return the state as values of a DiagnosticStatus."""
+        time, retracts, paused = self.motion
+        words = [str(time), _RETRACTING * retracts, _PAUSED * paused]
+        return {
+            _MODE: self.mode.value,
+            _MOTION: ' '.join(filter(None, words)),
+            **{f'{_STOP}{node}': f'{one.time} {one.reason}' for node, one in self.stops.items()},
+            **{f'{_CLEARED}{node}': str(time) for node, time in self.cleared.items()},
+        }
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, str]) -> SystemState:
+        """Parse a state from values of a DiagnosticStatus; invalid entries are ignored."""
+        stops, cleared, motion = {}, {}, _Motion()
+        for key, value in values.items():
+            number, _, rest = value.partition(' ')
+            if not (number.isascii() and number.isdecimal()):
+                continue
+            if key.startswith(_STOP) and rest:
+                stops[key[len(_STOP) :]] = Stop(int(number), printable(rest))
+            elif key.startswith(_CLEARED):
+                cleared[key[len(_CLEARED) :]] = int(number)
+            elif key == _MOTION:
+                words = rest.split()
+                motion = _Motion(int(number), _RETRACTING in words, _PAUSED in words)
+        return cls(stops, cleared, motion)
+
+
+class Authority:
+    """
+    System state in one node, and the requests that change it.
+
+    Parameters
+    ----------
+    node : str
+        Name of the node.
+    time : callable
+        Returns a time [ns] by which requests of different nodes are ordered.
+
+    Attributes
+    ----------
+    state : SystemState
+        The state.
+    changed : bool
+        Whether the state has changed since the node published it.
+
+    """
+
+    def __init__(self, node: str = '', time: Callable[[], int] = time_ns) -> None:
+        self.node, self._time = node, time
+        self.state = SystemState()
+        self.changed = True
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the system."""
+        return self.state.mode
+
+    @property
+    def reason(self) -> str:
+        """Reason of the stop; '' without a stop."""
+        return self.state.reason
+
+    def _next(self) -> int:
+        """Return a time [ns] after all entries of the state, also if a clock is set back."""
+        return max(self._time(), self.state.newest + 1)
+
+    def receive(self, state: SystemState) -> None:
+        """Merge the state of another node."""
+        merged = self.state.merged(state)
+        self.changed |= merged != self.state
+        self.state = merged
+
+    def stop(self, reason: str) -> None:
+        """Stop the system, for a reason that is not empty; a stop of this node is kept."""
+        own = self.state.stops.get(self.node)
+        if own is None or own.time <= self.state.cleared.get(self.node, 0):
+            self.receive(SystemState(stops={self.node: Stop(self._next(), printable(reason))}))
+
+    def clear(self) -> None:
+        """Clear all stops that this node knows: nothing moves until the next request."""
+        cleared = {node: stop.time for node, stop in self.state.stops.items()}
+        self.receive(SystemState(cleared=cleared, motion=_Motion(self._next())))
+
+    def run(self) -> None:
+        """End a retraction, for another motion that a user has requested."""
+        if self.state.motion.retracts:
+            self._change(retracts=False)
+
+    def _change(self, **change: bool) -> None:
+        motion = self.state.motion._replace(time=self._next(), **change)
+        self.receive(SystemState(motion=motion))
+
+    def request(self, word: str, obstacle: str = '') -> tuple[bool, str]:
+        """
+        Execute a request of a user, a word of `REQUESTS`.
+
+        Parameters
+        ----------
+        word : str
+            The request.
+        obstacle : str
+            Reason why the node cannot execute it, or ''.
+
+        Returns
+        -------
+        tuple of (bool, str)
+            Whether it is executed, and one line for the user.
+
+        """
+        stopped = self.reason
+        if word == STOP:
+            self.stop('requested by a user')
+            return True, 'stopped; ~/clear_stop releases'
+        if word == CLEAR_STOP and not stopped:
+            return True, 'there was no stop'
+        if word != CLEAR_STOP and stopped:
+            obstacle = f'stopped: {stopped}; ~/clear_stop releases'
+        if obstacle:
+            return False, f'{word} refused: {obstacle}'
+        if word == CLEAR_STOP:
+            self.clear()
+            return True, 'cleared; nothing moves until the next request'
+        if word == RETRACT:
+            self._change(retracts=True, paused=False)
+            return True, 'retracting'
+        self._change(paused=word == PAUSE)
+        return True, 'paused' if word == PAUSE else 'resumed'

@@ -1,0 +1,120 @@
+"""One state of controller, steering and plant over DDS, whichever node receives a request."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from needle_controller.controller_node import ControllerNode
+from needle_controller.steering_node import SteeringNode
+from needle_ros.base_node import COMMAND
+from needle_ros.system_state import Mode
+from nodes.test_steering import Bench
+import pytest
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool, Trigger
+from support.ros_graph import RosGraph
+
+NODES = ('controller', 'steering', 'plant')
+
+
+class System(Bench):
+    """Plant, controller and steering in lock-step, and a user."""
+
+    def __init__(self, graph: RosGraph) -> None:
+        super().__init__(graph, mode='simulation', use_sim_time=True)
+        parameters = {
+            'use_sim_time': True,
+            'steered': True,
+            'rate': 200.0,
+            'reference.speed': 0.06,
+            'reference.acceleration': 1.0,
+            'model.preset': 'bending_35mm',
+            'deflection_feedback': 'none',
+        }
+        self.controller = graph.add(ControllerNode, parameters=parameters)
+        self.takers = 2
+        self.depths: list[float] = []
+        self.user.create_subscription(JointState, 'joint_states', self._on_state, 100)
+
+    def _on_state(self, message: JointState) -> None:
+        self.depths.append(message.position[message.name.index('insertion')])
+
+    @property
+    def modes(self) -> set[Mode]:
+        return {
+            node.diagnose().status.system for node in (self.controller, self.steering, self.plant)
+        }
+
+    def call(self, service: str, data: bool | None = None) -> Any:
+        kind = Trigger if data is None else SetBool
+        client = self.user.create_client(kind, service)
+        self.until(client.service_is_ready, service)
+        request = kind.Request() if data is None else SetBool.Request(data=data)
+        answer = client.call_async(request)
+        self.until(answer.done, f'the answer of {service}')
+        self.user.destroy_client(client)
+        return answer.result()
+
+    def agree(self, mode: Mode) -> None:
+        self.until(lambda: self.modes == {mode}, f'the mode {mode}')
+
+    def rest(self) -> float:
+        """Wait until needle and guide rest, and return the insertion depth [m]."""
+
+        def rests() -> bool:
+            before = [self.at(name) for name in ('insertion', 'guide_x', 'guide_z')]
+            count = len(self.depths) + 40
+            self.until(lambda: len(self.depths) > count, 'samples')
+            after = [self.at(name) for name in ('insertion', 'guide_x', 'guide_z')]
+            return max(abs(b - a) for a, b in zip(before, after, strict=True)) < 1e-5
+
+        self.until(rests, 'rest')
+        return self.at('insertion')
+
+
+@pytest.mark.parametrize('asked', NODES)
+def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> None:
+    """Pause, resume, retract, stop and clear during an insertion, by any of the nodes."""
+    system = System(ros_graph)
+    system.aim()
+    system.until(lambda: system.at('insertion') > 0.015, 'the insertion')
+    assert system.call(f'{asked}/pause', data=True).success
+    system.agree(Mode.PAUSED)
+    depth = system.rest()
+    assert system.steering._loop.steers
+    assert system.call(f'{asked}/pause', data=False).success
+    system.until(lambda: system.at('insertion') > depth + 2e-3, 'the motion')
+    begun = max(system.depths)
+    assert system.call(f'{asked}/retract').success
+    system.agree(Mode.RETRACTING)
+    system.until(lambda: system.at('insertion') < begun - 2e-3, 'the withdrawal')
+    assert system.call(f'{asked}/stop').success
+    system.agree(Mode.STOPPED)
+    depth = system.rest()
+    assert depth > 0.01
+    # Braking from 50 mm/s within 0.2 s, and the delay of the request.
+    assert max(system.depths) < begun + 8e-3
+    for node in NODES:
+        assert not system.call(f'{node}/retract').success
+    other = NODES[NODES.index(asked) - 1]
+    assert system.call(f'{other}/clear_stop').success
+    system.agree(Mode.RUNNING)
+    assert system.rest() == pytest.approx(depth, abs=1e-4)
+    assert system.call(f'{other}/retract').success
+    system.until(lambda: abs(system.at('insertion') - 0.01) < 5e-4, 'the retract depth')
+    system.until(lambda: abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4, 'the guide')
+
+
+def test_emergency_topic_stops_and_a_late_node_knows(ros_graph: RosGraph) -> None:
+    """The force is zero; a node that starts during the stop is stopped, too."""
+    system = System(ros_graph)
+    system.aim()
+    system.until(lambda: system.at('insertion') > 0.015, 'the insertion')
+    emergency = system.user.create_publisher(Bool, 'emergency_stop', COMMAND)
+    system.until(lambda: emergency.get_subscription_count() == 3, 'the nodes')
+    emergency.publish(Bool(data=True))
+    system.agree(Mode.STOPPED)
+    system.rest()
+    late = ros_graph.add(SteeringNode, parameters={'use_sim_time': True})
+    system.until(lambda: late.diagnose().status.system is Mode.STOPPED, 'the state')

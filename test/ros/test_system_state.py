@@ -1,0 +1,145 @@
+"""The system state: a stop has priority, and all nodes agree for any order of messages."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_ros.system_state import (
+    Authority,
+    CLEAR_STOP,
+    Mode,
+    PAUSE,
+    REQUESTS,
+    RESUME,
+    RETRACT,
+    STOP,
+    SystemState,
+)
+import pytest
+
+NODES = ('/controller', '/steering', '/plant')
+
+
+def authorities() -> list[Authority]:
+    """Return the authorities of three nodes whose clocks stand still at different times."""
+    return [Authority(node, partial(int, 1000 * k)) for k, node in enumerate(NODES)]
+
+
+def exchange(nodes: list[Authority], order: list[int]) -> None:
+    """Deliver the states of the nodes in an order, then each to each."""
+    for sender in [*order, 0, 1, 2]:
+        for node in nodes:
+            node.receive(nodes[sender].state)
+
+
+steps = st.lists(
+    st.tuples(
+        st.integers(0, 2),
+        st.sampled_from([*REQUESTS, 'fault', 'run']),
+        st.lists(st.integers(0, 2), max_size=2),
+    ),
+    max_size=12,
+)
+
+
+def perform(node: Authority, word: str) -> None:
+    if word == 'fault':
+        node.stop('the tip is lost')
+    elif word == 'run':
+        node.run()
+    else:
+        node.request(word)
+
+
+@given(steps=steps, order=st.permutations([0, 1, 2]))
+def test_nodes_agree_for_any_order_of_messages(
+    steps: list[tuple[int, str, list[int]]], order: list[int]
+) -> None:
+    """After every exchange all nodes have the same state; repeated messages change nothing."""
+    nodes = authorities()
+    for at, word, sent in steps:
+        perform(nodes[at], word)
+        for sender in sent:
+            nodes[(at + 1) % 3].receive(nodes[sender].state)
+    exchange(nodes, list(order))
+    assert nodes[0].state == nodes[1].state == nodes[2].state
+    before = nodes[0].state
+    exchange(nodes, [2, 2, 0, 1])
+    assert nodes[0].state == before
+
+
+@given(before=steps, after=steps, concurrent=st.sampled_from([PAUSE, RESUME, RETRACT, CLEAR_STOP]))
+def test_a_stop_holds_until_it_is_cleared(
+    before: list[tuple[int, str, list[int]]],
+    after: list[tuple[int, str, list[int]]],
+    concurrent: str,
+) -> None:
+    """No other request ends it, also not one that another node receives at the same time."""
+    nodes = authorities()
+    for at, word, _ in before:
+        perform(nodes[at], word)
+    exchange(nodes, [])
+    # A clearance of an earlier stop does not clear this one.
+    nodes[1].request(concurrent)
+    nodes[0].request(CLEAR_STOP)
+    nodes[0].stop('emergency')
+    exchange(nodes, [])
+    for at, word, _ in after:
+        if word != CLEAR_STOP:
+            perform(nodes[at], word)
+        exchange(nodes, [])
+        assert {node.mode for node in nodes} == {Mode.STOPPED}
+        assert 'emergency' in nodes[2].reason
+    nodes[2].request(CLEAR_STOP)
+    exchange(nodes, [])
+    assert {node.mode for node in nodes} == {Mode.RUNNING}
+
+
+@given(steps=steps)
+def test_state_survives_its_values(steps: list[tuple[int, str, list[int]]]) -> None:
+    """Converting a state to text values and back changes nothing."""
+    nodes = authorities()
+    for at, word, _ in steps:
+        perform(nodes[at], word)
+    exchange(nodes, [])
+    state = nodes[0].state
+    assert SystemState.from_values(state.to_values()) == state
+
+
+@given(st.dictionaries(st.text(), st.text()))
+def test_any_values_are_read(values: dict[str, str]) -> None:
+    """Values of another node are ignored if they are no state."""
+    found = SystemState.from_values(
+        {**values, 'stop /x': 'soon', 'motion': '', 'cleared /x': '-1'}
+    )
+    assert found.mode is not None
+    assert '/x' not in found.cleared
+
+
+@pytest.mark.parametrize('word', [PAUSE, RESUME, RETRACT])
+def test_requests_are_refused_during_a_stop(word: str) -> None:
+    """The line names the reason and the release."""
+    node = Authority('/controller')
+    node.stop('axial force 40 N')
+    assert node.request(word) == (
+        False,
+        f'{word} refused: stopped: axial force 40 N; ~/clear_stop releases',
+    )
+    assert node.request(STOP)[0]
+    assert node.reason == 'axial force 40 N'
+
+
+def test_pause_of_a_retraction_resumes_the_retraction() -> None:
+    """A request of a motion ends the retraction, a pause does not."""
+    node = Authority('/steering')
+    for word, mode in (
+        (RETRACT, Mode.RETRACTING),
+        (PAUSE, Mode.PAUSED),
+        (RESUME, Mode.RETRACTING),
+    ):
+        assert node.request(word)[0]
+        assert node.mode is mode
+    node.run()
+    assert node.mode is Mode.RUNNING
