@@ -38,7 +38,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     'bench': 'measure speed and accuracy (from a clone)',
 }
 
-#: Modules of the subcommands in `reproduction` and `benchmarks`, which import this package: they
+#: Modules of the subcommands in ``reproduction`` and ``benchmarks``, which import this package: they
 #: are imported by name when the subcommand runs.
 ABOVE: Final[Mapping[str, str]] = {
     'demo': 'reproduction.demo_command',
