@@ -76,9 +76,16 @@ class Loop:
 
     """
 
-    def __init__(self, law: str = 'adaptive', rate: float = 200.0, seed: int = 1) -> None:
+    def __init__(
+        self, law: str = 'adaptive', rate: float = 200.0, seed: int = 1, friction: float = 1.0
+    ) -> None:
         phantom = NeedleParameters.preset('phantom')
-        self.run = PlantRun({'model.preset': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed})
+        true = {
+            'model.coulomb_friction': friction * phantom.coulomb_friction,
+            'model.viscous_friction': friction * phantom.viscous_friction,
+        }
+        own = {'model.preset': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed}
+        self.run = PlantRun({**own, **true})
         self.now, self._period = EPOCH, round(NANOSECONDS / rate)
         self.publishers = {'wrench_command': 1}
         self.supervisor = Supervisor(lambda: self.now / NANOSECONDS)

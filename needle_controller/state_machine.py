@@ -41,9 +41,20 @@ class StateMachine(ABC, Generic[_Command]):
 
     def request(self, word: str, now: int) -> tuple[bool, str, _Command | None]:
         """
-        Execute a request of a user, as `Authority.request`, and follow the new state.
+        Execute a request of a user, and follow the new state.
 
-        Returns whether it succeeded, a line for the user, and the command to publish.
+        Parameters
+        ----------
+        word : str
+            The request, see `needle_ros.system_state.Authority.request`.
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        tuple of (bool, str, command or None)
+            Whether it is executed, one line for the user, and the command to publish.
+
         """
         success, message = self.authority.request(word, self._obstacle(word, now))
         if not success:

@@ -10,13 +10,14 @@ from typing import Final
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
+from needle_controller.laws.axis import Axis
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.response_monitor import ResponseMonitor
+from needle_controller.safety.response_monitor import ResponseMonitor, StallMonitor
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
@@ -55,7 +56,6 @@ class Supervisor(StateMachine[ForceCommand]):
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
         self._last = ForceCommand(0)
-        self._following = ResponseMonitor()
         #: Last measured insertion depth [m].
         self._depth: float | None = None
         #: The controller while configured, and while measurements are answered.
@@ -77,6 +77,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
         self.controller = controller
+        axis = Axis.insertion(controller.parameters)
+        self._following = ResponseMonitor(StallMonitor(axis, 0.5 * controller.settings.jump))
         self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
         self._robot = robot
         noise = {} if observed is None else observed.sensor_noise
@@ -384,11 +386,11 @@ class Supervisor(StateMachine[ForceCommand]):
             self.events.add(Severity.ERROR, command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
-        stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
-        if stopped is not None:
-            return stopped
         force, depth = self._last.force, measured.depth
         lost = self._following.update(stamp, depth, aim.position, force, measured.force)
+        stopped = self._stop_for(safety.guard.tracking(error[0]) or self._following.fault, stamp)
+        if stopped is not None:
+            return stopped
         if lost != controller.guide.waits:
             controller.guide.wait(lost)
         if lost:
@@ -451,8 +453,8 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _release(self, stamp: int) -> ForceCommand:
         self._waiting.discard(self.fault or 'no force is commanded')
-        self._following.forget()
         if self.controller is not None:
+            self._following.forget()
             self.controller.guide.wait(False)
             self.controller.release()
         return self._command(ForceCommand(stamp))

@@ -16,6 +16,7 @@ from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class
+from needle_ros.contract import EMERGENCY_STOP, SYSTEM_STATE
 from needle_ros.errors import MessageError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.run_node import run
@@ -55,6 +56,11 @@ _FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
+def _requests(topic: str) -> bool:
+    """Return whether a topic has requests of a user to the whole system."""
+    return topic.rpartition('/')[2] in (SYSTEM_STATE.name, EMERGENCY_STOP.name)
+
+
 class PlayerNode(BaseNode):
     """
     Plays a recording while active, each topic with the QoS that its publishers offered.
@@ -63,7 +69,8 @@ class PlayerNode(BaseNode):
     reception. Latched messages from before ``start`` are published first. A truncated recording is
     played up to its last complete message. ``~/pause`` stops the recorded time; ``~/step`` then
     plays the next message. With ``publish_clock`` the recorded time is published on /clock, and a
-    recorded /clock is not played.
+    recorded /clock is not played. ``system_state`` and ``emergency_stop`` are played only if
+    ``topics`` names them: a recorded request must not move or stop a needle.
 
     Attributes
     ----------
@@ -136,7 +143,7 @@ class PlayerNode(BaseNode):
             listing = ', '.join(map(str, topics))
             raise RecordingError(f'{path} has no topic {", ".join(missing)}; it has {listing}')
         if '*' in words:
-            named |= {name for name in there if not is_hidden(name)}
+            named |= {name for name in there if not (is_hidden(name) or _requests(name))}
         # This node publishes its own configuration.
         named.discard(self.resolve_topic_name('~/configuration'))
         if publishes:

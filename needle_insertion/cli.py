@@ -38,8 +38,8 @@ COMMANDS: Final[Mapping[str, str]] = {
     'bench': 'measure speed and accuracy (from a clone)',
 }
 
-#: Modules of the subcommands in ``reproduction`` and ``benchmarks``, which import this package: they
-#: are imported by name when the subcommand runs.
+#: Modules of the subcommands in ``reproduction`` and ``benchmarks``, which import this package;
+#: they are imported by name when the subcommand runs.
 ABOVE: Final[Mapping[str, str]] = {
     'demo': 'reproduction.demo_command',
     'experiment': 'reproduction.experiment_command',

@@ -1,9 +1,11 @@
-"""Response monitor: check that the plant follows its commands."""
+"""Response monitor: check that plant and encoders follow the commands."""
 
 from __future__ import annotations
 
+from math import isnan
 from typing import Final, NamedTuple
 
+from needle_controller.laws.axis import Axis
 from needle_ros.timing import NANOSECONDS
 
 #: Time without response after which the plant does not follow [ns].
@@ -11,6 +13,14 @@ _PATIENCE: Final = NANOSECONDS // 10
 
 #: Least response, as a fraction of the commanded force or of the distance of the reference.
 _NOTHING: Final = 0.1
+
+
+#: Longest time between two measurements that can be compared [s].
+_GAP: Final = 0.1
+
+#: Friction of a needle in other tissue, as a multiple of the nominal one: while the reference
+#: moves, and while it rests, where the law may approach its target slowly.
+_STRONGER, _RESTING = 1.5, 4.0
 
 
 class _Mark(NamedTuple):
@@ -21,6 +31,57 @@ class _Mark(NamedTuple):
     aim: float
 
 
+class StallMonitor:
+    """
+    Expect a displacement from the applied force, with stronger friction than the nominal one.
+
+    Encoders that do not move while the expected displacement exceeds ``most`` [m] are frozen, or
+    the needle is blocked: no further force may act.
+    """
+
+    def __init__(self, axis: Axis, most: float) -> None:
+        self._axis, self._most = axis, most
+        self.forget()
+
+    def forget(self) -> None:
+        """Expect motion from the next measurement on."""
+        self._stamp: int | None = None
+        self._depth = self._velocity = self._expected = self._aim = 0.0
+
+    def update(self, stamp: int, depth: float, aim: float, force: float) -> str | None:
+        """
+        Process a measurement at a stamp [ns] and the force [N] that acted before it.
+
+        Takes insertion depth and reference depth [m].
+
+        Returns the fault, or None.
+        """
+        before, self._stamp = self._stamp, stamp
+        factor = _RESTING if aim == self._aim else _STRONGER
+        axis, self._aim = self._axis, aim
+        elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
+        push = abs(force) - factor * axis.coulomb
+        if not 0.0 < elapsed < _GAP or push <= 0.0 or self._expected * force < 0.0:
+            self._depth, self._velocity, self._expected = depth, 0.0, 0.0
+            return None
+        # Implicit step: stable for any friction.
+        speed = abs(self._velocity) + elapsed / axis.inertia * push
+        speed /= 1.0 + elapsed / axis.inertia * factor * axis.viscous
+        self._velocity = speed
+        self._expected += (speed if force > 0.0 else -speed) * elapsed
+        moved = depth - self._depth
+        if abs(self._expected) <= self._most:
+            return None
+        if abs(moved) > _NOTHING * self._most:
+            self._depth, self._expected = depth, 0.0
+            return None
+        return (
+            f'the encoders do not move: {1e3 * abs(moved):.3g} mm measured, more than '
+            f'{1e3 * self._most:.3g} mm expected at {force:.3g} N; they are frozen, or the needle '
+            'is blocked'
+        )
+
+
 class ResponseMonitor:
     """
     Compare the commanded force with the response that the robot reports.
@@ -28,16 +89,19 @@ class ResponseMonitor:
     A plant does not follow if it reports almost no force while a force is commanded, and the
     needle rests while its reference moves. It follows again as soon as one of these conditions
     ends. A robot that reports no force is not checked. ``lost`` is whether the plant does not
-    follow.
+    follow. ``fault`` is the fault of the stall monitor.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stall: StallMonitor) -> None:
+        self._stall = stall
         self.forget()
 
     def forget(self) -> None:
         """Reset to a plant that follows."""
         self.lost = False
+        self.fault: str | None = None
         self._mark: _Mark | None = None
+        self._stall.forget()
 
     def update(
         self, stamp: int, depth: float, aim: float, commanded: float, reported: float
@@ -48,16 +112,18 @@ class ResponseMonitor:
         Takes insertion depth and reference depth [m], and the last commanded and the reported
         force [N]; the latter is NaN if the robot reports none.
         """
+        applied = commanded if isnan(reported) else reported
+        self.fault = self._stall.update(stamp, depth, aim, applied)
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
-            self.forget()
+            self.lost, self._mark = False, None
             return False
         if self._mark is None:
             self._mark = _Mark(stamp, depth, aim)
         mark = self._mark
         moved = abs(depth - mark.depth) > _NOTHING * abs(aim - mark.aim)
         if self.lost and moved:
-            self.forget()
+            self.lost, self._mark = False, None
         elif not self.lost and stamp - mark.stamp > _PATIENCE:
             self.lost = not moved and aim != mark.aim
             if not self.lost:

@@ -286,7 +286,17 @@ class Safety:
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def status(self, status: ControllerStatus, now: int) -> ControllerStatus:
-        """Return a status of the controller with stop, publishers, commands and inputs."""
+        """
+        Return a status of the controller with stop, publishers, commands and inputs.
+
+        Parameters
+        ----------
+        status : ControllerStatus
+            The status without them.
+        now : int
+            Time [ns].
+
+        """
         return replace(
             status,
             stop=self.stop or '',

@@ -21,7 +21,7 @@ from needle_controller.steering.insertion import InsertionStrategy
 from needle_controller.steering.insertion_status import describe, describe_phase
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.motion_control import MotionControl
+from needle_controller.steering.motion_control import MotionControl, SAME
 from needle_controller.steering.planner import (
     describe_target,
     InsertionPlanner,
@@ -50,9 +50,6 @@ _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
 #: Phases with motions of this executive.
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
-
-#: Tolerance of equal depths [m].
-_SAME: Final = 1e-6
 
 
 class SteeringExecutive(StateMachine[JointMotion]):
@@ -199,7 +196,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     def _aim(self, point: tuple[float, float, float]) -> None:
         depth = self.depth
-        if abs(point[1] - depth) > _SAME or self._insertion is None:
+        if abs(point[1] - depth) > SAME or self._insertion is None:
             raise ParameterError(
                 f'the insertion is to a depth of {1e3 * depth:.2f} mm, got '
                 f'{1e3 * point[1]:.2f} mm; ~/stop ends it'
@@ -401,7 +398,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
         except NeedleError as error:
             return self._stop(str(error), now)
         if insertion.phase is Phase.DONE:
-            self.events.add(Severity.INFO, f'done: {insertion.law.outcome()}')
+            line, severity = insertion.law.outcome()
+            self.events.add(severity, f'done: {line}')
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
@@ -495,5 +493,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if warning:
             return Severity.WARNING, warning, status
         if insertion is not None and self.phase is Phase.DONE:
-            return Severity.INFO, f'done: {insertion.law.outcome()}', status
+            line, severity = insertion.law.outcome()
+            return severity, f'done: {line}', status
         return Severity.INFO, describe_phase(status), status

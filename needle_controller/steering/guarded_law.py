@@ -24,6 +24,9 @@ import numpy as np
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
 
+#: Distance of the tip from the target that is a hit [m], and quantile of a 95 % interval.
+_HIT, _QUANTILE = 1e-3, 1.96
+
 
 class GuardedLaw:
     """
@@ -168,17 +171,27 @@ class GuardedLaw:
             self._events.add(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
         return to
 
-    def outcome(self) -> str:
-        """Describe the estimate of the tip at the end."""
-        there = self.expected
-        if there is None:
-            return 'the needle is at the target depth'
-        half = there.half_width
-        (x, z), off = there.mean, float(np.hypot(*(there.mean - self.law.target)))
-        return (
-            f'the tip is at x = {1e3 * x:.2f} ± {1e3 * half[0]:.2f} mm, z = {1e3 * z:.2f} ± '
-            f'{1e3 * half[1]:.2f} mm (95 %), {1e3 * off:.2f} mm from the target'
-        )
+    def outcome(self) -> tuple[str, Severity]:
+        """Describe the tip at the end; a warning if it is not within 1 mm of the target."""
+        there, seen = self.expected, self.seen
+        words, off = [], np.zeros(3)
+        if there is not None:
+            (x, z), half = there.mean, there.half_width
+            off[[0, 2]] = there.mean - self.law.target
+            words += [_interval('x', x, half[0]), _interval('z', z, half[1])]
+        if seen is not None:
+            off[1] = seen.tip[1] - self.depths[-1]
+            words.insert(1, _interval('y', seen.tip[1], _QUANTILE * max(seen.error, self._noise)))
+        if there is None or seen is None:
+            words.append('the rest is not measured')
+        miss = float(np.linalg.norm(off))
+        line = f'the tip is at {", ".join(words)} (95 %), {1e3 * miss:.2f} mm from the target'
+        hit = miss <= _HIT and seen is not None
+        return line, Severity.INFO if hit else Severity.WARNING
+
+
+def _interval(axis: str, center: float, half: float) -> str:
+    return f'{axis} = {1e3 * center:.2f} ± {1e3 * half:.2f} mm'
 
 
 @contextmanager

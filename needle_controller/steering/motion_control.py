@@ -32,7 +32,7 @@ _SPAN: Final = 0.05
 STILL: Final = 1e-4
 
 #: Tolerance of equal positions [m, rad].
-_SAME: Final = 1e-6
+SAME: Final = 1e-6
 
 
 class MotionControl:
@@ -108,7 +108,7 @@ class MotionControl:
     def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> JointMotion | None:
         duration = duration_of(self.goal - begin, self._settings)
         self.due = now + round(duration * NANOSECONDS)
-        if np.abs(self.goal - begin).max() < _SAME:
+        if np.abs(self.goal - begin).max() < SAME:
             # Too short: the times of the points would be equal.
             self.monitor.forget()
             return None

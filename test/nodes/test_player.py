@@ -262,6 +262,24 @@ def test_loop_repeats_all_messages(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert player.diagnose().status.loops >= 3
 
 
+def test_recorded_requests_are_played_only_by_name(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A replay neither stops nor moves a needle."""
+    bag = small_bag(tmp_path / 'bag')
+    with BagWriter(tmp_path / 'requests') as writer:
+        for name, kind in (
+            ('/text', 'std_msgs/msg/String'),
+            ('/emergency_stop', 'std_msgs/msg/Bool'),
+            ('/left/system_state', 'diagnostic_msgs/msg/DiagnosticStatus'),
+        ):
+            writer.add_topic(name, kind)
+            writer.write(name, bytes_of(bag, '/text')[0], EPOCH)
+    player = play(ros_graph, tmp_path / 'requests', paused=True)
+    assert set(player._outputs) == {'/text'}
+    player.stop()
+    named = play(ros_graph, tmp_path / 'requests', paused=True, topics=['/emergency_stop'])
+    assert set(named._outputs) == {'/emergency_stop'}
+
+
 def test_pause_step_and_resume(ros_graph: RosGraph, tmp_path: Path) -> None:
     """A step plays one message and returns its topic; no other message is played in a pause."""
     bag = small_bag(tmp_path / 'bag')
