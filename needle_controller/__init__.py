@@ -38,7 +38,6 @@ from needle_controller.reference.trapezoid import Trapezoid
 from needle_controller.safety.guard import Guard
 from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.safety import Safety
 from needle_controller.stability import (
     check_stability,
     Limit,
@@ -103,7 +102,6 @@ __all__ = [
     'Reference',
     'ReferenceLimits',
     'Robot',
-    'Safety',
     'SafetyLimits',
     'SampledLoop',
     'Setpoint',

@@ -29,8 +29,9 @@ class StateMachine(ABC, Generic[_Command]):
         self._steady = steady
         self.events = EventLog(steady)
         self.authority = Authority()
-        #: Mode of the system that is followed.
+        #: Mode of the system that is followed, and time of the retraction that is followed [ns].
         self._obeyed = Mode.RUNNING
+        self._retracted = 0
         #: Time of the last event [ns].
         self._time = 0
         self._take_requests(takes)
@@ -81,8 +82,11 @@ class StateMachine(ABC, Generic[_Command]):
 
         """
         mode, before = self.authority.mode, self._obeyed
+        time, retracted = self.authority.state.motion.time, self._retracted
         self._obeyed = mode
-        if mode is before:
+        if mode is Mode.RETRACTING:
+            self._retracted = time
+        if mode is before and (mode is not Mode.RETRACTING or time == retracted):
             return None
         self.events.add(Severity.INFO)
         return self._change_mode(mode, before, now)

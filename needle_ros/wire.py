@@ -56,8 +56,9 @@ _HEAD: Final = b'\0\1\0\0'
 #: Position of the stamp (seconds, nanoseconds) after the encapsulation [bytes].
 _STAMP: Final = 4
 
-#: Maximum padding of the last word by some middlewares [bytes].
-_PADDING: Final = 3
+#: Maximum padding of the last word by some middlewares, and additional bytes after the message for
+#: each empty array: rclpy aligns it in the size of its buffer, but not in the message [bytes].
+_PADDING, _EXCESS = 3, 8
 
 #: Number of templates in a batch after which messages are parsed one by one.
 _TEMPLATES: Final = 32
@@ -94,7 +95,7 @@ class _Cursor:
         self.order = '<' if kind % 2 else '>'
         #: Begin and end of the bytes other than the stamp and the numbers.
         self.fixed = [(0, 2)]
-        self._widest = _WIDEST[kind]
+        self._widest, self._padding = _WIDEST[kind], _PADDING
         self._end = 4
         self._given: Iterator[Any] | None = None if given is None else iter(given)
 
@@ -128,10 +129,11 @@ class _Cursor:
         return self.message[begin : begin + length].rstrip(b'\0').decode(errors='replace')
 
     def numbers(self, number: int) -> tuple[int, int]:
+        self._padding += 0 if number else _EXCESS
         return self.take(8, number), number
 
     def close(self) -> None:
-        if len(self.message) - self._end > _PADDING:
+        if len(self.message) - self._end > self._padding:
             raise MessageError(f'has {len(self.message)} bytes, {self._end} expected')
 
 

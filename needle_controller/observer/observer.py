@@ -55,6 +55,9 @@ _WAITING: Final = 16
 #: Largest relative overlap of exposures of the tip; above it a sample is a duplicate.
 _OVERLAP: Final = 0.1
 
+#: Largest plausible measurement [m, N or N m]; squares of larger ones overflow.
+_LARGEST: Final = 1e6
+
 
 class _Encoders(NamedTuple):
     """Sample of the encoders: time since the first sample [s], insertion depth, velocity."""
@@ -252,7 +255,7 @@ class Observer:
             As for `update`; nan if missing.
 
         """
-        time = self._seconds(stamp)
+        time, lateral, moment = self._seconds(stamp), _finite(lateral), _finite(moment)
         if self._last is None or not (isfinite(lateral) or isfinite(moment)):
             self.refused += 1
             return
@@ -268,7 +271,7 @@ class Observer:
         if slot == self._oldest or abs(sample['time'] - time) > slack or taken:
             self.refused += 1
             return
-        sample['lateral'], sample['moment'] = _finite(lateral), _finite(moment)
+        sample['lateral'], sample['moment'] = lateral, moment
         self._replay(float(samples[(slot or len(samples)) - 1]['time']))
 
     def add_tip(self, stamp: int, deflection: float) -> None:
@@ -285,7 +288,7 @@ class Observer:
 
         """
         end = self._seconds(stamp) - self.settings.tip_latency
-        if self._last is None or not isfinite(deflection):
+        if self._last is None or not isfinite(_finite(deflection)):
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
@@ -460,7 +463,8 @@ class Observer:
 
 
 def _finite(value: float) -> float:
-    return float(value) if isfinite(value) else nan
+    """Return a plausible measurement, else NaN."""
+    return float(value) if abs(value) <= _LARGEST else nan
 
 
 def _checked(stamp: int) -> int:

@@ -31,34 +31,8 @@ class Safety:
     """
     Conditions for a force command: valid inputs, limits, no latched stop, one publisher per topic.
 
-    Parameters
-    ----------
-    limits : SafetyLimits
-        Limits.
-    settings : ControllerSettings
-        Timeout and range of depths.
-    parameters : NeedleParameters
-        Needle.
-    expected : sequence of str
-        Topics that must be published continuously.
-    noise : Mapping[str, Sequence[float]]
-        Noise of the sensor values, by topic.
-    wrench_frame : str
-        Frame of the force sensor.
-
-    Attributes
-    ----------
-    stop : str or None
-        Reason of the latched stop; None if there is no stop.
-    stops : int
-        Number of stops so far.
-    duplicate_publishers : str or None
-        Topics with duplicate publishers of commands or measurements, or None.
-    streams : dict of str to InputMonitor
-        Inputs by topic.
-    saturation : RateCounter
-        Commands, with a mark for commands at their limit.
-
+    `expected` are the topics that must be published continuously, `noise` is the noise of the
+    sensor values by topic, and `wrench_frame` the frame of the force sensor.
     """
 
     def __init__(
@@ -72,8 +46,10 @@ class Safety:
         wrench_frame: str = BASE,
     ) -> None:
         self.limits = limits
+        #: Reason of the latched stop, and number of stops so far.
         self.stop: str | None = None
         self.stops = 0
+        #: Topics with duplicate publishers of commands or measurements.
         self.duplicate_publishers: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))
         self.saturation = RateCounter()
@@ -104,15 +80,7 @@ class Safety:
         self._stale: set[str] = set()
 
     def begin(self, now: int) -> None:
-        """
-        Discard all readings, and expect new readings from a time [ns] on; a stop stays.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Discard all readings, and expect new readings from a time [ns] on; a stop stays."""
         self._begun = now or None
         self._stale.clear()
         for stream in self.streams.values():
@@ -121,15 +89,7 @@ class Safety:
         self.guard.forget('reference')
 
     def latch(self, reason: str | None) -> bool:
-        """
-        Latch a stop for a reason, if not None; return whether the stop begins now.
-
-        Parameters
-        ----------
-        reason : str or None
-            The reason.
-
-        """
+        """Latch a stop for a reason, if not None; return whether the stop begins now."""
         if reason is None or self.stop is not None:
             return False
         self.stop = reason
@@ -139,40 +99,14 @@ class Safety:
         return True
 
     def clear(self, now: int) -> str | None:
-        """
-        Release the stop, or return why not; see `obstacle`.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        str or None
-            Why the stop stays; None if it is released.
-
-        """
+        """Release the stop, or return why not; see `obstacle`."""
         reason = self.obstacle(now)
         if reason is None:
             self.stop = None
         return reason
 
     def obstacle(self, now: int) -> str | None:
-        """
-        Return why a stop cannot be released.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        str or None
-            Measurement beyond a limit, or a required measurement that is missing; or None.
-
-        """
+        """Return why a stop cannot be released."""
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
@@ -181,15 +115,7 @@ class Safety:
         return self.guard.violated or required
 
     def count_publishers(self, publishers: Mapping[str, int]) -> None:
-        """
-        Set the number of publishers of topics with a single source, including this controller.
-
-        Parameters
-        ----------
-        publishers : Mapping[str, int]
-            Number of nodes by topic.
-
-        """
+        """Set the number of publishers by topic, including this controller."""
         for name, count in publishers.items():
             if name in self.streams:
                 self.streams[name].publishers = count
@@ -201,20 +127,7 @@ class Safety:
         self.duplicate_publishers = ', '.join(vital) or None
 
     def mixed_sources(self, now: int) -> str | None:
-        """
-        Return a fault if nearly all encoder messages are out of order: several robots or clocks.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        str or None
-            Fraction of messages out of order; None if it is tolerable.
-
-        """
+        """Return a fault if nearly all encoder messages are out of order (several sources)."""
         window = self.streams['joint_states'].window
         share = window.share(now)
         if share <= _MIXED or window.rate(now) < _FEW:
@@ -239,35 +152,14 @@ class Safety:
         }
 
     def new_warnings(self, now: int) -> list[str]:
-        """
-        Return a line for each expected topic that has become stale since the last call.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Return a line for each expected topic that has become stale since the last call."""
         silent = self._silent(now)
         lines = [line for name, line in silent.items() if name not in self._stale]
         self._stale = set(silent)
         return lines
 
     def warning(self, now: int) -> str | None:
-        """
-        Return the expected topics that are stale or frozen, and the topics out of order.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        str or None
-            The topics with their state; None if all are valid.
-
-        """
+        """Return the expected topics that are stale or frozen, and the topics out of order."""
         frozen = (
             f'{name} has not changed for {self.limits.sensor_timeout:g} s'
             for name in self._expected
@@ -286,17 +178,7 @@ class Safety:
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def status(self, status: ControllerStatus, now: int) -> ControllerStatus:
-        """
-        Return a status of the controller with stop, publishers, commands and inputs.
-
-        Parameters
-        ----------
-        status : ControllerStatus
-            The status without them.
-        now : int
-            Time [ns].
-
-        """
+        """Return a status of the controller with stop, publishers, commands and inputs."""
         return replace(
             status,
             stop=self.stop or '',

@@ -68,6 +68,23 @@ def test_controller_recovers_from_implausible_inputs(
     assert abs(loop.acting) < 2.0
 
 
+@pytest.mark.parametrize('value', [1e100, -1e100, 1e7, float('inf'), float('nan')])
+def test_observer_ignores_implausible_sensors(value: float) -> None:
+    """A single reading has no effect on later estimates."""
+    loads = []
+    for shown in (value, None):
+        observer = Observer(PHANTOM, ObserverSettings(), period=0.01)
+        for k in range(200):
+            stamp = 10_000_000 * k
+            wrench = (shown, shown) if k == 50 and shown is not None else None
+            observer.update(stamp, 0.05, 0.0, wrench)
+            if k == 60 and shown is not None:
+                observer.add_tip(stamp, shown)
+                observer.add_wrench(stamp, shown, shown)
+        loads.append(observer.load)
+    assert loads[0] == loads[1]
+
+
 def test_observer_rejects_an_implausible_velocity() -> None:
     """It is finite, and would give a load of 1e296 N."""
     observer = Observer(PHANTOM, ObserverSettings(), 1e-3)

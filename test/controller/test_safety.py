@@ -8,10 +8,10 @@ from needle_controller import (
     Guard,
     InputMonitor,
     Measurement,
-    Safety,
     SafetyLimits,
 )
 from needle_controller.safety.encoders import read_encoders
+from needle_controller.safety.safety import Safety
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_ros.wire import Reading
 import numpy as np

@@ -444,13 +444,14 @@ def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
 
 
 def test_force_above_eulers_load_gives_a_warning() -> None:
-    """With almost the whole needle outside and an obstacle, it buckles at 13 N."""
+    """With almost the whole needle outside and stronger friction, it buckles at 13 N."""
     loop = Loop()
     loop.depth = 0.002
     loop.supervisor.target(0, '', 0.1, 0.0, loop.now)
     said = []
-    for _ in range(400):
-        loop.measure()
+    for _ in range(800):
+        # A fifth of the velocity of the reference.
+        loop.measure(2e-6, 2e-3)
         said += loop.said()
     (line,) = (one for one in said if 'Euler' in one)
     assert "exceeds Euler's load 13.2 N of the part outside" in line
@@ -496,6 +497,20 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
         loop.measure()
     assert loop.supervisor.controller is not None
     assert loop.supervisor.controller.target == 0.01
+
+
+def test_repeated_retraction_withdraws_a_needle_that_was_moved() -> None:
+    """The state of the system remains the same in between."""
+    loop = Loop(target=None)
+    loop.measure()
+    loop.request(RETRACT)
+    for _ in range(2):
+        loop.depth = 0.02
+        loop.supervisor.activate(loop.now, {TOPIC: 1})
+        loop.supervisor.controller.guide.forget()
+        loop.measure()
+        loop.request(RETRACT)
+        assert loop.supervisor.controller.target == 0.01
 
 
 def test_clock_set_back_is_detected() -> None:

@@ -19,7 +19,7 @@ from needle_ros.contract import EVERY_NODE, Topic, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.status import NodeStatus
 from needle_ros.timing import nanoseconds
-from needle_ros.wire import JOINT_STATE, POINT, Reading, Template, WRENCH
+from needle_ros.wire import JOINT_STATE, MessageReader, POINT, Reading, Template, WRENCH
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from reproduction.protocol import SHIPPED_BAGS
@@ -57,7 +57,12 @@ def check(type_name: str, template: Template, reading: Reading) -> Any:
     message = deserialize_message(data, message_class(type_name))
     assert Template.of(data, type_name).read(data) == template.read(data) == reading
     # rmw writes arbitrary bytes into padding.
-    assert template.read(serialize_message(message)) == content(message) == reading
+    data = serialize_message(message)
+    assert template.read(data) == content(message) == reading
+    # It also appends some after empty arrays.
+    assert (
+        Template.of(data, type_name).read(data) == MessageReader(type_name).read(data) == reading
+    )
     return message
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+import re
 from typing import Any
 
 from hypothesis import given, settings
@@ -71,7 +72,24 @@ def test_insertion_hits_the_target_with_a_consistent_estimate() -> None:
     # A reading of positions is rounded to 10 ms.
     assert (speeds <= [0.0101, 0.0202, 0.0202]).all()
     assert np.abs(robot.tracked).max(axis=0)[1:].max() <= SETTINGS.guide_limit
-    assert 'mm from the target' in robot.loop.diagnose(robot.now)[1]
+    severity, line, _ = robot.loop.diagnose(robot.now)
+    assert severity is Severity.INFO
+    assert re.fullmatch(
+        r'done: the tip is at x = .* ± .* mm, y = (59\.[89]|60\.0)\d ± .* mm, z = .* \(95 %\), '
+        r'0\.\d\d mm from the target', line,
+    )  # fmt: skip
+
+
+def test_miss_in_depth_is_a_warning() -> None:
+    """The sensor measures the tip 2 mm short; the needle is at its insertion depth."""
+    robot = Robot()
+    robot.sees = lambda tip: tip - np.array([0.0, 2e-3, 0.0])
+    robot.steer()
+    severity, line, _ = robot.loop.diagnose(robot.now)
+    assert robot.loop.phase is Phase.DONE
+    assert severity is Severity.WARNING
+    # A bent needle is 0.1 mm less deep than its insertion depth.
+    assert re.search(r'y = (57\.[89]|58\.0)\d ± .* 2\.\d\d mm from the target', line)
 
 
 def test_late_and_lost_readings_are_tolerated() -> None:
