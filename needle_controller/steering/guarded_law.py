@@ -174,24 +174,20 @@ class GuardedLaw:
     def outcome(self) -> tuple[str, Severity]:
         """Describe the tip at the end; a warning if it is not within 1 mm of the target."""
         there, seen = self.expected, self.seen
-        words, off = [], np.zeros(3)
+        if seen is None:
+            return 'the needle is at the target depth; its tip is not measured', Severity.WARNING
+        # The law estimates x and z from all measurements.
+        tip, half = seen.tip.copy(), np.full(3, _QUANTILE * max(seen.error, self._noise))
         if there is not None:
-            (x, z), half = there.mean, there.half_width
-            off[[0, 2]] = there.mean - self.law.target
-            words += [_interval('x', x, half[0]), _interval('z', z, half[1])]
-        if seen is not None:
-            off[1] = seen.tip[1] - self.depths[-1]
-            words.insert(1, _interval('y', seen.tip[1], _QUANTILE * max(seen.error, self._noise)))
-        if there is None or seen is None:
-            words.append('the rest is not measured')
-        miss = float(np.linalg.norm(off))
-        line = f'the tip is at {", ".join(words)} (95 %), {1e3 * miss:.2f} mm from the target'
-        hit = miss <= _HIT and seen is not None
-        return line, Severity.INFO if hit else Severity.WARNING
-
-
-def _interval(axis: str, center: float, half: float) -> str:
-    return f'{axis} = {1e3 * center:.2f} ± {1e3 * half:.2f} mm'
+            tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
+        x, z = np.asarray(self.law.target)
+        miss = float(np.linalg.norm(tip - (x, self.depths[-1], z)))
+        words = ', '.join(
+            f'{axis} = {1e3 * center:.2f} ± {1e3 * width:.2f} mm'
+            for axis, center, width in zip('xyz', tip, half, strict=True)
+        )
+        line = f'the tip is at {words} (95 %), {1e3 * miss:.2f} mm from the target'
+        return line, Severity.INFO if miss <= _HIT else Severity.WARNING
 
 
 @contextmanager

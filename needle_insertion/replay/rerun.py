@@ -154,8 +154,9 @@ class Rerun:
         """Return values of each topic by sample number, nan for missing values."""
         recorded = self.recorded
         tip = recorded.constants.tip
-        # Tip measurements are published with a later sample.
-        end = recorded.numbers[-1] + ceil(tip.delay * recorded.constants.own.rate)
+        # Tip measurements are published with a later sample; a bag may end within a sample.
+        last = max(int(rows.numbers[-1]) for rows in recorded.rows.values())
+        end = max(recorded.numbers[-1] + ceil(tip.delay * recorded.constants.own.rate), last)
         computed = {
             topic.name: np.full((end + 1, len(topic.quantities)), np.nan)
             for topic in recorded.topics.values()
