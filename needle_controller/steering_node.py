@@ -157,7 +157,6 @@ class SteeringNode(CompiledNode):
     def activate(self) -> None:
         """Start to process measurements, and to check for missing inputs."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
-        self._obey()
         if self.get_parameter('use_sim_time').value:
             self._processed = self.publisher(contract.PROCESSED, always=True)
 
@@ -254,6 +253,8 @@ class SteeringNode(CompiledNode):
             return
         count = self._measurers.count
         self._loop.count_publishers(count(contract.JOINT_STATES), count(contract.TIP_DEFLECTION))
+        # The state may have changed before the activation.
+        self._obey()
         self._act(self._loop.watch(self.now()))
         self._report_processed()
 

@@ -20,7 +20,8 @@ from pathlib import Path
 import re
 import shutil
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+from zlib import crc32
 
 from needle_dynamics import FloatArray
 from needle_ros.errors import JobError, ParameterError
@@ -39,7 +40,8 @@ _GROUP: Final = 2**13
 # The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
 
-_PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
+#: Name of a part: first sample, end, and checksum.
+_PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
 
 #: Packages whose versions affect the bits of a sample.
 _PACKAGES: Final = ('needle_insertion', 'numba', 'numpy', 'scipy')
@@ -89,6 +91,23 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
     return monotonic() - begin, columns
 
 
+def _checksum(first: int, end: int, path: Path) -> str:
+    return f'{crc32(path.read_bytes(), crc32(f"{first} {end}".encode())):08x}'
+
+
+class _Part(NamedTuple):
+    """File with the samples from `first` to `end` - 1; the checksum is in its name."""
+
+    first: int
+    end: int
+    checksum: str
+    path: Path
+
+    @property
+    def is_intact(self) -> bool:
+        return _checksum(self.first, self.end, self.path) == self.checksum
+
+
 class Results:
     """
     The folder of a study; a folder of the same study is resumed.
@@ -111,7 +130,7 @@ class Results:
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(self._file, order(study).encode())
         if self.table.exists():
-            if _rows(self.table) != study.samples:
+            if not self._is_intact():
                 raise JobError(f'{self.table} is damaged; remove it to compute it again')
             self._clear()
         else:
@@ -140,11 +159,11 @@ class Results:
             except BlockingIOError as error:
                 raise JobError(f'another process computes {self.folder}') from error
             end = 0
-            for first, after in [] if self.table.exists() else self._done():
-                if first < end or _rows(self._part(first, after)) != after - first:
-                    self._part(first, after).unlink()
+            for part in [] if self.table.exists() else self._done():
+                if part.first < end or not part.is_intact:
+                    part.path.unlink()
                 else:
-                    end = after
+                    end = part.end
             yield
 
     @property
@@ -157,29 +176,45 @@ class Results:
         begin, gaps = 0, list[tuple[int, int]]()
         if self.table.exists():
             return gaps
-        for first, end in self._done():
-            if first > begin:
-                gaps.append((begin, first))
-            begin = max(begin, end)
+        for part in self._done():
+            if part.first > begin:
+                gaps.append((begin, part.first))
+            begin = max(begin, part.end)
         if begin < self.study.samples:
             gaps.append((begin, self.study.samples))
         return gaps
 
-    def _done(self) -> list[tuple[int, int]]:
-        found = (_PART.fullmatch(path.name) for path in self._parts.iterdir())
-        return sorted((int(one[1]), int(one[2])) for one in found if one)
+    def _done(self) -> list[_Part]:
+        found = ((_PART.fullmatch(path.name), path) for path in self._parts.iterdir())
+        return sorted(_Part(int(one[1]), int(one[2]), one[3], path) for one, path in found if one)
 
     def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
         """Write a chunk that starts at the sample `first`; return its number of samples."""
         count = len(columns['sample'])
-        self._write(self._part(first, first + count), [pa.table(dict(columns))])
+        end, draft = first + count, self._parts / f'{first:010d}.part'
+        self._write(draft, [pa.table(dict(columns))])
+        name = f'{first:010d}-{end:010d}-{_checksum(first, end, draft)}.parquet'
+        draft.replace(self._parts / name)
         return count
 
     def complete(self) -> None:
         """Merge all parts into one table, and remove the parts."""
         if not self.table.exists():
-            self._write(self.table, self._groups())
+            draft = self.table.with_suffix('.part')
+            self._write(draft, self._groups(), durable=True)
+            write_whole(self._sum, _checksum(0, self.study.samples, draft).encode())
+            draft.replace(self.table)
         self._clear()
+
+    @property
+    def _sum(self) -> Path:
+        return self.table.with_suffix('.crc32')
+
+    def _is_intact(self) -> bool:
+        """Return whether the table has its checksum."""
+        with suppress(OSError, UnicodeDecodeError):
+            return self._sum.read_text() == _checksum(0, self.study.samples, self.table)
+        return False
 
     def _clear(self) -> None:
         """Remove the parts after they are merged."""
@@ -189,8 +224,8 @@ class Results:
     def _groups(self) -> Iterator[Any]:
         """Yield all samples in tables of equal size."""
         waiting: list[Any] = []
-        for first, end in self._done():
-            waiting.append(parquet.read_table(self._part(first, end), use_threads=False))
+        for part in self._done():
+            waiting.append(parquet.read_table(part.path, use_threads=False))
             while sum(map(len, waiting)) >= _GROUP:
                 whole = pa.concat_tables(waiting)
                 yield whole.slice(0, _GROUP)
@@ -198,11 +233,8 @@ class Results:
         if sum(map(len, waiting)):
             yield pa.concat_tables(waiting)
 
-    def _part(self, first: int, end: int) -> Path:
-        return self._parts / f'{first:010d}-{end:010d}.parquet'
-
     @staticmethod
-    def _write(path: Path, tables: Iterable[Any]) -> None:
+    def _write(path: Path, tables: Iterable[Any], *, durable: bool = False) -> None:
         """Write a file atomically."""
         draft = path.with_suffix('.tmp')
         try:
@@ -212,11 +244,14 @@ class Results:
                     if writer is None:
                         writer = stack.enter_context(
                             parquet.ParquetWriter(
-                                draft, one.schema, compression='zstd', use_dictionary=False
+                                draft,
+                                one.schema,
+                                compression='zstd',
+                                use_dictionary=False,
                             )
                         )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
-            if path.name == TABLE:
+            if durable:
                 # The parts are removed afterwards. A lost part is computed again.
                 with draft.open('rb') as file:
                     os.fsync(file.fileno())
@@ -294,11 +329,3 @@ def dask(client: Any) -> Iterator[Executor]:
     finally:
         if client.status == 'running':
             pool.shutdown(wait=False)
-
-
-def _rows(path: Path) -> int:
-    """Return the number of rows of a table; -1 if it is damaged."""
-    try:
-        return int(parquet.read_metadata(path).num_rows)
-    except (OSError, pa.ArrowException):
-        return -1

@@ -365,17 +365,25 @@ def test_a_study_is_locked_by_one_process(
     assert main(words) == 0
 
 
+def flip(path: Path, where: float) -> None:
+    """Flip a bit at a fraction of a file."""
+    data = bytearray(path.read_bytes())
+    data[int(where * len(data))] ^= 4
+    path.write_bytes(data)
+
+
 @pytest.mark.parametrize(
     'damage',
     [
         lambda part: part.write_bytes(b''),
         lambda part: part.write_bytes(part.read_bytes()[:-1]),
-        lambda part: part.rename(part.with_name('0000000000-0000000017.parquet')),
-        lambda part: part.with_name('0000000007-0000000016.parquet').write_bytes(
+        lambda part: part.rename(part.with_name(part.name.replace('16-', '17-'))),
+        lambda part: part.with_name(part.name.replace('0-', '7-', 1)).write_bytes(
             part.read_bytes()
         ),
+        *(partial(flip, where=where) for where in (0.01, 0.2, 0.5, 0.7, 0.9, 0.99)),
     ],
-    ids=['empty', 'cut', 'other number', 'twice'],
+    ids=['empty', 'cut', 'other number', 'twice', *(f'bit {k}' for k in range(6))],
 )
 def test_damaged_parts_are_computed_again(
     tmp_path: Path, damage: Callable[[Path], object]
@@ -386,9 +394,25 @@ def test_damaged_parts_are_computed_again(
     compute(whole, here, 1, lambda _: None)
     for first in (0, 16):
         broken.add(first, study.rows(first, 16))
-    damage(tmp_path / 'broken' / 'parts' / '0000000000-0000000016.parquet')
+    (part,) = (tmp_path / 'broken' / 'parts').glob('0000000000-*.parquet')
+    damage(part)
     compute(broken, here, 1, lambda _: None)
     assert checksum(broken.table) == checksum(whole.table)
+
+
+def test_flipped_bits_of_a_table_are_detected(tmp_path: Path) -> None:
+    """At any place of the file."""
+    study = made(SMALL)
+    results = Results(tmp_path / 'whole', study)
+    compute(results, here, 1, lambda _: None)
+    whole = results.table.read_bytes()
+    for where in np.linspace(0.0, 0.999, 150):
+        results.table.write_bytes(whole)
+        flip(results.table, where)
+        with pytest.raises(JobError, match='is damaged; remove it to compute it again'):
+            Results(tmp_path / 'whole', study)
+    results.table.write_bytes(whole)
+    assert not Results(tmp_path / 'whole', study).missing()
 
 
 def test_damaged_tables_and_other_versions_are_rejected(

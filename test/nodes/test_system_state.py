@@ -107,7 +107,7 @@ def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> 
 
 
 def test_emergency_topic_stops_and_a_late_node_knows(ros_graph: RosGraph) -> None:
-    """The force is zero; a node that starts during the stop is stopped, too."""
+    """The force is zero; a node that starts during stop or pause follows it, too."""
     system = System(ros_graph)
     system.aim()
     system.until(lambda: system.at('insertion') > 0.015, 'the insertion')
@@ -118,3 +118,9 @@ def test_emergency_topic_stops_and_a_late_node_knows(ros_graph: RosGraph) -> Non
     system.rest()
     late = ros_graph.add(SteeringNode, parameters={'use_sim_time': True})
     system.until(lambda: late.diagnose().status.system is Mode.STOPPED, 'the state')
+    late.stop()
+    assert system.call('plant/clear_stop').success
+    assert system.call('plant/pause', data=True).success
+    system.agree(Mode.PAUSED)
+    assert late.trigger_activate()
+    system.until(lambda: late._loop._obeyed is Mode.PAUSED, 'the pause')
