@@ -10,14 +10,13 @@ from typing import Final
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
-from needle_controller.laws.axis import Axis
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.response_monitor import ResponseMonitor, StallMonitor
+from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
@@ -77,8 +76,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
         self.controller = controller
-        axis = Axis.insertion(controller.parameters)
-        self._following = ResponseMonitor(StallMonitor(axis, 0.5 * controller.settings.jump))
+        self._following = ResponseMonitor(controller.parameters, 0.5 * controller.settings.jump)
         self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
         self._robot = robot
         noise = {} if observed is None else observed.sensor_noise
@@ -105,6 +103,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if self.controller is not None:
             self.controller.change(parameters, law=law, gains=gains)
             self.bending.model = NeedleModel(parameters)
+            self._following.change(parameters)
 
     @property
     def watch_period(self) -> float:

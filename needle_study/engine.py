@@ -40,6 +40,9 @@ _GROUP: Final = 2**13
 # The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
 
+#: Bytes that are read at once.
+_BLOCK: Final = 2**20
+
 #: Name of a part: first sample, end, and checksum.
 _PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
 
@@ -92,7 +95,12 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
 
 
 def _checksum(first: int, end: int, path: Path) -> str:
-    return f'{crc32(path.read_bytes(), crc32(f"{first} {end}".encode())):08x}'
+    """Return the checksum of a range of samples and of a file, read in blocks."""
+    value = crc32(f'{first} {end}'.encode())
+    with path.open('rb') as file:
+        while block := file.read(_BLOCK):
+            value = crc32(block, value)
+    return f'{value:08x}'
 
 
 class _Part(NamedTuple):

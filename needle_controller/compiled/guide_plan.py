@@ -1,7 +1,7 @@
 """
 Reachable set of the tip, and the next position of the guide.
 
-The distributions of the tip by hypothesis are those of `needle_controller.compiled.hypotheses`.
+`needle_controller.compiled.hypotheses` has the distributions of the tip by hypothesis.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 _DEVIATION, _MOTION = 1e-5, 1e-2
 
 #: Distance from the target that counts as a hit [m].
-_HIT: Final = 1e-3
+HIT: Final = 1e-3
 
 
 class FinalTip(NamedTuple):
@@ -131,9 +131,9 @@ def hit_probability(boxed: Boxed[Steering]) -> float:
         x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
         for a in range(len(_WEIGHTS)):
             off = errors[i] * _ABSCISSAS[a]
-            if abs(x + off) <= _HIT + sizes[i].real:
+            if abs(x + off) <= HIT + sizes[i].real:
                 along_x += w[i] * _WEIGHTS[a]
-            if abs(z + off) <= _HIT + sizes[i].imag:
+            if abs(z + off) <= HIT + sizes[i].imag:
                 along_z += w[i] * _WEIGHTS[a]
     return along_x * along_z
 

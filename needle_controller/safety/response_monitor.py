@@ -6,6 +6,7 @@ from math import isnan
 from typing import Final, NamedTuple
 
 from needle_controller.laws.axis import Axis
+from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 
 #: Time without response after which the plant does not follow [ns].
@@ -40,7 +41,7 @@ class StallMonitor:
     """
 
     def __init__(self, axis: Axis, most: float) -> None:
-        self._axis, self._most = axis, most
+        self.axis, self._most = axis, most
         self.forget()
 
     def forget(self) -> None:
@@ -58,7 +59,7 @@ class StallMonitor:
         """
         before, self._stamp = self._stamp, stamp
         factor = _RESTING if aim == self._aim else _STRONGER
-        axis, self._aim = self._axis, aim
+        axis, self._aim = self.axis, aim
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
         push = abs(force) - factor * axis.coulomb
         if not 0.0 < elapsed < _GAP or push <= 0.0 or self._expected * force < 0.0:
@@ -89,12 +90,17 @@ class ResponseMonitor:
     A plant does not follow if it reports almost no force while a force is commanded, and the
     needle rests while its reference moves. It follows again as soon as one of these conditions
     ends. A robot that reports no force is not checked. ``lost`` is whether the plant does not
-    follow. ``fault`` is the fault of the stall monitor.
+    follow. ``fault`` is the fault of the stall monitor, see `StallMonitor` for
+    ``most``.
     """
 
-    def __init__(self, stall: StallMonitor) -> None:
-        self._stall = stall
+    def __init__(self, parameters: NeedleParameters, most: float) -> None:
+        self._stall = StallMonitor(Axis.insertion(parameters), most)
         self.forget()
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """Continue with another nominal friction."""
+        self._stall.axis = Axis.insertion(parameters)
 
     def forget(self) -> None:
         """Reset to a plant that follows."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import InsertionStrategy
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
@@ -14,9 +12,6 @@ from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-
-#: Time over which the insertion speed is measured [s].
-_SPAN: Final = 0.05
 
 
 class ContinuousInsertion(InsertionStrategy):
@@ -38,9 +33,8 @@ class ContinuousInsertion(InsertionStrategy):
         self._between = np.zeros((2, 2))
         #: Time of the last guide motion [ns].
         self._sent = 0
-        #: An earlier stamp [ns] and insertion depth [m], and insertion speed [m/s].
-        self._before: tuple[int, float] | None = None
-        self._speed = 0.0
+        #: Whether the needle has begun to move.
+        self._moved = False
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         """Begin the insertion to the last depth."""
@@ -68,13 +62,9 @@ class ContinuousInsertion(InsertionStrategy):
             return self._wait(stamp, now)
         motions, depths, settings = self._motions, self.law.depths, self._settings
         depth, last = float(motions.at[0]), self.law.steps
-        if self._before is None:
-            if depth < depths[0] + STILL:
-                return None
-            self._before = stamp, depth
-        since = (stamp - self._before[0]) / NANOSECONDS
-        if since >= _SPAN:
-            self._speed, self._before = (depth - self._before[1]) / since, (stamp, depth)
+        self._moved |= depth >= depths[0] + STILL
+        if not self._moved:
+            return None
         while self._passed < last - 1 and depth >= depths[self._passed + 1]:
             self._passed += 1
             self._pass()
@@ -93,9 +83,9 @@ class ContinuousInsertion(InsertionStrategy):
         self._sent = stamp
         low, high = depths[self._passed : self._passed + 2].tolist()
         begin, end = self._between
-        part = min(max((depth + self._speed * interval - low) / (high - low), 0.0), 1.0)
+        part = min(max((depth + motions.velocity * interval - low) / (high - low), 0.0), 1.0)
         way = end - begin
-        rate = way * self._speed / (high - low)
+        rate = way * motions.velocity / (high - low)
         move = motions.guide_to(begin + part * way, rate, interval, now)
         motions.monitor.stream(move)
         return move
@@ -136,8 +126,8 @@ class ContinuousInsertion(InsertionStrategy):
         if self.phase is not Phase.INSERTING:
             return super().tip(stamp, tip, now)
         # Insertion depth at the time of the reading.
-        depths = self.law.depths
-        depth = float(self._motions.at[0]) - self._speed * (now - stamp) / NANOSECONDS
+        depths, motions = self.law.depths, self._motions
+        depth = float(motions.at[0]) - motions.velocity * (now - stamp) / NANOSECONDS
         at = int(np.searchsorted(depths, depth))
         if 0 < at < len(depths):
             look = self._passing.setdefault(at, TipMeasurements())

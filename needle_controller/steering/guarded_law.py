@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from math import isfinite, sqrt
 from typing import Final
 
+from needle_controller.compiled.guide_plan import HIT
 from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
 from needle_controller.steering.law import (
     GuideSetpoint,
+    NORMAL,
     SteeringFaultError,
     SteeringLaw,
     TipEstimate,
@@ -23,9 +25,6 @@ import numpy as np
 
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
-
-#: Distance of the tip from the target that is a hit [m], and quantile of a 95 % interval.
-_HIT, _QUANTILE = 1e-3, 1.96
 
 
 class GuardedLaw:
@@ -177,7 +176,7 @@ class GuardedLaw:
         if seen is None:
             return 'the needle is at the target depth; its tip is not measured', Severity.WARNING
         # The law estimates x and z from all measurements.
-        tip, half = seen.tip.copy(), np.full(3, _QUANTILE * max(seen.error, self._noise))
+        tip, half = seen.tip.copy(), np.full(3, NORMAL * max(seen.error, self._noise))
         if there is not None:
             tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
         x, z = np.asarray(self.law.target)
@@ -187,7 +186,7 @@ class GuardedLaw:
             for axis, center, width in zip('xyz', tip, half, strict=True)
         )
         line = f'the tip is at {words} (95 %), {1e3 * miss:.2f} mm from the target'
-        return line, Severity.INFO if miss <= _HIT else Severity.WARNING
+        return line, Severity.INFO if miss <= HIT else Severity.WARNING
 
 
 @contextmanager

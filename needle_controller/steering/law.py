@@ -31,7 +31,7 @@ DEFAULT_LAW: Final = 'multi_hypothesis'
 
 
 #: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
-_NORMAL, _CHI_SQUARED = 1.96, 5.991
+NORMAL, _CHI_SQUARED = 1.96, 5.991
 
 
 class SteeringFaultError(JobError):
@@ -48,7 +48,7 @@ class TipEstimate:
     @property
     def half_width(self) -> FloatArray:
         """Half width of the 95 % intervals of x and z [m], shape (2,)."""
-        return np.asarray(_NORMAL * np.sqrt(np.diag(self.covariance)))
+        return np.asarray(NORMAL * np.sqrt(np.diag(self.covariance)))
 
     def contains(self, tip: FloatArray) -> bool:
         """

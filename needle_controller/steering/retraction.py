@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_ros.requests import REPEAT_AFTER
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-
-#: Time from one guide motion to the next [s].
-_INTERVAL: Final = 0.05
 
 
 class Retraction:
@@ -47,13 +42,14 @@ class Retraction:
                 return motions.withdraw(self._end, now)
         elif np.abs(guide).max() <= settings.guide_tolerance:
             self.done = True
-        if self.done or now - self._guided < _INTERVAL * NANOSECONDS:
+        interval = 1.0 / settings.rate
+        if self.done or now - self._guided < interval * NANOSECONDS:
             return None
         self._guided = now
         # At the end of the guide motion.
-        rest += motions.velocity * _INTERVAL
+        rest += motions.velocity * interval
         part = min(max(rest / begin, 0.0), 1.0) if begin > settings.depth_tolerance else 0.0
-        return motions.guide_toward(part * self._begin[1:3], _INTERVAL, now)
+        return motions.guide_toward(part * self._begin[1:3], interval, now)
 
     def _is_due(self, depth: float, now: int) -> bool:
         """Return whether the withdrawal must be sent: first, or again to a needle at rest."""

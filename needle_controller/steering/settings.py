@@ -41,7 +41,13 @@ class ExecutiveSettings(SteeringLimits):
         False, 'the needle is inserted without rests, and the guide follows its depth; else it '
         'rests at the end of each step',
     )  # fmt: skip
-    rate: float = constant(20.0, 'Hz', 'continuous: rate of guide commands', low=1.0, high=50.0)
+    rate: float = constant(
+        20.0,
+        'Hz',
+        'rate of guide commands, if continuous and during a retraction',
+        low=1.0,
+        high=50.0,
+    )
     settle_time: float = constant(0.1, 's', 'time at rest before a tip measurement')
     look_time: float = constant(
         0.5, 's', 'duration of a tip measurement, whose readings are averaged', open_low=True

@@ -32,7 +32,7 @@ def insert_causes(
     ``ei`` is the bending stiffness [N m^2], ``skin`` the stiffness of the skin [N/m], ``free`` the
     free length between guide and skin [m]. ``depths``, shape (k,), are the insertion depths from 0
     [m]: an increase cuts an element, a repeated depth is at rest; ``stiffness``, shape (k,), is
-    that of the tissue along the element that ends at each depth [N/m^2]. By cause: ``tilts`` of
+    the tissue stiffness along the element that ends at each depth [N/m^2]. By cause: ``tilts`` of
     the guide, shape (m,); ``guides`` and ``loads``, shape (k, m), position of the guide [m] and
     lateral load on the tip [N] at each depth. Outputs, shape (k, m): ``tips``, deflection of the
     tip [m], and ``forces`` of the needle on the guide [N].

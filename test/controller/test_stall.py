@@ -59,4 +59,5 @@ def test_other_friction_is_no_stall(law: str, factor: float) -> None:
     for _ in range(1600):
         loop.step()
     assert loop.supervisor.authority.reason == ''
-    assert loop.depth == pytest.approx(0.05, abs=1e-3)
+    # Dry friction holds the needle where the law has less force; a tenth of the stall limit.
+    assert loop.depth == pytest.approx(0.05, abs=1e-4)

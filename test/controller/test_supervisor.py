@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import inf, isfinite, nan
 from typing import Any
 
@@ -20,7 +20,7 @@ from needle_controller.supervisor import Supervisor
 from needle_controller.waiting_request import JointPath
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
+from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
@@ -497,6 +497,46 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
         loop.measure()
     assert loop.supervisor.controller is not None
     assert loop.supervisor.controller.target == 0.01
+
+
+def test_clearance_of_another_node_does_not_end_a_violation() -> None:
+    """The limit stops the system again, also a retraction; below the limit the stop ends."""
+    loop, other = Loop(), Authority('/steering')
+    loop.measure()
+    loop.request(RETRACT)
+    for axial in (50.0, 50.0, 50.0):
+        loop.measure()
+        loop.wrench(axial)
+    authority = loop.supervisor.authority
+    assert 'axial force 50 N' in authority.reason
+    other.receive(authority.state)
+    assert other.request(CLEAR_STOP)[0]
+    authority.receive(other.state)
+    loop.supervisor.obey(loop.now)
+    assert 'axial force 50 N' in authority.reason
+    assert loop.measure() == ForceCommand(loop.now)
+    loop.wrench(0.0)
+    loop.clear()
+    assert authority.reason == ''
+
+
+def test_live_friction_changes_the_expected_motion() -> None:
+    """A needle that does not move is blocked with this friction, not with twenty times it."""
+    for factor, stops in ((1.0, True), (20.0, False)):
+        loop = Loop()
+        controller = loop.supervisor.controller
+        loop.supervisor.change(
+            replace(
+                PHANTOM,
+                coulomb_friction=factor * PHANTOM.coulomb_friction,
+                viscous_friction=factor * PHANTOM.viscous_friction,
+            ),
+            controller.law,
+            {},
+        )
+        for _ in range(300):
+            loop.measure()
+        assert bool(loop.supervisor.authority.reason) == stops
 
 
 def test_repeated_retraction_withdraws_a_needle_that_was_moved() -> None:

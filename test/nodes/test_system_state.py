@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from needle_controller.controller_node import ControllerNode
+from needle_controller.steering.motion_control import STILL
 from needle_controller.steering_node import SteeringNode
 from needle_ros.base_node import COMMAND
 from needle_ros.system_state import Mode
 from nodes.test_steering import Bench
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
@@ -100,7 +102,8 @@ def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> 
     other = NODES[NODES.index(asked) - 1]
     assert system.call(f'{other}/clear_stop').success
     system.agree(Mode.RUNNING)
-    assert system.rest() == pytest.approx(depth, abs=1e-4)
+    # Without force the bent needle relaxes by less than what counts as rest.
+    assert system.rest() == pytest.approx(depth, abs=STILL)
     assert system.call(f'{other}/retract').success
     system.until(lambda: abs(system.at('insertion') - 0.01) < 5e-4, 'the retract depth')
     system.until(lambda: abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4, 'the guide')
@@ -122,5 +125,5 @@ def test_emergency_topic_stops_and_a_late_node_knows(ros_graph: RosGraph) -> Non
     assert system.call('plant/clear_stop').success
     assert system.call('plant/pause', data=True).success
     system.agree(Mode.PAUSED)
-    assert late.trigger_activate()
+    assert late.trigger_activate() == TransitionCallbackReturn.SUCCESS
     system.until(lambda: late._loop._obeyed is Mode.PAUSED, 'the pause')

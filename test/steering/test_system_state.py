@@ -170,7 +170,9 @@ def test_retraction_is_paused_and_resumed(continuous: bool) -> None:
     assert held[0] > 0.015
     assert robot.request(RESUME)
     robot.tick(1500)
-    assert robot.at == pytest.approx([SETTINGS.retract_depth, 0.0, 0.0], abs=3e-4)
+    assert robot.at == pytest.approx(
+        [SETTINGS.retract_depth, 0.0, 0.0], abs=SETTINGS.depth_tolerance
+    )
 
 
 def test_insertion_after_a_retraction_hits_its_target() -> None:
@@ -205,7 +207,7 @@ def test_stop_of_a_retraction_ends_it() -> None:
     assert robot.request(CLEAR_STOP)
     assert robot.request(RETRACT)
     robot.tick(1500)
-    assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=3e-4)
+    assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=SETTINGS.depth_tolerance)
 
 
 def test_pause_during_planning_holds_the_start() -> None:
