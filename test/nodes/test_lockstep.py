@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby
 from math import inf
 import os
@@ -14,9 +15,17 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from needle_controller import ContinuousInverseDynamics
-from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
-from needle_identification import Bag, deserialize, encode
+from needle_controller import (
+    ContinuousInverseDynamics,
+    ExecutiveSettings,
+    SteeringModel,
+    SteeringPrior,
+)
+from needle_controller.steering.law import build_law, DEFAULT_LAW
+from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.simulation import sample_truth, simulate_steering, step_depths
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, STEERING_PRESETS
+from needle_identification import Bag, deserialize, encode, read_topic
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import RunSample, SimulatedRun
@@ -46,6 +55,9 @@ BREAKAWAY = 1e-8
 
 #: QoS of a slow subscriber.
 EVERY = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+#: Insertion depth at the start of a steered insertion [m].
+DEPTH = 5e-3
 
 #: Streams of a run; /diagnostics depends on the machine.
 DATA = {
@@ -311,8 +323,13 @@ def busy(number: int) -> Iterator[None]:
             process.wait()
 
 
-def steer(folder: Path) -> Path:
-    """Steer a needle by two steps; return the bag."""
+def steer(
+    folder: Path,
+    target: tuple[float, float, float] = (1e-3, 0.015, 0.0),
+    steering: dict[str, Any] | None = None,
+    plant: dict[str, Any] | None = None,
+) -> Path:
+    """Steer a needle by nodes, by default in two steps; return the bag."""
     bag, common = folder / 'bag', {'model.preset': 'bending_35mm'}
     end = inf
     with Graph(folder / 'logs') as graph:
@@ -324,22 +341,23 @@ def steer(folder: Path) -> Path:
             assert isinstance(status, SteeringStatus)
             if end == inf and status.phase is SteeringPhase.DONE:
                 end = sample.time + 0.5
-            assert status.phase is not SteeringPhase.STOPPED
-            assert sample.time < 30.0
+            assert status.phase is not SteeringPhase.STOPPED, status.fault
+            assert sample.time < 60.0
             return sample.time < end
 
         nodes: dict[str, dict[str, Any]] = {
-            'steering': {**common, 'speed': 0.02, 'look_time': 0.2},
+            'steering': {**common, 'speed': 0.02, 'look_time': 0.2, **(steering or {})},
             'controller': {
                 **common, 'rate': RATE, 'steered': True, 'deflection_feedback': 'none',
                 'reference.speed': 0.02, 'reference.acceleration': 0.5,
             },
             'plant': {
-                **common, 'rate': RATE, 'steered': True, 'depth': 5e-3, 'tip.rate': 40.0,
+                **common, 'rate': RATE, 'steered': True, 'depth': DEPTH, 'tip.rate': 40.0,
                 'tip.noise': 1.8e-4, 'tip.delay': 0.02, 'steering.cutting_force': [1.0],
+                **(plant or {}),
             },
         }  # fmt: skip
-        run.insert(bag, nodes, 5e-3, (1e-3, 0.015, 0.0), proceeds)
+        run.insert(bag, nodes, DEPTH, target, proceeds)
     return bag
 
 
@@ -352,3 +370,50 @@ def test_steered_run_is_identical_on_a_busy_machine(tmp_path: Path) -> None:
     assert set(one) == DATA
     assert len(one['/joint_states']) == round(2.5 * RATE)
     assert one == two
+
+
+@pytest.mark.parametrize('seed', [3, 4])
+def test_nodes_end_at_the_tip_of_the_simulated_loop(tmp_path: Path, seed: int) -> None:
+    """
+    The nodes steer a needle as `simulate_steering` does, which `needle steer` and studies use.
+
+    Path and sensor have almost no noise: the two draw it in their own order. The guide of the plant
+    has no tilt.
+    """
+    target, prior, path_noise = (2e-3, 0.06, -1e-3), SteeringPrior(), 1e-12
+    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    drawn = sample_truth(needle, steering, prior, np.random.default_rng(seed), seed)
+    bevel = float(np.hypot(*drawn.bevel))
+    truth = replace(
+        drawn,
+        steering=replace(drawn.steering, path_noise=path_noise),
+        tilt=(0.0, 0.0),
+        frame=np.zeros(2),
+        bevel=np.array([0.0, bevel]),
+    )
+    depths = DEPTH + step_depths(target[1] - DEPTH, STEP_LENGTH)
+    tips = []
+    for law in (DEFAULT_LAW, 'open_loop'):
+        plant = truth.plant(depths)
+        plant.needle.move(depth=DEPTH)
+        model = SteeringModel(needle, steering, depths, prior)
+        built = build_law(law, model, np.array(target)[[0, 2]], ExecutiveSettings().limits(0.005))
+        simulate_steering(built, plant, lambda tip: tip)
+        tips.append(plant.tip)
+    bag = steer(
+        tmp_path,
+        target,
+        None,
+        {
+            'model.tissue_stiffness': truth.needle.tissue_stiffness,
+            'steering.skin_stiffness': truth.steering.skin_stiffness,
+            'steering.bevel_load': [bevel],
+            'steering.path_noise': path_noise,
+            'tip.noise': 1e-8,
+        },
+    )
+    _, message = read_topic(bag, '/ground_truth')[-1]
+    tip = message.position[1:3]
+    assert np.hypot(*(tips[1] - tips[0])) > 5e-4
+    # The depth at rest is exact within 0.05 mm, and the path has a slope of at most 0.1.
+    np.testing.assert_allclose(tip, tips[0], rtol=0.0, atol=5e-6)
