@@ -38,4 +38,4 @@ def test_every_job_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_control, '_ROUNDS', 1)
     [section], bars = bench_control.compare(lambda _stage: None)
     assert [row[0] for row in section.rows] == list(bench_control.jobs())
-    assert [bar.limit for bar in bars] == 3 * [20.0]
+    assert [bar.limit for bar in bars] == 3 * [bench_control.BUDGET]
