@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_study needle_insertion reproduction benchmarks examples test description launch docs tools setup.py
 
-.PHONY: demo test check docs format setup compiled lock bags results bench clean
+.PHONY: demo test check docs format setup compiled wheel lock bags results bench clean
 
 demo: setup
 	$(BIN)/needle demo
@@ -32,6 +32,11 @@ setup: compiled
 # Machine code for this processor; 1 s if it exists.
 compiled: $(VENV)/.complete
 	$(BIN)/needle compile
+
+# Wheel for the Python version of .venv, with machine code for x86-64-v3: its first start compiles nothing.
+wheel: setup
+	$(BIN)/needle compile --portable
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation -w dist .
 
 # The marker is written last: an interrupted setup restarts.
 $(VENV)/.complete: requirements.lock setup.py package.xml

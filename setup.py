@@ -4,7 +4,7 @@ from pathlib import Path
 import runpy
 import xml.etree.ElementTree as ET
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
 
 # colcon --symlink-install runs this file through a link, in a folder without README.md.
 ROOT = Path(__file__).resolve().parent
@@ -37,8 +37,20 @@ def files(folder: str, pattern: str) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob(pattern))]
 
 
+#: Functions compiled for a processor level by `make wheel`.
+COMPILED = files('needle_dynamics', 'compiled/__pycache__/*.v3.nbc')
+
+
+class Compiled(Distribution):
+    """Distribution for one Python version and platform if it contains machine code."""
+
+    def has_ext_modules(self) -> bool:
+        return bool(COMPILED)
+
+
 setup(
     name=NAME,
+    distclass=Compiled,
     version=MANIFEST.findtext('version'),
     description=MANIFEST.findtext('description'),
     license=MANIFEST.findtext('license'),
@@ -51,6 +63,7 @@ setup(
     package_data={
         '': ['py.typed'],
         'needle_ros': ['*.xml'],
+        'needle_dynamics.compiled': ['__pycache__/*.v3.nbc'],
         'needle_insertion.report': ['templates/*'],
         'reproduction.claims': ['*.yaml'],
         'needle_insertion.watch': ['page/*'],

@@ -4,7 +4,8 @@ Machine code on disk: one file for each function and signature.
 The name of a file contains a digest of all inputs of its machine code: sources, signature,
 processor, and versions of Python and Numba. An entry is therefore never outdated, and several
 processes, users and machines can share a folder. A file is written under a temporary name and
-renamed; a damaged file is ignored.
+renamed; a damaged file is ignored. A processor with the instructions of `PORTABLE` also uses
+entries for that level, which a wheel contains.
 
 Entries are read from the folder of this package, which may be read-only, and from the cache folder
 of the user. New entries are written to the first writable folder of the two.
@@ -33,8 +34,15 @@ _FOLDER: Final = Path(__file__).parent
 #: Environment variable of Numba with a folder that replaces both.
 FOLDER_VARIABLE: Final = 'NUMBA_CACHE_DIR'
 
-#: Suffix of an entry.
+#: Suffix of an entry, and of an entry for the processor level `PORTABLE`.
 SUFFIX: Final = '.nbc'
+PORTABLE_SUFFIX: Final = '.v3.nbc'
+
+#: Environment of a process that compiles for a processor level, and the features of this level.
+PORTABLE: Final = {'NUMBA_CPU_NAME': 'x86-64-v3', 'NUMBA_CPU_FEATURES': '+avx2,+bmi2,+fma'}
+_FEATURES: Final = frozenset(
+    '+avx +avx2 +bmi +bmi2 +cx16 +f16c +fma +lzcnt +movbe +popcnt +sahf +sse4.2 +xsave'.split()
+)
 
 #: Longest wait for another process that compiles the same function, and polling period [s].
 _LONGEST, _CHECK = 120.0, 0.05
@@ -86,6 +94,14 @@ def _stamp(folder: Path) -> str:
     return digest.hexdigest()
 
 
+@cache
+def _is_portable() -> bool:
+    """Return whether this processor executes code for `PORTABLE`."""
+    from numba.core.codegen import get_host_cpu_features
+
+    return _FEATURES <= {*get_host_cpu_features().split(',')}
+
+
 @contextmanager
 def preparing() -> Iterator[None]:
     """Mark functions that this thread loads or compiles as prepared."""
@@ -122,20 +138,21 @@ class Store:
 
     def has(self, signature: Any, target_context: Any) -> bool:
         """Return whether a folder contains an entry for a signature on a target."""
-        name = self._file_name(signature, target_context.codegen())
-        return any((folder / name).is_file() for folder in folders())
+        names = self._file_names(signature, target_context.codegen())
+        return any((folder / name).is_file() for folder in folders() for name in names)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Load the machine code for a signature; None if Numba must compile the function."""
         target_context.refresh()
-        name = self._file_name(signature, target_context.codegen())
-        found, folder = self._read(name, signature, target_context), writable_folder()
+        names = self._file_names(signature, target_context.codegen())
+        name = names[0]
+        found, folder = self._read(names, signature, target_context), writable_folder()
         if found is None and folder is not None:
             # Another process may be compiling it: wait for the result.
             deadline = monotonic() + _LONGEST
             while not _lock(folder, name) and monotonic() < deadline:
                 sleep(_CHECK)
-            found = self._read(name, signature, target_context)
+            found = self._read(names, signature, target_context)
             if found is not None:
                 _unlock(folder, name)
         for listener in tuple(LISTENERS):
@@ -147,7 +164,7 @@ class Store:
         folder = writable_folder()
         if folder is None:
             return
-        name = self._file_name(signature, result.codegen)
+        name = self._file_names(signature, result.codegen)[0]
         try:
             if not any(one.can_cache for one in result.lifted) and (
                 not result.library.has_dynamic_globals
@@ -158,24 +175,30 @@ class Store:
         finally:
             _unlock(folder, name)
 
-    def _file_name(self, signature: Any, codegen: Any) -> str:
-        """Return the file name of the entry for a signature on this processor."""
+    def _file_names(self, signature: Any, codegen: Any) -> list[str]:
+        """Return the file names of entries for a signature; the first one is written."""
         from numba import __version__
         from numba.core.sigutils import normalize_signature
 
         arguments, _ = normalize_signature(signature)
-        parts = [*self._fixed, str(arguments), codegen.magic_tuple(), __version__, sys.version]
-        digest = sha256(repr(parts).encode()).hexdigest()
-        return f'{self._name}-{self._stamp[:8]}-{digest[:24]}{SUFFIX}'
+        triple, *target = codegen.magic_tuple()
+        portable = [*PORTABLE.values()]
+        names = []
+        for one in (target, portable) if target != portable and _is_portable() else (target,):
+            parts = [*self._fixed, str(arguments), triple, one, __version__, sys.version_info[:2]]
+            digest = sha256(repr(parts).encode()).hexdigest()
+            suffix = PORTABLE_SUFFIX if one == portable else SUFFIX
+            names.append(f'{self._name}-{self._stamp[:8]}-{digest[:24]}{suffix}')
+        return names
 
     @staticmethod
-    def _read(name: str, signature: Any, target_context: Any) -> Any:
+    def _read(names: list[str], signature: Any, target_context: Any) -> Any:
         from numba.core.compiler import CompileResult
         from numba.core.sigutils import normalize_signature
 
-        for folder in folders():
+        for path in (folder / name for folder in folders() for name in names):
             try:
-                content = (folder / name).read_bytes()
+                content = path.read_bytes()
             except OSError:
                 continue
             data = content[_DIGEST:]

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from needle_insertion.commands.common import Subcommand
 
 
-def _add_arguments(_parser: argparse.ArgumentParser) -> None:
-    """Add no options."""
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--portable',
+        action='store_true',
+        help='compile for every processor of the level x86-64-v3, for a wheel',
+    )
 
 
-def _run(_options: argparse.Namespace) -> int:
+def _run(options: argparse.Namespace) -> int:
     """Compile all kernels; return 1 if no folder is writable."""
+    from needle_dynamics.compiled.store import PORTABLE, writable_folder
+
+    if options.portable:
+        # Numba reads these when it is imported.
+        os.environ.update(PORTABLE)
     from needle_dynamics.compiled.cache import kernels, where_kept
-    from needle_dynamics.compiled.store import writable_folder
     from needle_insertion.compilation import compile_kernels, MODULES
 
     if compile_kernels() and writable_folder() is None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from needle_dynamics.compiled import store
 from needle_dynamics.compiled.cache import kernels
 from needle_dynamics.compiled.store import SUFFIX
 from needle_insertion.compilation import MODULES
@@ -177,6 +178,18 @@ def test_other_processors_and_versions_have_separate_cache_files(toy: Path) -> N
     assert run(toy, '0.0.1')[0] == [4.0, 6.0, 2.0]
     assert run(toy, NUMBA_CPU_NAME='x86-64', NUMBA_CPU_FEATURES='')[0] == [4.0, 6.0, 0.0]
     assert run(toy)[0] == [4.0, 6.0, 0.0]
+
+
+def test_code_for_the_processor_level_needs_no_compilation(toy: Path) -> None:
+    """A wheel contains it. A process that compiles for the level does not use other code."""
+    if not store._is_portable():
+        pytest.skip('this processor is below x86-64-v3')
+    run(toy)
+    assert run(toy, **store.PORTABLE)[0] == [4.0, 6.0, 2.0]
+    for path in {*entries(toy)} - {*toy.rglob(f'*{store.PORTABLE_SUFFIX}')}:
+        path.unlink()
+    make_read_only(toy)
+    assert run(toy) == ([4.0, 6.0, 0.0], '')
 
 
 def make_read_only(folder: Path) -> None:
