@@ -40,9 +40,10 @@ PORTABLE_SUFFIX: Final = '.v3.nbc'
 
 #: Environment of a process that compiles for a processor level, and the features of this level.
 PORTABLE: Final = {'NUMBA_CPU_NAME': 'x86-64-v3', 'NUMBA_CPU_FEATURES': '+avx2,+bmi2,+fma'}
-_FEATURES: Final = frozenset(
-    '+avx +avx2 +bmi +bmi2 +cx16 +f16c +fma +lzcnt +movbe +popcnt +sahf +sse4.2 +xsave'.split()
-)
+_FEATURES: Final = {
+    '+avx', '+avx2', '+bmi', '+bmi2', '+cx16', '+f16c', '+fma', '+lzcnt', '+movbe', '+popcnt',
+    '+sahf', '+sse4.2', '+xsave',
+}  # fmt: skip
 
 #: Longest wait for another process that compiles the same function, and polling period [s].
 _LONGEST, _CHECK = 120.0, 0.05
@@ -99,7 +100,7 @@ def _is_portable() -> bool:
     """Return whether this processor executes code for `PORTABLE`."""
     from numba.core.codegen import get_host_cpu_features
 
-    return _FEATURES <= {*get_host_cpu_features().split(',')}
+    return {*get_host_cpu_features().split(',')} >= _FEATURES
 
 
 @contextmanager
