@@ -363,12 +363,7 @@ class Integrator:
 
 
 def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:
-    """
-    Return the exception for a motion with ``left`` seconds remaining (NaN: not finite).
-
-    It is an `InsertionDepthError` if the needle would leave its range; ``state`` is the last valid
-    state.
-    """
+    """Return the error of a motion with ``left`` [s] remaining: outside the range, not finite."""
     if isnan(left):
         return NeedleError('the motion is not finite: constants, state or inputs are badly scaled')
     p, far = model.parameters, model.compiled.maximum_depth

@@ -14,8 +14,7 @@ from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Default step along the axis [s].
-DEFAULT_AXIS_STEP = 1e-4
+DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
 
 
 def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConstants:
