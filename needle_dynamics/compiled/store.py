@@ -33,8 +33,7 @@ _FOLDER: Final = Path(__file__).parent
 #: Environment variable of Numba with a folder that replaces both.
 FOLDER_VARIABLE: Final = 'NUMBA_CACHE_DIR'
 
-#: Suffix of an entry.
-SUFFIX: Final = '.nbc'
+SUFFIX: Final = '.nbc'  #: suffix of an entry
 
 #: Longest wait for another process that compiles the same function, and polling period [s].
 _LONGEST, _CHECK = 120.0, 0.05
