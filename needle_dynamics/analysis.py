@@ -160,10 +160,8 @@ class Analysis:
 
     Attributes
     ----------
-    state : Structure
-        State controllability.
-    observed : Structure
-        Observability from the tip deflection.
+    state, observed : Structure
+        State controllability; observability from the tip deflection.
     output_controllable : bool
         Whether the tip deflection is output controllable. With one output the matrix
         [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.

@@ -174,10 +174,8 @@ class NeedleStatics:
 
         Parameters
         ----------
-        depth : float
-            Insertion depth s [m].
-        time : float
-            Time [s], for swelling tissue.
+        depth, time : float
+            Insertion depth s [m]; time [s], for swelling tissue.
 
         Returns
         -------

@@ -167,10 +167,8 @@ class Insertion:
 
         Parameters
         ----------
-        duration : float
-            Time [s].
-        force : float
-            Insertion force [N], positive into the tissue.
+        duration, force : float
+            Time [s]; insertion force [N], positive into the tissue.
         speed_limit : float
             Speed limit of the pushing device [m/s]; a needle that would move faster is carried at
             this speed.
@@ -222,10 +220,8 @@ class Insertion:
 
         Parameters
         ----------
-        duration : float
-            Time [s].
-        velocity : float
-            Insertion velocity at the end [m/s].
+        duration, velocity : float
+            Time [s]; insertion velocity at the end [m/s].
         forces : ndarray, shape (parts,), optional
             Overwritten with the mean force over each of the equal parts of the duration [N].
         guide, tilt, roll, tissue : optional

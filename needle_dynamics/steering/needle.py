@@ -47,10 +47,8 @@ class NeedleShape(NamedTuple):
     ----------
     depths : ndarray, shape (k,)
         Distance y from the entry point [m], from the guide at -L0 to the tip.
-    deflections : ndarray, shape (k, 2)
-        Deflections in x and z [m].
-    slopes : ndarray, shape (k, 2)
-        Derivatives of the deflections in y.
+    deflections, slopes : ndarray, shape (k, 2)
+        Deflections in x and z [m]; derivatives of the deflections in y.
 
     """
 

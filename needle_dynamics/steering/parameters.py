@@ -96,10 +96,8 @@ def bending_length(stiffness: float, tissue: float) -> float:
 
     Parameters
     ----------
-    stiffness : float
-        Bending stiffness E I [N m^2].
-    tissue : float
-        Stiffness k of the tissue per length [N/m^2].
+    stiffness, tissue : float
+        Bending stiffness E I [N m^2]; stiffness k of the tissue per length [N/m^2].
 
     Returns
     -------
