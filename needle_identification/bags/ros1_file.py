@@ -22,7 +22,7 @@ from rosbags.typesys import get_typestore, Stores
 
 #: Size of an entry of the index; number of bytes in a chunk that count as a record.
 _ENTRY: Final = 12
-_RECORD: Final = 64
+_RECORD: Final = 128
 
 #: Exceptions of the library for damaged bytes.
 _DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)
@@ -89,7 +89,8 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
 
 def _messages(reader: Reader, budget: Budget) -> Iterator[tuple[int, int, bytes]]:
     """Yield connection, time and data of all messages; entries may share records."""
-    entries = merge(*reader.indexes.values())
+    # In the order of `messages`, also if a connection is listed twice.
+    entries = merge(*(reader.indexes[one.id] for one in reader.connections))
     for entry, (connection, when, data) in zip(entries, reader.messages(), strict=False):
         size = reader.current_chunk[1].tell() - entry.offset
         budget.spend(size, 1 + size // _RECORD)

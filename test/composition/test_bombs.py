@@ -35,7 +35,7 @@ JOINTS = 'sensor_msgs/msg/JointState'
 MEGABYTE = 2**20
 
 #: Memory limit for reading a small file [kB], and limit of its CPU time [s].
-MEMORY, PATIENCE = 1_000_000, 120.0
+MEMORY, PATIENCE = 1_000_000, 240.0
 
 #: Documents of a few lines that expand quadratically or worse.
 LAUGHS = 'a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol, lol]\n' + ''.join(
@@ -371,7 +371,7 @@ MANY = [
 ]
 
 #: Limit of CPU time for reading many small records twice, on a slow machine [s].
-DURATION = 60.0
+DURATION = 120.0
 
 
 @pytest.mark.parametrize('make', MANY)
