@@ -19,12 +19,7 @@ if TYPE_CHECKING:
     from needle_dynamics.linearization import linearize, LinearSystem, operating_point
     from needle_dynamics.model import NeedleModel
     from needle_dynamics.modes import mode_shapes, ModeShapes
-    from needle_dynamics.parameters import (
-        DEFAULT_PRESET,
-        FORMULATIONS,
-        NeedleParameters,
-        PRESETS,
-    )
+    from needle_dynamics.parameters import DEFAULT_PRESET, FORMULATIONS, NeedleParameters, PRESETS
     from needle_dynamics.simulated.batch import Batch, simulate_batch
     from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
     from needle_dynamics.simulated.indenter import Indenter, IndenterParameters

@@ -22,8 +22,7 @@ from needle_ros.errors import ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Relative tolerance of the rank decision, in natural units.
-RANK_TOLERANCE: Final = 1e-10
+RANK_TOLERANCE: Final = 1e-10  #: relative tolerance of the rank decision, in natural units
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +72,8 @@ def controllability(
     """
     Find the controllable states of (A, B), shapes (N, N) and (N, M), and the PBH distances.
 
-    The pair must be in units in which its entries are comparable, see `LinearSystem.scaled`. The
-    states in ``names`` are ``transform`` (N, N) times the states of the pair, the identity by
-    default; ``scaled_names`` names the states of the pair for `Structure.weakest`.
+    The units of the pair are those of `LinearSystem.scaled`; ``names`` are of its states times
+    ``transform`` (N, N), ``scaled_names`` of its states.
     """
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     order = len(names)
@@ -162,10 +160,8 @@ class Analysis:
 
     Attributes
     ----------
-    state : Structure
-        State controllability.
-    observed : Structure
-        Observability from the tip deflection.
+    state, observed : Structure
+        State controllability; observability from the tip deflection.
     output_controllable : bool
         Whether the tip deflection is output controllable. With one output the matrix
         [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
@@ -250,12 +246,7 @@ def controllability_map(
     force: float = 0.0,
     progress: Callable[[], object] | None = None,
 ) -> ControllabilityMap:
-    """
-    Analyze all pairs of insertion depths (I,) and tip deflections (J,) [m] at a velocity [m/s].
-
-    ``sliding`` is as in `linearize`, ``force`` is the insertion force [N]; ``progress`` is called
-    after each depth.
-    """
+    """Analyze all pairs of depths (I,) and deflections (J,) [m], with `progress` after a depth."""
     model = NeedleModel(parameters)
     depths, deflections = np.array(depths, dtype=float), np.array(deflections, dtype=float)
     for name, values in (('depths', depths), ('deflections', deflections)):

@@ -7,17 +7,10 @@ from typing import Annotated, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-#: NumPy array of doubles.
-FloatArray: TypeAlias = NDArray[np.float64]
-
-#: NumPy array of complex numbers.
-ComplexArray: TypeAlias = NDArray[np.complex128]
-
-#: NumPy array of Booleans.
-BoolArray: TypeAlias = NDArray[np.bool_]
-
-#: NumPy array of integers.
-IntArray: TypeAlias = NDArray[np.int64]
+FloatArray: TypeAlias = NDArray[np.float64]  #: NumPy array of doubles
+ComplexArray: TypeAlias = NDArray[np.complex128]  #: NumPy array of complex numbers
+BoolArray: TypeAlias = NDArray[np.bool_]  #: NumPy array of Booleans
+IntArray: TypeAlias = NDArray[np.int64]  #: NumPy array of integers
 
 
 class Shaped(NamedTuple):

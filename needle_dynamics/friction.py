@@ -29,10 +29,8 @@ class Friction:
         ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
         break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
         velocity; a needle at rest creeps.
-    coulomb : float
-        Coulomb friction mu_s [N].
-    viscous : float
-        Viscous friction mu_v [N s/m].
+    coulomb, viscous : float
+        Coulomb friction mu_s [N]; viscous friction mu_v [N s/m].
     withdrawal : float
         Ratio of friction on withdrawal to friction on insertion.
     breakaway : float

@@ -288,10 +288,8 @@ class NeedleModel(NeedleStatics):
         ----------
         state : array_like, shape (2 (2 + n),)
             State.
-        force : float
-            Insertion force f_y [N], positive into the tissue.
-        torque : float
-            Torque tau about x [N m].
+        force, torque : float
+            Insertion force f_y [N], positive into the tissue; torque tau about x [N m].
         time : float
             Time [s], for swelling tissue.
 

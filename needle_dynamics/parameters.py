@@ -306,5 +306,4 @@ PRESETS: Final[Mapping[str, NeedleParameters]] = {
     'phantom': replace(_PAPER_MM, tissue_damping=1.6),
 }
 
-#: Default preset of nodes and commands.
-DEFAULT_PRESET: Final = 'phantom'
+DEFAULT_PRESET: Final = 'phantom'  #: default preset of nodes and commands

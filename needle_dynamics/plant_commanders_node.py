@@ -13,12 +13,7 @@ from needle_ros.wire import Reading
 
 
 class PlantCommanders:
-    """
-    Subscribe to `wrench_command` and `joint_commands`, and count commands and publishers.
-
-    `on_change` is called when publishers appear or disappear; see `BaseNode.listen`. ``rate`` is
-    the rate of the commands.
-    """
+    """Subscribe to commands at a rate [Hz]; `on_change` is called when publishers come or go."""
 
     def __init__(
         self,
@@ -46,11 +41,7 @@ class PlantCommanders:
         return sum(self._count_matched()) != self._matched
 
     def update(self, new: int) -> bool:
-        """
-        Update the matched publishers after the appearance of ``new`` publishers.
-
-        Return whether there may have been several, if only while this process was blocked.
-        """
+        """Update the publishers; return whether there may have been several, if only briefly."""
         before, matched = self._matched, sum(self._count_matched())
         if matched != before:
             self._matched, self._matched_at = matched, monotonic_ns()

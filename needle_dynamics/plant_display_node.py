@@ -18,8 +18,7 @@ from visualization_msgs.msg import Marker
 _WIDTH: Final = 1e-3
 _PATH_WIDTH: Final = 5e-4
 
-#: Rate of the messages [Hz].
-_RATE: Final = 30.0
+_RATE: Final = 30.0  #: rate of the messages [Hz]
 
 
 def time_message(stamp: int) -> TimeMessage:

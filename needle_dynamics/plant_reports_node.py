@@ -15,11 +15,7 @@ from std_msgs.msg import Header
 
 
 class SampleReports:
-    """
-    Pass the reports to a clock; `advance` takes the samples that are due afterwards.
-
-    ``checks`` counts the successive checks at which the same sample has waited for its answers.
-    """
+    """Pass reports to a clock; ``checks`` counts the checks at which the same sample waited."""
 
     def __init__(self, node: BaseNode, advance: Callable[[], None]) -> None:
         self._node, self._advance = node, advance

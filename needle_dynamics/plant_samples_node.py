@@ -22,11 +22,7 @@ from rosgraph_msgs.msg import Clock
 
 
 class SamplePublishers:
-    """
-    Publishers of all measurements, with the fault of one of them, of the events and of the time.
-
-    ``rate`` is the rate of the samples, ``saturated`` counts saturated values of the force sensor.
-    """
+    """Publishers of all measurements, with a fault; ``saturated`` counts saturated forces."""
 
     def __init__(self, node: BaseNode) -> None:
         streams = (

@@ -19,11 +19,9 @@ from trajectory_msgs.msg import JointTrajectory
 
 class PlantTrajectories:
     """
-    Receive `joint_trajectory`, execute each request once and acknowledge it.
+    Receive `joint_trajectory`, execute each request once by `follow`, and acknowledge it.
 
-    `simulated` returns the simulated time [ns] while the plant is active, and `follow` executes
-    the content of a trajectory or raises ParameterError. `rejected` counts rejected requests.
-    While `stopped` is not empty, no request is executed.
+    `simulated` returns the simulated time [ns]. While `stopped` is not empty, none is executed.
     """
 
     def __init__(

@@ -24,8 +24,7 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Rounding tolerance of an insertion depth, relative to the needle length.
-ROUNDING: Final = 1e-12
+ROUNDING: Final = 1e-12  #: rounding tolerance of an insertion depth, relative to the needle length
 
 
 @dataclass(frozen=True)
@@ -175,10 +174,8 @@ class NeedleStatics:
 
         Parameters
         ----------
-        depth : float
-            Insertion depth s [m].
-        time : float
-            Time [s], for swelling tissue.
+        depth, time : float
+            Insertion depth s [m]; time [s], for swelling tissue.
 
         Returns
         -------

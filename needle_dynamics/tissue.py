@@ -111,10 +111,8 @@ class Tissue:
 
         Parameters
         ----------
-        depth : float
-            Distance y from the entry point [m].
-        time : float
-            Time [s].
+        depth, time : float
+            Distance y from the entry point [m]; time [s].
 
         Returns
         -------

@@ -40,22 +40,7 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
 def result_yaml(
     friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> str:
-    """
-    Return the text of a ROS parameter file with the identified parameters.
-
-    Examples
-    --------
-    >>> from needle_identification import identify_friction, read_friction_recording, summarize
-    >>> estimate = identify_friction(read_friction_recording('bags/friction_01'))
-    >>> text = result_yaml(summarize([estimate]))
-    >>> print(text.partition('/**/controller')[2])
-    :
-      ros__parameters:
-        model.coulomb_friction: 0.561...
-        model.viscous_friction: 238.18...
-    <BLANKLINE>
-
-    """
+    """Return the text of a ROS parameter file with the identified parameters."""
     found = [
         *(friction.statistics if friction else ()),
         *([stiffness.tissue_stiffness] if stiffness else ()),

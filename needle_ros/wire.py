@@ -89,7 +89,8 @@ class _Cursor:
         kind = int.from_bytes(message[:2], 'big')
         if len(message) < 4 or kind not in _WIDEST:
             raise MessageError(
-                f'begins with {message[:4].hex(" ") or "nothing"}, which is not CDR'
+                f'begins with {message[:4].hex(" ") or "nothing"}, which is not CDR '
+                '(00 00, 00 01) or XCDR2 (00 06, 00 07)'
             )
         self.message = bytearray(message)
         self.order = '<' if kind % 2 else '>'
@@ -118,6 +119,12 @@ class _Cursor:
             struct.pack_into(f'{self.order}I', self.message, begin, value)
         self.fixed.append((begin, begin + 4))
         return int(struct.unpack_from(f'{self.order}I', self.message, begin)[0])
+
+    def elements(self) -> int:
+        """Return the length of an array of strings or messages; XCDR2 has its size before it."""
+        if self._widest < 8:
+            self.count()
+        return self.count()
 
     def string(self) -> str:
         text = b'' if self._given is None else next(self._given).encode() + b'\0'
@@ -155,7 +162,9 @@ class Template:
         names: Sequence[str] = (),
         counts: Sequence[int] = (0, 0, 0),
     ) -> None:
-        self._walk(type_name, _Cursor(_HEAD, [frame, len(names), *names, *counts]))
+        fields = _FIELDS[type_name]
+        described = [len(names), *names, *counts] if fields.names else [''] * fields.strings
+        self._walk(type_name, _Cursor(_HEAD, [frame, *described]))
 
     @classmethod
     def of(cls, message: bytes, type_name: str) -> Template:
@@ -169,7 +178,7 @@ class Template:
         fields = _FIELDS[type_name]
         cursor.take(4, 2)
         self.frame = cursor.string()
-        names = range(cursor.count() if fields.names else 0)
+        names = range(cursor.elements() if fields.names else 0)
         self.names = tuple([cursor.string() for _ in names])
         for _ in range(fields.strings):
             cursor.string()
@@ -379,7 +388,7 @@ def read_line(message: bytes) -> tuple[str, NDArray[np.float64]]:
     # Number, kind and action; pose and scale; color and lifetime; whether it is locked.
     for size, number in ((4, 3), (8, 10), (4, 6), (1, 1)):
         cursor.take(size, number)
-    count = cursor.count()
+    count = cursor.elements()
     begin = cursor.take(8, 3 * count)
     points = np.frombuffer(message, f'{cursor.order}f8', 3 * count, begin)
     return name, points.reshape(count, 3).astype(np.float64)

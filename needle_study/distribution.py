@@ -52,8 +52,7 @@ KINDS: Final = {
     ),
 }
 
-#: Largest valid magnitude of a parameter.
-_LARGEST: Final = 1e100
+_LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
 
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
@@ -63,10 +62,8 @@ _CHOICE: Final = 'choice'
 class Distribution:
     """Distribution of one variable."""
 
-    #: One of `KINDS`, or ``choice``.
-    kind: str
-    #: Parameters of the kind, or equally probable values.
-    numbers: tuple[float, ...]
+    kind: str  #: one of `KINDS`, or ``choice``
+    numbers: tuple[float, ...]  #: parameters of the kind, or equally probable values
     #: Low and high end of a truncated distribution.
     within: tuple[float, float] = (-np.inf, np.inf)
 
@@ -102,12 +99,7 @@ def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
 
 
 def distribution(name: str, given: Any) -> Distribution:
-    """
-    Parse a distribution; `name` is for error messages.
-
-    `given` is a number, a constant, or a mapping such as ``{normal: [0, 0.02]}``, truncated by
-    ``within: [low, high]``. Raises `ParameterError` if it is not valid.
-    """
+    """Parse a distribution: a number, or a mapping as ``{normal: [0, 0.02], within: [0, 1]}``."""
     if _is_number(given):
         return Distribution(_CHOICE, (float(given),))
     if not isinstance(given, Mapping):

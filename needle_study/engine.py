@@ -34,14 +34,12 @@ from pyarrow import parquet
 _FIRST, _WANTED = 16, 1.0
 _LARGEST: Final = 2**13
 
-#: Rows per group of the table; the bytes of the table depend on it.
-_GROUP: Final = 2**13
+_GROUP: Final = 2**13  #: rows per group of the table; the bytes of the table depend on it
 
 # The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
 
-#: Bytes that are read at once.
-_BLOCK: Final = 2**20
+_BLOCK: Final = 2**20  #: bytes that are read at once
 
 #: Name of a part: first sample, end, and checksum.
 _PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
@@ -82,12 +80,7 @@ def _study(text: str) -> Study:
 
 
 def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:
-    """
-    Compute `count` samples of the study `text` of `order`, from `first` on, in any process.
-
-    Returns the duration [s] and the columns. Raises `JobError` if the package versions of this
-    process differ.
-    """
+    """Compute samples from `first` on of the text of `order`; return duration [s] and columns."""
     study = _study(text)
     begin = monotonic()
     columns = study.rows(first, count)
@@ -117,12 +110,7 @@ class _Part(NamedTuple):
 
 
 class Results:
-    """
-    The folder of a study; a folder of the same study is resumed.
-
-    Raises `ParameterError` if it has another study or other files, and `JobError` if its table is
-    damaged.
-    """
+    """Folder of a study; ParameterError for other content, JobError for a damaged table."""
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
@@ -154,11 +142,7 @@ class Results:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """
-        Lock the folder against other processes, and remove damaged parts.
-
-        Raises `JobError` if another process computes here, or the package versions differ.
-        """
+        """Lock the folder and remove damaged parts; JobError if locked or of another version."""
         _check_versions(self._begun()['versions'], f'the study in {self.folder}')
         self._parts.mkdir(exist_ok=True)
         with (self._parts / 'lock').open('w') as lock:
@@ -252,10 +236,7 @@ class Results:
                     if writer is None:
                         writer = stack.enter_context(
                             parquet.ParquetWriter(
-                                draft,
-                                one.schema,
-                                compression='zstd',
-                                use_dictionary=False,
+                                draft, one.schema, compression='zstd', use_dictionary=False
                             )
                         )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
@@ -276,12 +257,7 @@ def compute(
     workers: int,
     progress: Callable[[int], object],
 ) -> None:
-    """
-    Compute the missing samples; raise `JobError` if a sample cannot be computed or written.
-
-    `executor` returns a context with an executor that replaces lost workers. `progress` receives
-    the number of samples of each chunk that is written.
-    """
+    """Compute the missing samples with a context of an executor; JobError if one fails."""
     with results.alone():
         if todo := results.missing():
             with executor() as running:

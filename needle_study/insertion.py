@@ -44,20 +44,11 @@ from scipy.optimize import brentq
 
 OPEN_LOOP: Final = 'open loop'
 
-#: Control laws, and the open loop.
-CONTROLLERS: Final = (*LAWS, OPEN_LOOP)
-
-#: Largest speed of a needle at rest [m/s].
-_REST: Final = 1e-5
-
-#: Default limits of the guard.
-_LIMITS: Final = SafetyLimits()
-
-#: Most samples of an insertion.
-_MOST: Final = 1_000_000
-
-#: Open-loop insertions per batch, whose samples are all in memory.
-_AT_ONCE: Final = 16
+CONTROLLERS: Final = (*LAWS, OPEN_LOOP)  #: control laws, and the open loop
+_REST: Final = 1e-5  #: largest speed of a needle at rest [m/s]
+_LIMITS: Final = SafetyLimits()  #: default limits of the guard
+_MOST: Final = 1_000_000  #: most samples of an insertion
+_AT_ONCE: Final = 16  #: open-loop insertions per batch, whose samples are all in memory
 
 #: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
@@ -115,17 +106,13 @@ class InsertionStudy:
 class _Course(NamedTuple):
     """Trajectory of one insertion up to its end or stop."""
 
-    #: The true needle.
-    model: NeedleModel
-    #: States at the samples, shape (k + 1, 2 (2 + n)).
-    states: FloatArray
+    model: NeedleModel  #: the true needle
+    states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
     #: Command of each sample, and the force that acts from that sample on [N], shape (k,).
     commands: FloatArray
     forces: FloatArray
-    #: Encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2).
-    noise: FloatArray
-    #: Reference [m], shape (k + 1,); NaN without a reference.
-    goal: FloatArray
+    noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2)
+    goal: FloatArray  #: reference [m], shape (k + 1,); NaN without a reference
     #: As in `FIGURES`.
     stopped: float
     left: float
@@ -150,10 +137,9 @@ class InsertionProtocol:
     """
     Insert needles that differ from the nominal model to a depth.
 
-    `settings` holds ``needle``, a preset; nominal ``constants``; ``controller``, one of
-    `CONTROLLERS`, with its ``gains`` of insertion, which must be stable for the ``uncertainty``;
-    ``reference``, a key of `REFERENCES`; and the fields of `InsertionStudy`. Raises
-    `ParameterError` if a setting is not valid, or the gains are unstable.
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``controller`` of `CONTROLLERS`
+    with ``gains`` that are stable for the ``uncertainty``; ``reference`` of `REFERENCES`; and the
+    fields of `InsertionStudy`. Raises `ParameterError` if a setting is not valid.
     """
 
     figures = FIGURES

@@ -15,8 +15,7 @@ import numpy as np
 class Variable(NamedTuple):
     """A variable that may differ from sample to sample."""
 
-    #: Value if it is not in the population.
-    default: float
+    default: float  #: value if it is not in the population
     #: SI unit.
     unit: str
     meaning: str
@@ -37,28 +36,20 @@ class MeasuredRun(NamedTuple):
     """A message of a robot or a sensor in a replayed sample."""
 
     topic: Topic
-    #: [ns].
-    stamp: int
-    #: Numbers of `Topic.quantities`.
-    values: Sequence[float]
+    stamp: int  #: [ns]
+    values: Sequence[float]  #: numbers of `Topic.quantities`
 
 
 class Scenario(Interface):
     """Interface of a scenario, which is simulated with each sample."""
 
-    #: Variables of a sample.
-    quantities: Mapping[str, Variable]
-    #: Metrics, the primary metric first.
-    figures: Mapping[str, Metric]
+    quantities: Mapping[str, Variable]  #: variables of a sample
+    figures: Mapping[str, Metric]  #: metrics, the primary metric first
 
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """
-        Simulate samples with the sampled values and the random generator of each.
-
-        Returns each metric, shape (n,): 1 for yes, NaN for a missing value.
-        """
+        """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
 
     def replay(
         self, drawn: Mapping[str, float], rng: np.random.Generator

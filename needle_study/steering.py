@@ -15,12 +15,7 @@ from needle_controller import (
     SteeringModel,
     SteeringPrior,
 )
-from needle_controller.steering.law import (
-    build_law,
-    DEFAULT_LAW,
-    find_law,
-    SteeringFaultError,
-)
+from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.simulation import (
     GroundTruth,
@@ -47,25 +42,15 @@ import numpy as np
 #: Law of a guide at rest, for which a batch is simulated without a law.
 _OPEN_LOOP: Final = 'open_loop'
 
-#: Largest miss of a hit [m].
-HIT: Final = 1e-3
-
-#: Insertion speed of a replay [m/s].
-_SPEED: Final = 0.01
+HIT: Final = 1e-3  #: largest miss of a hit [m]
+_SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 
 _JOINTS: Final = contract.steered_states().without_efforts()
 
-#: Upper bound of the seeds of paths.
-_SEEDS: Final = 2**63
-
-#: Most steps of an insertion.
-_MOST: Final = 1000
-
-#: Needles per batch, which are in memory together.
-_TOGETHER: Final = 256
-
-#: Settings that are mappings or words.
-_PARTS: Final = ('needle', 'constants', 'prior', 'law')
+_SEEDS: Final = 2**63  #: upper bound of the seeds of paths
+_MOST: Final = 1000  #: most steps of an insertion
+_TOGETHER: Final = 256  #: needles per batch, which are in memory together
+_PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
 FIGURES: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
@@ -96,9 +81,8 @@ class SteeringProtocol:
     """
     Steer needles that differ from the nominal model to a target.
 
-    `settings` holds ``needle``, a preset; nominal ``constants``; ``prior``, the prior
-    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`. Raises
-    `ParameterError` if a setting is not valid.
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``prior``, the prior uncertainty;
+    ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises `ParameterError`.
     """
 
     figures = FIGURES

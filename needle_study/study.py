@@ -23,8 +23,7 @@ from scipy.stats import qmc
 #: Keys of a study file.
 _KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
-#: Sampling designs.
-DESIGNS: Final = ('sobol', 'random', 'latin')
+DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 
 #: Largest number of samples and of dimensions, as limited by the Sobol sequence.
 _MOST: Final = 2**30
@@ -45,14 +44,11 @@ class Study:
     protocol: Scenario
     samples: int
     seed: int
-    #: One of `DESIGNS`.
-    design: str
+    design: str  #: one of `DESIGNS`
     #: Distributions by variable; the other variables have their defaults.
     population: Mapping[str, Distribution]
-    #: Cholesky factor of the correlations of the normal scores, shape (d, d).
-    factor: FloatArray
-    #: Content of the study file.
-    document: Mapping[str, Any]
+    factor: FloatArray  #: Cholesky factor of the correlations of the normal scores, shape (d, d)
+    document: Mapping[str, Any]  #: content of the study file
 
     def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
         """Return the sampled values of consecutive sample numbers by variable."""

@@ -12,11 +12,8 @@ import numpy as np
 from pyarrow import parquet
 from scipy.stats import binom
 
-#: Half-width of a 95 % interval over the standard deviation.
-_NORMAL: Final = 1.96
-
-#: Probability of an interval above the true value, and below it.
-_TAIL: Final = 0.025
+_NORMAL: Final = 1.96  #: half-width of a 95 % interval over the standard deviation
+_TAIL: Final = 0.025  #: probability of an interval above the true value, and below it
 
 #: Groups of samples in the estimate of a variance fraction, and the least number of samples.
 _GROUPS, _FEWEST = 32, 200
@@ -74,12 +71,7 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
 
 
 def quantile(values: FloatArray, part: float) -> Estimate:
-    """
-    Estimate a quantile at the probability `part`; NaN is ignored.
-
-    The distribution-free interval lies between two of the values; an end is infinite with too few
-    values.
-    """
+    """Estimate a quantile with its distribution-free interval; NaN is ignored."""
     finite = np.sort(values[np.isfinite(values)])
     n = len(finite)
     if n == 0:
@@ -96,12 +88,7 @@ def quantile(values: FloatArray, part: float) -> Estimate:
 
 
 def share(values: FloatArray, by: FloatArray) -> float:
-    """
-    Return the fraction of a variance that one variable alone explains; NaN is ignored.
-
-    First-order Sobol index, from means of equal groups, corrected for its bias; NaN for fewer than
-    200 samples.
-    """
+    """Return the first-order Sobol index of a variable; NaN for fewer than 200 samples."""
     finite = np.isfinite(values)
     y = values[finite][np.argsort(by[finite], kind='stable')]
     if len(y) < _FEWEST:

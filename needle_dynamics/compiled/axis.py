@@ -14,8 +14,7 @@ DEPTH: Final = 0
 VELOCITY: Final = 1
 DEEPEST: Final = 2
 
-#: Bisections of an event time: to the last digit of a step.
-_HALVINGS: Final = 60
+_HALVINGS: Final = 60  #: bisections of an event time: to the last digit of a step
 
 
 class AxisConstants(NamedTuple):
@@ -125,10 +124,9 @@ def push(
     step: float,
 ) -> float:
     """
-    Advance under a constant force [N], positive into the tissue, for ``duration`` [s], in place.
+    Advance under a constant force [N] for ``duration`` [s], in steps up to ``step`` [s], in place.
 
-    ``state`` is depth [m], velocity [m/s] and greatest depth [m]; ``step`` is the longest step
-    [s]. Returns the time left when the needle leaves the tissue [s], otherwise 0.
+    Returns the time left when the needle leaves the tissue [s], otherwise 0.
     """
     left = duration
     while left > 0.0:
@@ -184,9 +182,7 @@ def carry_on(
     """
     Advance with a ramp to ``velocity`` [m/s] over ``duration`` [s], at any force, in place.
 
-    ``state`` and ``step`` as in `push`; ``forces``, shape (parts,), takes the mean force in equal
-    parts of the duration [N]. Returns the time left when the needle leaves the tissue [s],
-    otherwise 0.
+    ``forces``, shape (parts,), takes the mean force in equal parts [N]. Returns as `push`.
     """
     rate = (velocity - state[VELOCITY]) / duration
     left = duration

@@ -79,11 +79,7 @@ class Crossing(NamedTuple):
 
 @inlined
 def element(ei: float, k: float, h: float) -> Element:
-    """
-    Return the transfer over an element of length h [m], at most (4 E I / k)^(1/4).
-
-    Up to this length the truncated series are exact to rounding.
-    """
+    """Return the transfer over h [m] <= (4 E I / k)^(1/4); its series are exact to rounding."""
     z = -k / ei * h**4
     # Coefficients of z^m: j! / (4m + j)!, by ratios of neighbors.
     p0 = 1.0 + z / 24 * (1.0 + z / 1680 * (1.0 + z / 11880 * (1.0 + z / 43680)))
@@ -140,20 +136,12 @@ def _loaded(
     a = e.k / e.ei
     # Load of the path on a needle with zero start values: w, w', V and M at the end.
     shear, moment = -e.k * q1, e.k * q2
-    return (
-        a * q4 - n00 * shear - n01 * moment,
-        a * q3 - n01 * shear - n11 * moment,
-    )
+    return (a * q4 - n00 * shear - n01 * moment, a * q3 - n01 * shear - n11 * moment)
 
 
 @compiled
 def begin(s: SpringSupports, ei: float, free: float, skin: float, entry: FloatArray) -> None:
-    """
-    Fill the first row: from the guide over the free length [m] to the entry point, and the skin.
-
-    ``skin`` is the stiffness of the skin [N/m], ``entry`` the entry point by plane [m], shape
-    (2,).
-    """
+    """Fill the first row: over the free length [m] to the entry point (2,), and the skin [N/m]."""
     c00, c01, c11 = free**3 / (3.0 * ei), free**2 / (2.0 * ei), free / ei
     support = skin / (1.0 + skin * c00)
     s.depths[0] = 0.0

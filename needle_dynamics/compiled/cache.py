@@ -105,11 +105,10 @@ class _Compiled:
 
 def kernel(function: _Function) -> _Function:
     """
-    Compile a function that is called from Python.
+    Compile a function that is called from Python; ``py_func`` is its source.
 
-    It may call compiled functions of its own folder and of `needle_dynamics.compiled`. `prepare`
-    compiles it for the types of its annotations; for other types it is compiled at the first call.
-    Its Python source is the attribute ``py_func``.
+    It may call functions of its folder and of `needle_dynamics.compiled`. `prepare` compiles it
+    for the types of its annotations.
     """
     return _kernel(function)
 
@@ -131,11 +130,7 @@ def compiled(function: _Function) -> _Function:
 
 
 def inlined(function: _Function) -> _Function:
-    """
-    Compile a part of a hot loop: its code is inlined into its callers.
-
-    A call that is not inlined passes every number of its arguments; an array is seven numbers.
-    """
+    """Compile a part of a hot loop into its callers: a call would pass each number of an array."""
     return cast(_Function, _Compiled(function, forceinline=True, no_cpython_wrapper=True))
 
 
@@ -159,12 +154,7 @@ def is_kept(name: str) -> bool:
 
 
 def prepare(names: Iterable[str]) -> Iterator[tuple[int, int, str]]:
-    """
-    Load or compile kernels, one at each step of the iterator.
-
-    Yields the number of kernels that are ready, the number of all kernels, and the name of the
-    next kernel, '' after the last kernel.
-    """
+    """Load or compile kernels, one a step; yield numbers ready and in total, and the next name."""
     found = kernels(names)
     for done, name in enumerate(found):
         module, _, own = name.partition(':')
@@ -192,11 +182,9 @@ def where_kept() -> str:
 @contextmanager
 def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
     """
-    Report each function that this process compiles or loads.
+    Call the listener with each function of this process, before compilation or after loading.
 
-    The listener takes the name of the function, whether it is loaded from disk, and whether
-    `prepare` requested it. It is called by the compiling thread, before compilation or after
-    loading.
+    It takes name, whether loaded from disk, and whether by `prepare`, in the compiling thread.
     """
     LISTENERS.append(listener)
     try:
@@ -206,11 +194,7 @@ def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
 
 
 def announce_compilation() -> None:
-    """
-    Write one line to standard error when this process first compiles a function.
-
-    Called by commands at their start; libraries and tests are silent.
-    """
+    """Write one line to standard error when this process first compiles; for commands."""
 
     def report(_name: str, loaded: bool, _prepared: bool) -> None:
         if not loaded:

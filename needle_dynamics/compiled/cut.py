@@ -40,8 +40,7 @@ _PART: Final = 0.5
 #: Placeholder for the output ``forces`` of `insert`: guide forces are not computed.
 NO_FORCES: Final = np.empty((0, 0, 2))
 
-#: Length below which a piece of path is ignored [m].
-_NOTHING: Final = 1e-12
+_NOTHING: Final = 1e-12  #: length below which a piece of path is ignored [m]
 
 
 class GuidePose(NamedTuple):
@@ -77,11 +76,7 @@ def start(n: Steered, c: Cut, to: GuidePose, free: float) -> None:
 
 @inlined
 def move(n: Steered, c: Cut, to: GuidePose) -> None:
-    """
-    Move the needle to a pose, in place; guide and roll change in proportion to the depth.
-
-    The depth of the pose must be at least 0 and within the capacity of the rows.
-    """
+    """Move the needle to a pose in its rows, in place; guide and roll change with the depth."""
     begun, deepest = c.pose[DEPTH], c.pose[DEEPEST]
     x, tilt_x, z, tilt_z = c.guide[0, 0], c.guide[0, 1], c.guide[1, 0], c.guide[1, 1]
     roll = c.pose[ROLL]

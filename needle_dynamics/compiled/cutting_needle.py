@@ -122,11 +122,7 @@ def crossing(n: Steered, s: SpringSupports, i: int, h: float) -> Crossing:
 
 @kernel
 def place(n: Steered, c: Cut) -> tuple[float, float, float]:
-    """
-    Compute load, deflection and slope of the tip at the present depth.
-
-    Returns the compliance c00, c01, c11 of the tip [m/N, 1/N, rad/(N m)].
-    """
+    """Place the tip at the present depth; return its compliance [m/N, 1/N, rad/(N m)]."""
     s, depth = c.springs, c.pose[DEPTH]
     i = node_before(s, c.counts[LAST], depth)
     e = crossing(n, s, i, depth - s.depths[i])

@@ -41,9 +41,8 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
     """
     Return dry friction at a speed [N] and its derivative [N s/m], for every law.
 
-    ``coulomb`` is the Coulomb friction in the direction of motion [N]. The value at rest is the
-    static friction limit. Where it is zero, the law is smooth: the needle never sticks, and
-    creeps.
+    ``coulomb`` is for the direction of motion [N]. The value at rest is the static friction limit;
+    if it is zero, the law is smooth and the needle never sticks.
     """
     if f.law == STRIBECK:
         ratio = speed / f.stribeck_speed
@@ -58,11 +57,9 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
 @kernel
 def friction_force(f: FrictionConstants, velocity: float, drive: float) -> float:
     """
-    Return the friction force on the needle [N], positive against insertion.
+    Return the friction force [N], positive against insertion, of equation (15) with any dry law.
 
-    Equation (15) with the dry part of the law; ``velocity`` is s_dot [m/s]. At rest the force
-    balances ``drive``, the sum of the other forces [N], positive into the tissue, up to static
-    friction.
+    At rest it balances ``drive``, the sum of the other forces [N], up to static friction.
     """
     dry, _ = dry_friction(f, f.coulomb, abs(velocity))
     if velocity == 0.0:

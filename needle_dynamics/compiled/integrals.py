@@ -18,8 +18,7 @@ import numpy as np
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
 SERIES_END: Final = 2.0
 
-#: Resolution of `ModeTables.terms` in the relative insertion depth.
-TERMS_PER_LENGTH: Final = 32
+TERMS_PER_LENGTH: Final = 32  #: resolution of `ModeTables.terms` in the relative insertion depth
 
 
 class ModeTables(NamedTuple):
@@ -68,9 +67,8 @@ def mode_derivatives(
     """
     Return phi and its first three derivatives at x = k_i y, divided by c_i k_i^order.
 
-    ``ratio``, ``rest`` and ``end`` are mu_i, (mu_i - 1) exp(k_i l) and k_i l. The growing
-    exponentials of (11) nearly cancel; ``rest`` is the remainder at the tip of a fully inserted
-    needle, so that high modes are accurate.
+    ``ratio`` is mu_i and ``end`` k_i l; ``rest``, (mu_i - 1) exp(k_i l), is what remains of
+    growing exponentials of (11) that nearly cancel.
     """
     sine, cosine = sin(x), cos(x)
     grow = 0.5 * rest * exp(x - end)
@@ -118,9 +116,7 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
     """
     Evaluate any number of modes; see `mode_integrals`.
 
-    Pairs of modes with small arguments use the series, which does not cancel there, other pairs
-    the boundary values of the antiderivatives: the fourth derivative of a mode is k^4 times the
-    mode.
+    Pairs of modes use the series where boundary values of the antiderivatives would cancel.
     """
     length, modes, table = tables.length, tables.modes, tables.series
     n = modes.shape[1]
@@ -185,11 +181,7 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
 
 @inlined_kernel
 def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeIntegrals) -> None:
-    """
-    Evaluate the modes and their integrals at an insertion depth s [m] in the range of the tables.
-
-    ``work``, shape (columns + 4 n,), is scratch memory; ``out`` is overwritten.
-    """
+    """Evaluate modes and integrals at a depth [m]; ``work`` (columns + 4 n,) is scratch memory."""
     if tables.modes.shape[1] == 2:
         two_modes(tables, depth, work, out)
     else:
@@ -198,12 +190,7 @@ def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeInte
 
 @kernel
 def tip_deflections(tables: ModeTables, states: Matrix) -> FloatArray:
-    """
-    Return the deflections of the tip w(s) = phi(s) q [m], shape (k,), of k states.
-
-    States have shape (k, 2 (2 + n)), with depths in the range of the tables; a NaN state gives
-    NaN.
-    """
+    """Return tip deflections w(s) [m], shape (k,), of states (k, 2 (2 + n)); NaN for NaN."""
     n = tables.modes.shape[1]
     grids, rows = np.empty((2, n, n)), np.empty((4, n))
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])

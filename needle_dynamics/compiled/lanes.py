@@ -26,11 +26,8 @@ from needle_dynamics.compiled.modal_flow import normal_pair, turn_pair
 from needle_dynamics.compiled.step import GRADED_FROM
 import numpy as np
 
-#: Number of lanes per step: their rows fit into the first-level cache.
-LANES: Final = 32
-
-#: Columns of `ModeTables.series` for G, H, phi and phi'' of two modes.
-COLUMNS: Final = 26
+LANES: Final = 32  #: number of lanes per step: their rows fit into the first-level cache
+COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' of two modes
 
 # Offset of each row of the lanes. First the constants.
 (
@@ -51,8 +48,7 @@ COLUMNS: Final = 26
 _KEPT: Final = _H // LANES
 _ROWS: Final = _SERIES // LANES + COLUMNS
 
-#: Adding and subtracting this number rounds to an integer.
-_ROUND: Final = 1.5 * 2.0**52
+_ROUND: Final = 1.5 * 2.0**52  #: adding and subtracting this number rounds to an integer
 
 #: pi / 2 as a sum of three parts; integer multiples of the first two are exact.
 _HALF_PI: Final = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
@@ -64,17 +60,11 @@ _TURN: Final = 2.0 / pi
     _F19,
 ) = (1.0 / factorial(k) for k in range(2, 20))  # fmt: skip
 
-#: Exponent above which exp(-x) is negligible against 1.
-_DECAYED: Final = 40.0
+_DECAYED: Final = 40.0  #: exponent above which exp(-x) is negligible against 1
 
 
 class Constants(NamedTuple):
-    """
-    Constants of a needle, in the order of the first rows.
-
-    Other fields: see `needle_dynamics.parameters.NeedleParameters`.
-
-    """
+    """Constants of a needle, in the order of the first rows; units as in `NeedleParameters`."""
 
     length: float
     linear_density: float

@@ -18,12 +18,7 @@ def copy(matrix: FloatArray, to: FloatArray) -> None:
 
 @compiled
 def cholesky(matrix: FloatArray, factor: FloatArray) -> None:
-    """
-    Write the lower Cholesky factor L of a symmetric positive definite matrix, shape (n, n).
-
-    Only the upper triangle of the matrix is read and only the lower triangle of ``factor``
-    written.
-    """
+    """Write the lower Cholesky factor of a matrix (n, n), of which the upper triangle is read."""
     n = matrix.shape[0]
     for j in range(n):
         for i in range(j, n):
@@ -56,11 +51,9 @@ def backward(factor: FloatArray, x: FloatArray) -> None:
 @compiled
 def diagonalize(matrix: FloatArray, vectors: FloatArray) -> None:
     """
-    Compute eigenvalues and eigenvectors of a symmetric positive definite matrix.
+    Overwrite a positive definite matrix with its eigenvalues, ascending, and its eigenvectors.
 
-    Jacobi rotations keep the relative accuracy of small eigenvalues, and are faster than LAPACK
-    for a few rows. The diagonal of the matrix is overwritten with the eigenvalues, ascending, the
-    columns of ``vectors`` with the orthonormal eigenvectors.
+    Jacobi rotations keep the relative accuracy of small eigenvalues.
     """
     n = matrix.shape[0]
     for i in range(n):

@@ -129,9 +129,8 @@ def turn_pair(
     """
     Rotate two normal modes through a step of h [s], between two half steps of damping.
 
-    ``y`` and ``v`` are L^T q and its rate, ``value`` and ``curvature`` the shape modes at the tip,
-    ``decay`` the factor of the rates over half a step of damping, ``first`` and ``second`` the
-    sine and cosine of the rotation angle of each normal mode.
+    ``y`` and ``v`` are L^T q and its rate, ``decay`` the factor of half a step of damping,
+    ``first`` and ``second`` sine and cosine of the rotation angle of each mode.
     """
     cj, sj, square1, square2 = m.cosine, m.sine, m.square1, m.square2
     a1 = cj * y[0] - sj * y[1]
@@ -194,11 +193,7 @@ def turn_pair(
 def rotate_two(
     e: Elasticity, layers: Layers, at: ModeIntegrals, q: FloatArray, z: FloatArray, h: float
 ) -> Rotated:
-    """
-    Advance the deflections q and momenta z of two modes through a step of h [s], in place.
-
-    Same result as `rotate_many`, five times as fast: one Jacobi rotation is exact.
-    """
+    """Advance two modes as `rotate_many`, five times as fast: one Jacobi rotation is exact."""
     rho, ei, ka, layer = e.density, e.bending, e.stiffness, e.layer
     growth = e.growth
     q1, q2, z1, z2 = q[0], q[1], z[0], z[1]

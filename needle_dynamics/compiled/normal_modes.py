@@ -44,11 +44,9 @@ def modal_stiffness(
     out: FloatArray,
 ) -> None:
     """
-    Compute the modal stiffness of needle and tissue, E I_y H plus the integral of k phi phi^T.
+    Compute the modal stiffness E I_y H plus the integral of k phi phi^T [N/m], shape (n, n).
 
-    ``stiffness`` is the tissue stiffness at the tip including swelling [N/m^2], ``growth`` the
-    stiffness factor of swelling, ``layer`` the layer of the tip; ``out``, shape (n, n), is in N/m
-    for modal coordinates in m^3/2.
+    ``stiffness`` is that of the tissue at the tip [N/m^2], ``growth`` its factor by swelling.
     """
     n = out.shape[0]
     for i in range(n):

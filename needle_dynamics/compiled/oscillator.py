@@ -12,9 +12,8 @@ def swing(damping: float, square: float, t: float) -> tuple[float, float, float,
     """
     Solve x_ddot + damping x_dot + square x = 0 for a time t [s], exactly.
 
-    ``damping`` [1/s] is not negative; ``square`` [1/s^2], the squared undamped frequency, is
-    positive. Returns pp, pv [s], vp [1/s], vv: the position after t is pp x + pv v, the velocity
-    vp x + vv v.
+    Returns pp, pv [s], vp [1/s], vv: the position after t is pp x + pv v, the velocity vp x + vv
+    v.
     """
     half = 0.5 * damping
     apart = square - half * half

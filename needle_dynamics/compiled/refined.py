@@ -21,11 +21,8 @@ import numpy as np
 #: Step at the largest vibration, as a fraction of the slowest mode's period over 2 pi.
 SHARE: Final = 0.25
 
-#: Number of steps between updates of the step length.
-_BLOCK: Final = 32
-
-#: Largest number of steps of an interval.
-_MOST: Final = 1e12
+_BLOCK: Final = 32  #: number of steps between updates of the step length
+_MOST: Final = 1e12  #: largest number of steps of an interval
 
 
 @kernel

@@ -26,12 +26,7 @@ _tuple_type: Any = types.BaseTuple.from_types  # type: ignore[attr-defined]
 
 
 def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
-    """
-    Return Numba's types of the arguments of a function; TypeError if an annotation has none.
-
-    Annotations are numbers, arrays of `needle_dynamics.arrays` with a known number of dimensions,
-    tuples, named tuples of these, and `Boxed` named tuples.
-    """
+    """Return Numba's types of the annotated arguments of a function; TypeError without a type."""
     hints = get_type_hints(function, localns={'Boxed': Boxed}, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     try:

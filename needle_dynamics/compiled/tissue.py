@@ -13,11 +13,9 @@ class Layers(NamedTuple):
     """
     Tissue layers, and the contributions of the layers above to the integrals of the modes.
 
-    The tissue load is k(y) w per length. With the tip in layer m the integrals of
-    k phi phi^T, k phi and k y phi over the inserted part are the stiffness of that layer times
-    the integrals without k, plus row m of ``gram``, ``area`` and ``moment``. All of them
-    scale with the swelling of the tissue.
-
+    With the tip in layer m, the integrals of k phi phi^T, k phi and k y phi are its stiffness
+    times the integrals without k, plus row m of ``gram``, ``area`` and ``moment``, all times the
+    swelling.
     """
 
     starts: Vector  #: depths at which the layers begin [m], the first 0, shape (m,)
@@ -52,9 +50,5 @@ def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
 
 @compiled
 def growth_at(swelling: float, swelling_time: float, time: float) -> float:
-    """
-    Return the stiffness factor of swelling at a time since its start [s]; 1 without swelling.
-
-    ``swelling`` is the final relative increase, ``swelling_time`` the time constant [s].
-    """
+    """Return the stiffness factor at a time [s], from final increase and time constant [s]."""
     return 1.0 - swelling * expm1(-time / swelling_time) if swelling != 0.0 else 1.0

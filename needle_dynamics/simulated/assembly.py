@@ -9,11 +9,7 @@ from typing import Any, Final
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
-from needle_dynamics.simulated.force_sensor import (
-    ForceSensor,
-    ForceSensorParameters,
-    HIGHEST_RATE,
-)
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.integrator import Integrator
 from needle_dynamics.simulated.joint_commands import JointCommands
@@ -44,8 +40,7 @@ class PlantSettings:
     depth: float = constant(0.02, 'm', 'initial insertion depth', open_low=True)
     tip_deflection: float = constant(0.0, 'm', 'initial tip deflection', low=-0.1, high=0.1)
     modal: tuple[float, ...] = field(
-        default=(),
-        metadata={'description': 'initial q1 to qn [m^3/2], instead of tip_deflection'},
+        default=(), metadata={'description': 'initial q1 to qn [m^3/2], instead of tip_deflection'}
     )
     step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
     command_timeout: float = constant(0.1, 's', 'age at which a command expires', open_low=True)
@@ -70,8 +65,7 @@ class PlantSettings:
         object.__setattr__(self, 'modal', modal)
 
 
-#: Largest seed of the noise; integer parameters have 64 bits.
-LARGEST_SEED: Final = 2**62
+LARGEST_SEED: Final = 2**62  #: largest seed of the noise; integer parameters have 64 bits
 
 #: Parameters by namespace, as settings with default values.
 SETTINGS: Final[Mapping[str, Any]] = {
@@ -113,12 +107,7 @@ class PlantConstants:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlantConstants:
-        """
-        Read the constants from the parameters of a plant by name, such as ``sensor.rate``.
-
-        Other parameters are ignored. A missing constant has its default, from ``model.preset`` if
-        given. An error message contains the name of the parameter.
-        """
+        """Read the constants from parameters by name; defaults are of ``model.preset``."""
         mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
         for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, NEEDLES)):
             check_choice(name, value, valid)

@@ -17,8 +17,7 @@ import numpy as np
 #: force at once, and a present velocity with a mean force would be delayed by half an interval.
 PUSHES: Final = 4
 
-#: Position error below which the base rests at the end of a trajectory [m].
-_SETTLED: Final = 1e-8
+_SETTLED: Final = 1e-8  #: position error below which the base rests at the end of a trajectory [m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,10 +44,9 @@ def on_grid(value: float, resolution: float) -> float:
 
 class BaseMotion:
     """
-    Trajectory tracking of a joint position, or pushing with a force, within limits.
+    Tracking of trajectories of a joint, or pushing with a force, within limits.
 
-    ``depth`` is the insertion depth [m] to hold until a trajectory arrives, ``reach`` its range
-    [m], ``force_limit`` the largest push force [N]. ``joint`` and ``unit`` are for messages.
+    ``depth`` [m] is held until a trajectory arrives; ``joint`` and ``unit`` are for messages.
     """
 
     def __init__(
@@ -81,13 +79,11 @@ class BaseMotion:
         forces: Sequence[float | None] = (),
     ) -> None:
         """
-        Start a new trajectory, linear in time between its points.
+        Start a new trajectory at a time and depth, linear in time between its points.
 
-        ``start`` [s] is on the clock of `velocity`, ``depth`` the present insertion depth [m],
-        ``times`` [s] are relative to the start. A point without a depth (None) ends a push: until
-        its time the force changes linearly from the force at the previous point, zero if that was
-        no push, to the given force [N]. The segment after a push starts at the actual position of
-        the base. A new trajectory starts with the force of the active push.
+        A point without a depth (None) ends a push: until its time the force changes linearly from
+        the force at the previous point, zero if that was no push. A motion after a push starts at
+        the actual position of the base, a new trajectory with the force of the active push.
         """
         check_times(times)
         low, high = self._range
@@ -120,11 +116,7 @@ class BaseMotion:
         return float(self._times[-1])
 
     def push(self, time: float, depth: float, interval: float) -> float | None:
-        """
-        Return the mean push force over the next interval [N]; None during a motion.
-
-        ``time`` and ``interval`` in s, ``depth`` is the position of the base [m].
-        """
+        """Return the mean push force over an interval [N] at a depth [m]; None in a motion."""
         last = len(self._times) - 1
         # Clock rounding must not add an interval.
         k = int(np.searchsorted(self._times, time + 1e-6 * interval, side='right'))
@@ -139,11 +131,7 @@ class BaseMotion:
         return None
 
     def pushes(self, time: float, interval: float, depth: Callable[[], float]) -> Iterator[float]:
-        """
-        Yield the push force of each part of a sample interval [N]; nothing during a motion.
-
-        ``time`` and ``interval`` in s; ``depth`` returns the present position of the base [m].
-        """
+        """Yield the push force of each part of an interval [N]; nothing during a motion."""
         part = interval / PUSHES
         force: float | None = None
         for k in range(PUSHES):
@@ -154,12 +142,7 @@ class BaseMotion:
             yield force
 
     def velocity(self, time: float, depth: float, velocity: float, interval: float) -> float:
-        """
-        Return the velocity [m/s] at the end of the next interval that tracks the trajectory.
-
-        ``depth`` [m] and ``velocity`` [m/s] are the present position and velocity of the base. The
-        result is within the velocity and acceleration limits.
-        """
+        """Return the velocity [m/s] after an interval [s] that tracks the trajectory in limits."""
         limits = self.limits
         now = float(np.interp(time, self._times, self._depths))
         ahead = float(np.interp(time + interval, self._times, self._depths))

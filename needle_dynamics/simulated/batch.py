@@ -23,8 +23,7 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Largest number of runs per task, enough to fill all vector lanes.
-_CHUNK: Final = 256
+_CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vector lanes
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

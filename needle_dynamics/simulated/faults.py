@@ -13,8 +13,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: Stamp [ns] and values of a measurement.
-Reading: TypeAlias = tuple[int, list[float]]
+Reading: TypeAlias = tuple[int, list[float]]  #: stamp [ns] and values of a measurement
 
 #: Topics for fault injection, with the indices of the values changed by a bias or a saturation:
 #: position, force and torque, and deflection.

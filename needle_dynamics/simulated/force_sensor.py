@@ -13,23 +13,13 @@ from needle_ros.errors import JobError, ParameterError, ShapeError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: Number of filters of the sensor, in cascade.
-MOST_FILTERS: Final = 6
-
-#: Highest sample rate of the sensor [Hz].
-HIGHEST_RATE: Final = 8000.0
-
-#: Averaging time of the tare [s].
-TARE_TIME: Final = 0.1
+MOST_FILTERS: Final = 6  #: number of filters of the sensor, in cascade
+HIGHEST_RATE: Final = 8000.0  #: highest sample rate of the sensor [Hz]
+TARE_TIME: Final = 0.1  #: averaging time of the tare [s]
 
 
 def low_pass(cutoff: float, rate: float) -> FloatArray:
-    """
-    Return a second-order Butterworth low-pass, coefficients b0 b1 b2 a0 a1 a2, shape (6,).
-
-    Bilinear transform; ``cutoff`` (-3 dB) is below half the ``rate``, both in Hz. It replaces
-    scipy.signal, whose import takes 0.6 s.
-    """
+    """Return a Butterworth low-pass b0 b1 b2 a0 a1 a2; scipy.signal takes 0.6 s to import."""
     warped = tan(pi * cutoff / rate)
     square, damping = warped * warped, sqrt(2.0) * warped
     numerator = square * np.array([1.0, 2.0, 1.0])
@@ -171,8 +161,7 @@ class ForceSensor:
 
     """
 
-    #: Size of a block of random numbers.
-    _DRAWN = 16384
+    _DRAWN = 16384  #: size of a block of random numbers
 
     def __init__(self, parameters: ForceSensorParameters, rate: float, seed: int) -> None:
         p = parameters

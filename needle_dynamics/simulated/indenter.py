@@ -19,8 +19,7 @@ from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
-#: Joints of the indenter trajectories: the axes of the plane.
-JOINTS = ('x', 'z')
+JOINTS = ('x', 'z')  #: joints of the indenter trajectories: the axes of the plane
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,8 +122,7 @@ class Indenter(SimulatedPlant):
 
     """
 
-    #: Insertion depth; there is no needle.
-    depth = 0.0
+    depth = 0.0  #: insertion depth; there is no needle
 
     topics = (BASE_WRENCH, END_EFFECTOR_POSE)
 

@@ -50,10 +50,8 @@ class Interval:
         These three loads for each of the equal parts of the interval. Not compared by ``==``.
     friction_work, damping_work : float
         Energy dissipated by friction and tissue damping [J].
-    input_work : float
-        Work of force and torque [J].
-    impact_loss : float
-        Energy dissipated by impacts of the hub [J].
+    input_work, impact_loss : float
+        Work of force and torque [J]; energy dissipated by impacts of the hub [J].
     contact_time : float or None
         Time of the last hub contact [s], on the clock of the integrator.
 
@@ -181,10 +179,8 @@ class Integrator:
         ----------
         duration : float
             Time to advance [s], divided into steps no longer than ``step``.
-        force : float
-            Insertion force f_y [N], positive into the tissue.
-        torque : float
-            Torque tau about x [N m].
+        force, torque : float
+            Insertion force f_y [N], positive into the tissue; torque tau about x [N m].
         parts : int
             Number of equal parts of the interval for which base loads are returned. Steps end at
             the part boundaries.
@@ -212,10 +208,8 @@ class Integrator:
 
         Parameters
         ----------
-        duration : float
-            Time to advance [s].
-        velocity : float
-            Insertion velocity at the end [m/s], positive into the tissue.
+        duration, velocity : float
+            Time to advance [s]; insertion velocity at the end [m/s], positive into the tissue.
 
         Returns
         -------
@@ -237,10 +231,8 @@ class Integrator:
 
         Parameters
         ----------
-        duration : float
-            Time to advance [s].
-        force : float
-            Insertion force of the base below the speed limit [N].
+        duration, force : float
+            Time to advance [s]; insertion force of the base below the speed limit [N].
         speed_limit : float
             Highest speed of the base at the end [m/s].
 
@@ -363,12 +355,7 @@ class Integrator:
 
 
 def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:
-    """
-    Return the exception for a motion with ``left`` seconds remaining (NaN: not finite).
-
-    It is an `InsertionDepthError` if the needle would leave its range; ``state`` is the last valid
-    state.
-    """
+    """Return the error of a motion with ``left`` [s] remaining: outside the range, not finite."""
     if isnan(left):
         return NeedleError('the motion is not finite: constants, state or inputs are badly scaled')
     p, far = model.parameters, model.compiled.maximum_depth

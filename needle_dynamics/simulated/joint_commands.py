@@ -15,8 +15,7 @@ _POSITION: Final = 'position'
 _VELOCITY: Final = 'velocity'
 _EFFORT: Final = 'effort'
 
-#: In the order of the message.
-_KINDS: Final = (_POSITION, _VELOCITY, _EFFORT)
+_KINDS: Final = (_POSITION, _VELOCITY, _EFFORT)  #: in the order of the message
 
 
 #: Names of the joints of the guide, in the order of the message.
@@ -49,13 +48,11 @@ class Asked(NamedTuple):
 
 class JointCommands:
     """
-    Parser of successive `joint_commands` messages.
+    Parser of successive `joint_commands` messages, for a period and a command timeout [s].
 
-    The hardware interface sends all interfaces at its own rate, whether a controller sets them or
-    not: a value not yet set is NaN and has no effect. A value that has been a number must remain a
-    number. A position is the end of a linear motion from the present position with the duration
-    between the last message and this message. A velocity without a position lasts for the timeout.
-    ``shortest`` is the period of the plant, ``longest`` the command timeout [s].
+    The hardware interface sends all interfaces at its own rate: a value not yet set is NaN and has
+    no effect, but a number must remain a number. A position is the end of a linear motion since
+    the last message. A velocity without a position lasts for the timeout.
     """
 
     def __init__(self, mode: str, *, steered: bool, shortest: float, longest: float) -> None:
@@ -74,12 +71,7 @@ class JointCommands:
         self._given: dict[tuple[str, str], float] = {}
 
     def read(self, reading: Reading, at: Mapping[str, float], now: int) -> Asked:
-        """
-        Parse the next message, without effect before `accept`.
-
-        ``at`` are the joint positions [m or rad], zero by default; ``now`` replaces a zero stamp
-        [ns].
-        """
+        """Parse a message, without effect before `accept`; ``now`` [ns] replaces a zero stamp."""
         stamp = reading.stamp or now
         new = {
             (kind, joint): value

@@ -15,8 +15,7 @@ from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
 import numpy as np
 
-#: Velocity below which taring is permitted [m/s].
-AT_REST: Final = 1e-6
+AT_REST: Final = 1e-6  #: velocity below which taring is permitted [m/s]
 
 #: Measurement for one topic: topic name, sample intervals since the time of the stamp, and values
 #: in the order of the message.
@@ -101,15 +100,7 @@ class SimulatedPlant(ABC):
         """
 
     def tare(self) -> None:
-        """
-        Zero the force sensor on the mean of its latest readings.
-
-        Raises
-        ------
-        JobError
-            If the plant moves, or has not rested long enough.
-
-        """
+        """Zero the force sensor on the mean of its latest readings; JobError unless it rests."""
         motion = self._motion()
         if motion:
             raise JobError(f'{motion}; it must rest')

@@ -22,20 +22,13 @@ from needle_dynamics.simulated.measured import (
     velocity_text,
 )
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
-from needle_ros.contract import (
-    BASE_WRENCH,
-    ground_truth,
-    INSERTION,
-    JOINT_STATES,
-    TIP_DEFLECTION,
-)
+from needle_ros.contract import BASE_WRENCH, ground_truth, INSERTION, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import ParameterError
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import joint_values
 import numpy as np
 
-#: Number of points of an outline.
-_POINTS: Final = 21
+_POINTS: Final = 21  #: number of points of an outline
 
 
 def _friction_gained(friction: Friction, before: float, after: float) -> float:

@@ -30,14 +30,9 @@ PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
 
-#: Time in which joints come to rest at their positions [s].
-_HALT: Final = 0.05
-
-#: Mean velocity of a retraction [m/s].
-_WITHDRAWAL: Final = 0.01
-
-#: Tolerance of the period due to the rounding of stamps [ns].
-_ROUNDING: Final = 2
+_HALT: Final = 0.05  #: time in which joints come to rest at their positions [s]
+_WITHDRAWAL: Final = 0.01  #: mean velocity of a retraction [m/s]
+_ROUNDING: Final = 2  #: tolerance of the period due to the rounding of stamps [ns]
 
 
 class Event(NamedTuple):
@@ -53,12 +48,7 @@ class Event(NamedTuple):
 
 
 class PlantRun:
-    """
-    Simulated plant with commands and events, built from parameters by name.
-
-    ``number`` is the number of samples taken, including samples before this run. The parameters
-    are described in `PlantConstants.of`; ``topics`` are the published topics by name.
-    """
+    """Simulated plant with commands and events; ``number`` counts samples since the first run."""
 
     def __init__(self, values: Mapping[str, Any], number: int = 0) -> None:
         self._values = dict(values)
@@ -91,12 +81,7 @@ class PlantRun:
         self._joint_commands.forget()
 
     def command_joints(self, reading: Reading, now: int) -> tuple[bool, str]:
-        """
-        Process a `joint_commands` message at a time [ns], by the rules of `Commands`.
-
-        Returns whether it is accepted (an invalid message as zero force without motion), and the
-        error message or ''.
-        """
+        """Process a `joint_commands` message at a time [ns]; return as `Commands.offer`."""
         commands = self.commands
         try:
             asked = self._joint_commands.read(reading, self._positions(), now)
@@ -153,12 +138,7 @@ class PlantRun:
     # Events.
 
     def perform(self, event: Event) -> None:
-        """
-        Apply an event to the plant, live or in a replay.
-
-        Raises ParameterError for an invalid trajectory or parameter, and JobError for a tare of a
-        plant that moves or has not rested long enough.
-        """
+        """Apply an event; ParameterError if it is invalid, JobError if the sensor is not tared."""
         if event.kind in (TRAJECTORY, MOTION):
             self.plant.follow(**event.content)
         elif event.kind == PARAMETERS:
@@ -190,12 +170,7 @@ class PlantRun:
     # Samples.
 
     def take(self, stamp: int, command: AppliedForces | None = None) -> list[Measurement]:
-        """
-        Take a sample with a stamp [ns] and return its measurements, `joint_states` last.
-
-        ``command`` is the command that acted since the previous sample, by default the acting
-        command.
-        """
+        """Take a sample after a command, by default the acting one; `joint_states` is last."""
         acting = self.commands.acting if command is None else command
         before = self.plant.depth
         measured = self.plant.take(acting.force, acting.torque)

@@ -70,12 +70,7 @@ class GuideParameters:
 
 
 class SteeredPlant(SimulatedPlant):
-    """
-    Steered needle under a commanded force or moved by a robot, with guide and sensors.
-
-    Without a ``base`` (robot along the needle axis) the commanded force acts; ``rate`` is the
-    sample rate [Hz].
-    """
+    """Steered needle with guide and sensors, under a commanded force or moved by a ``base``."""
 
     def __init__(
         self,
@@ -127,11 +122,7 @@ class SteeredPlant(SimulatedPlant):
         positions: Sequence[Sequence[float]],
         efforts: Sequence[Sequence[float]],
     ) -> None:
-        """
-        Follow a trajectory of guide, roll and base from now on; omitted joints continue.
-
-        Without a base, `insertion` is ignored: it is the reference of a controller.
-        """
+        """Follow a trajectory of the given joints; `insertion` is ignored without a base."""
         known = (INSERTION, *GUIDE_JOINTS)
         if not joints or not set(joints) <= {*known} or len({*joints}) < len(joints):
             raise ParameterError(f'takes joints of {", ".join(known)}, got {list(joints)}')
@@ -162,11 +153,7 @@ class SteeredPlant(SimulatedPlant):
         self.insertion.change(parameters)
 
     def advance(self, force: float = 0.0) -> list[float]:
-        """
-        Advance by one sample interval and return the wrench of the base sensor [N, N m], xyz each.
-
-        The commanded insertion force [N] is ignored when a base moves the needle.
-        """
+        """Advance by one interval, under a force [N] without a base; return the wrench."""
         across = self._move_guide() if self._moving else {}
         wrenches = self._wrenches
         if self.base is None:

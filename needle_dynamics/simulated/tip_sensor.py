@@ -56,9 +56,8 @@ class TipSensor:
     """
     Convert mean tip deflections to delayed, noisy measurements.
 
-    ``rate`` is the sample rate of the plant [Hz], at least the rate of the sensor. A ``spatial``
-    sensor measures all three coordinates with noise and averages the depth; otherwise only the
-    deflection in the plane of the source's needle is noisy.
+    A ``spatial`` sensor measures three coordinates with noise and averages the depth, another only
+    the deflection in the plane of the source's needle.
     """
 
     def __init__(
@@ -83,12 +82,7 @@ class TipSensor:
         self._waiting: deque[tuple[int, float, float, float]] = deque()
 
     def measure(self, depth: float, deflection: float, across: float = 0.0) -> TipReading | None:
-        """
-        Process a plant sample and return the reading to publish now, if any.
-
-        ``depth`` is the insertion depth [m], ``deflection`` and ``across`` the mean tip deflection
-        since the previous sample along z and x [m].
-        """
+        """Process depth and mean deflections along z and x [m]; return the reading due now."""
         self._count += 1
         sums = self._sums
         sums[0] += across

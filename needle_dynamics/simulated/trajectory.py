@@ -23,14 +23,9 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Default tolerance of a run, as in `Trajectory.error`.
-DEFAULT_TOLERANCE: Final = 1e-3
-
-#: Default number of samples of a run.
-DEFAULT_SAMPLES: Final = 2000
-
-#: Largest number of intervals of a run, limited by memory.
-_MOST_INTERVALS: Final = 100_000_000
+DEFAULT_TOLERANCE: Final = 1e-3  #: default tolerance of a run, as in `Trajectory.error`
+DEFAULT_SAMPLES: Final = 2000  #: default number of samples of a run
+_MOST_INTERVALS: Final = 100_000_000  #: largest number of intervals of a run, limited by memory
 
 #: Least travel for relative errors, as a fraction of the needle length.
 _LEAST_TRAVEL: Final = 1e-4

@@ -14,8 +14,7 @@ from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Default step along the axis [s].
-DEFAULT_AXIS_STEP = 1e-4
+DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
 
 
 def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConstants:
@@ -168,10 +167,8 @@ class Insertion:
 
         Parameters
         ----------
-        duration : float
-            Time [s].
-        force : float
-            Insertion force [N], positive into the tissue.
+        duration, force : float
+            Time [s]; insertion force [N], positive into the tissue.
         speed_limit : float
             Speed limit of the pushing device [m/s]; a needle that would move faster is carried at
             this speed.
@@ -223,10 +220,8 @@ class Insertion:
 
         Parameters
         ----------
-        duration : float
-            Time [s].
-        velocity : float
-            Insertion velocity at the end [m/s].
+        duration, velocity : float
+            Time [s]; insertion velocity at the end [m/s].
         forces : ndarray, shape (parts,), optional
             Overwritten with the mean force over each of the equal parts of the duration [N].
         guide, tilt, roll, tissue : optional

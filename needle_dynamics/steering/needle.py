@@ -36,8 +36,7 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Nodes per element of the needle: a restarted path uses an additional node.
-_SPARE: Final = 2
+_SPARE: Final = 2  #: nodes per element of the needle: a restarted path uses an additional node
 
 
 class NeedleShape(NamedTuple):
@@ -48,10 +47,8 @@ class NeedleShape(NamedTuple):
     ----------
     depths : ndarray, shape (k,)
         Distance y from the entry point [m], from the guide at -L0 to the tip.
-    deflections : ndarray, shape (k, 2)
-        Deflections in x and z [m].
-    slopes : ndarray, shape (k, 2)
-        Derivatives of the deflections in y.
+    deflections, slopes : ndarray, shape (k, 2)
+        Deflections in x and z [m]; derivatives of the deflections in y.
 
     """
 
@@ -90,11 +87,7 @@ class Placement(NamedTuple):
 def steered(
     needle: NeedleParameters, steering: SteeringParameters, wander: FloatArray | None = None
 ) -> Steered:
-    """
-    Return the constants in the layout of the compiled functions.
-
-    ``wander`` (cells, 2) are the lateral noise loads on the tip by depth [N], see `wandering`.
-    """
+    """Return constants for compiled functions; ``wander`` (cells, 2) is of `wandering` [N]."""
     tissue = needle.tissue
     if steering.free_length >= needle.length:
         raise ParameterError(
@@ -121,9 +114,8 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     """
     Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2).
 
-    The loads are `noise_cell` apart in depth; none without noise. A load F turns the path
-    of a long needle by F lambda / (E I) per length. Loads correlated over the length of the noise
-    thus turn the path at random, and the variance of its direction grows with its length.
+    A load F turns the path of a long needle by F lambda / (E I) per length. Loads correlated over
+    a length turn it at random: the variance of its direction grows with its length.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')

@@ -19,8 +19,7 @@ _STEEL: Final = 1.3
 #: Longest element over the bending length; the element series converges up to this value.
 _LONGEST: Final = 1.0
 
-#: Loads of the path noise per correlation length.
-_CELLS: Final = 5
+_CELLS: Final = 5  #: loads of the path noise per correlation length
 
 #: Constants of `NeedleParameters` used by a steered needle; the others belong to the paper model.
 NEEDLE_CONSTANTS: Final = (
@@ -97,10 +96,8 @@ def bending_length(stiffness: float, tissue: float) -> float:
 
     Parameters
     ----------
-    stiffness : float
-        Bending stiffness E I [N m^2].
-    tissue : float
-        Stiffness k of the tissue per length [N/m^2].
+    stiffness, tissue : float
+        Bending stiffness E I [N m^2]; stiffness k of the tissue per length [N/m^2].
 
     Returns
     -------
@@ -117,12 +114,7 @@ def tissue_of(stiffness: float, length: float) -> float:
 
 
 def turning_load(stiffness: float, tissue: float) -> float:
-    """
-    Return the lateral tip load E I / lambda [N] for a path curvature of 1/m; 0 without tissue.
-
-    ``stiffness`` is the bending stiffness E I [N m^2], ``tissue`` the stiffness per length
-    [N/m^2].
-    """
+    """Return the tip load E I / lambda [N] for a path curvature of 1/m; 0 without tissue."""
     return stiffness / bending_length(stiffness, tissue) if tissue > 0.0 else 0.0
 
 
@@ -152,11 +144,7 @@ def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
 
 
 def longest_element(needle: NeedleParameters, steering: SteeringParameters) -> float:
-    """
-    Return the element length [m].
-
-    It is at most the bending length in the stiffest layer and the distance of the noise loads.
-    """
+    """Return the element length [m], within bending length and distance of the noise loads."""
     longest = steering.element
     stiffest = max(needle.tissue.stiffnesses)
     if stiffest > 0.0:

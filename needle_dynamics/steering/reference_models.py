@@ -32,23 +32,20 @@ from numpy.typing import ArrayLike
 
 def unicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float) -> FloatArray:
     """
-    Compute the tip path of a needle that follows arcs of constant curvature.
+    Compute the tip path (k, 3) [m] of a needle that follows arcs of constant curvature [1/m].
 
-    ``lengths`` (k,) are increasing insertion depths [m], ``rolls`` () or (k,) the roll over the
-    segment up to each depth, right-handed about y [rad]; at 0 the needle bends towards z. Returns
-    tip positions x, y, z [m], shape (k, 3), from zero along y.
+    ``rolls`` () or (k,) is the roll up to each depth, right-handed about y [rad]; 0 bends towards
+    z.
     """
     return bicycle(lengths, rolls, curvature, 0.0)
 
 
 def bicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float, lead: float) -> FloatArray:
     """
-    Compute the tip path of a bicycle model, with the tip ahead of a rear wheel that follows arcs.
+    Compute the tip path (k, 3) [m] of a bicycle model over path lengths of its rear wheel [m].
 
-    ``lengths`` (k,) are the path lengths of the rear wheel [m], ``rolls`` as in `unicycle`. The
-    curvature of the arcs is tan(phi) / l1 for a front wheel at angle phi and wheelbase l1, see
-    `bicycle_curvature`; ``lead`` is the distance l2 of the tip from the rear wheel [m]. Returns
-    tip positions x, y, z [m], shape (k, 3), from zero with the needle along y.
+    The curvature of its arcs is tan(phi) / l1 for a front wheel at angle phi and wheelbase l1, see
+    `bicycle_curvature`; ``lead`` is the distance l2 of the tip [m], ``rolls`` as in `unicycle`.
     """
     distances = np.atleast_1d(np.array(lengths, dtype=np.float64))
     turns = np.array(rolls, dtype=np.float64)
@@ -89,12 +86,7 @@ def bicycle_curvature(wheelbase: float, angle: float) -> float:
 
 
 def intrinsic_curvature(depth: float, curvature: float, at: ArrayLike = inf) -> FloatArray:
-    """
-    Evaluate the deflection [m] of a needle with kappa(y) = kappa_c (1 - y / L)^2.
-
-    ``depth`` is the insertion depth L [m], ``curvature`` the intrinsic curvature kappa_c at the
-    entry [1/m], ``at`` the position y [m], by default the tip, where it is kappa_c L^2 / 4.
-    """
+    """Return the deflection [m] at y, by default the tip, for kappa_c (1 - y / L)^2."""
     if not 0.0 < depth < inf:
         raise ParameterError(f'depth must be positive and finite, got {depth!r} m')
     part = np.minimum(np.asarray(at, dtype=np.float64) / depth, 1.0)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.compression import Budget, DAMAGED, decompress
+from needle_identification.bags.compression import Budget, COSTLY, DAMAGED, decompress
 from needle_identification.bags.topics import BagTopic
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,7 @@ class MessageBatch(NamedTuple):
         for k, (_, data) in enumerate(self.messages()):
             with suppress(*DAMAGED):
                 parts[k] = decompress(compression, data, budget.largest_message)
-            budget.spend(len(parts[k]))
+            budget.spend(len(parts[k]), COSTLY)
         return MessageBatch.joined(self.topic, self.received, parts)
 
 
@@ -94,6 +94,7 @@ class Tally:
 
     def enter(self, topic: BagTopic | None, number: int) -> bool:
         """Count messages of a topic (None: unknown, a fault); return whether it is selected."""
+        self.budget.spend(0, COSTLY)
         if topic is None:
             self.faults.append(f'is damaged: {number} messages of an unknown topic')
             return False

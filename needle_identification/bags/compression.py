@@ -39,6 +39,12 @@ LARGEST_MESSAGE: Final = 2**26
 _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
+#: Records allowed for any file, and bytes of the file per record: a compressed message takes more.
+_RECORDS: Final = 2**20
+_BYTES_PER_RECORD: Final = 4
+
+COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
+
 
 def open_file(file: Path, budget: Budget) -> Any:
     """Open the decompressed content of a file as a binary stream; count each byte read."""
@@ -90,22 +96,26 @@ def factor() -> float:
 
 
 class Budget:
-    """Remaining decompressed size of a file, and its largest record and message [bytes]."""
+    """Remaining decompressed size and records of a file; largest record and message [bytes]."""
 
     def __init__(self, file: Path) -> None:
         times = factor()
-        self.name, self._size = file.name, file.stat().st_size
-        self._most = self._left = round(times * max(_AT_LEAST, _RATIO * self._size))
+        self.name, self.size = file.name, file.stat().st_size
+        self._most = self._left = round(times * max(_AT_LEAST, _RATIO * self.size))
+        most = round(times * max(_RECORDS, self.size // _BYTES_PER_RECORD))
+        self._most_records = self._records_left = most
         self.largest = round(times * LARGEST_RECORD)
         self.largest_message = round(times * LARGEST_MESSAGE)
 
-    def spend(self, number: int) -> None:
-        """Count decompressed bytes; raise a RecordingError above the limit."""
+    def spend(self, number: int, records: int = 0) -> None:
+        """Count decompressed bytes and records; raise a RecordingError above a limit."""
         self._left -= number
-        if self._left < 0:
+        self._records_left -= records
+        if self._left < 0 or self._records_left < 0:
+            most = _bytes(self._most) if self._left < 0 else f'{self._most_records} records'
             raise RecordingError(
-                f'{self.name} unfolds to more than {_bytes(self._most)} from '
-                f'{_bytes(self._size)}; {FACTOR}=10 raises this limit tenfold'
+                f'{self.name} unfolds to more than {most} from {_bytes(self.size)}; {FACTOR}=10 '
+                'raises this limit tenfold'
             )
 
     def too_large(self, what: str, size: int) -> str:

@@ -18,6 +18,7 @@ from mcap.records import Channel, Schema, Statistics
 from needle_identification.bags.batch import LARGEST_BATCH, LATEST, MessageBatch, Tally
 from needle_identification.bags.compression import (
     BLOCK,
+    COSTLY,
     DAMAGED,
     decompress,
     open_file,
@@ -44,6 +45,7 @@ _MESSAGE: Final = np.dtype(
 )
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
+_SUMMARY: Final = 2**24  #: largest index that is read, of 80,000 chunks or more [bytes]
 DAMAGED_MCAP: Final = (*DAMAGED, McapError)  #: exceptions for damaged bytes
 
 
@@ -87,7 +89,7 @@ def indexed_topics(file: Path) -> set[BagTopic] | None:
                 return None
             stream.seek(start)
             # The checksum covers all bytes before it.
-            summary = stream.read()[: -4 - len(_MAGIC)]
+            summary = stream.read(_SUMMARY)[: -4 - len(_MAGIC)]
         if zlib.crc32(summary) != checksum:
             return None
         for begin, end in _records(summary):
@@ -125,10 +127,12 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
                     loose.clear()
                 if opcode == Opcode.CHUNK:
                     yield from _batches(_chunk_content(body, length, tally), channels, tally)
-            elif opcode == Opcode.STATISTICS:
-                tally.written = int.from_bytes(read_up_to(stream, length)[:8], 'little')
             else:
-                _skip(stream, length)
+                tally.budget.spend(0, COSTLY)
+                first = read_up_to(stream, min(length, 8))
+                if opcode == Opcode.STATISTICS:
+                    tally.written = int.from_bytes(first, 'little')
+                _skip(stream, length - len(first))
                 is_complete |= opcode == Opcode.DATA_END
             if opcode == Opcode.FOOTER:
                 break
@@ -187,7 +191,9 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Mess
     data = np.frombuffer(content, dtype=np.uint8)
     for begin, end in _records(content):
         opcodes = data[begin - _HEAD.size]
-        for k in np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)):
+        definitions = np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL))
+        tally.budget.spend(0, len(begin) + COSTLY * (1 + len(definitions)))
+        for k in definitions:
             # Messages of an unreadable channel are counted as of an unknown topic.
             with suppress(*DAMAGED_MCAP):
                 channels.define(opcodes[k], content[begin[k] : end[k]])

@@ -146,7 +146,15 @@ def deserialize(topic: BagTopic, data: bytes) -> Any:
     """
     store = _store(topic.type_name, topic.encoding, topic.definition)
     try:
-        return store.deserialize_cdr(data, topic.type_name)
+        if data[:2] not in (b'\0\0', b'\0\1'):
+            raise ValueError(f'begins with {data[:4].hex(" ")}, not with 00 00 or 00 01 (CDR)')
+        kind = store.get_msgdef(topic.type_name)
+        read = kind.deserialize_cdr_le if data[1] else kind.deserialize_cdr_be
+        message, size = read(data[4:], 0, kind.cls, store)
+        # rclpy appends up to four bytes for each empty array, which itself has four bytes.
+        if len(data) > 2 * size + 8:
+            raise ValueError(f'has {len(data)} bytes, {size + 4} expected')
+        return message
     except (*DAMAGED, SerdeError) as error:
         raise RecordingError(f'is not a {topic.type_name}: {error}') from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator
 from functools import partial
+from heapq import merge
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +20,10 @@ from rosbags.rosbag1.reader import decompressors
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 
+#: Size of an entry of the index; number of bytes in a chunk that count as a record.
+_ENTRY: Final = 12
+_RECORD: Final = 128
+
 #: Exceptions of the library for damaged bytes.
 _DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)
 
@@ -29,10 +34,24 @@ _BOUNDED: Final[dict[Any, Callable[[bytes, int], bytes]]] = {
 }
 
 
+class _Reader(Reader):
+    """Reader that counts the entries of the index: chunks may share them."""
+
+    def __init__(self, file: Path, budget: Budget) -> None:
+        self._budget = budget
+        super().__init__(file)
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[Any]]) -> None:
+        file: Any = self.bio
+        begin = file.tell()
+        super().read_index_data(pos, indexes)
+        self._budget.spend(0, 1 + (file.tell() - begin) // _ENTRY)
+
+
 def ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """Read a ``.bag`` file; yield its messages, converted to ROS 2."""
     try:
-        with Reader(file) as reader:
+        with _Reader(file, tally.budget) as reader:
             for at, chunk in reader.chunks.items():
                 bounded = partial(_unfolded, chunk.decompressor, tally.budget)
                 reader.chunks[at] = chunk._replace(decompressor=bounded)
@@ -51,11 +70,11 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
         for connection in reader.connections
     }
     converters: dict[str, Callable[[bytes], Any]] = {}
-    tally.written = reader.message_count
-    messages = reader.messages()
+    tally.written = sum(sum(chunk.connection_counts.values()) for chunk in reader.chunk_infos)
+    messages = _messages(reader, tally.budget)
     while some := list(islice(messages, LARGEST_BATCH)):
         tally.piece += 1
-        for key, group in grouped((one.id, when, data) for one, when, data in some).items():
+        for key, group in grouped(some).items():
             topic = topics[key]
             if not tally.enter(topic, len(group)) or topic.type_name not in known:
                 continue
@@ -66,6 +85,16 @@ def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:
             converters[kind] = convert
             parts = [_converted(convert, data) for _, data in group]
             yield MessageBatch.of_times(topic, [when for when, _ in group], parts)
+
+
+def _messages(reader: Reader, budget: Budget) -> Iterator[tuple[int, int, bytes]]:
+    """Yield connection, time and data of all messages; entries may share records."""
+    # In the order of `messages`, also if a connection is listed twice.
+    entries = merge(*(reader.indexes[one.id] for one in reader.connections))
+    for entry, (connection, when, data) in zip(entries, reader.messages(), strict=False):
+        size = reader.current_chunk[1].tell() - entry.offset
+        budget.spend(size, 1 + size // _RECORD)
+        yield connection.id, when, data
 
 
 def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, ExitStack, suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 import sqlite3
@@ -22,7 +23,7 @@ _ROW: Final = 16  # size of a row in addition to its data [bytes]
 
 #: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
 #: A message takes about 20 steps and 40 bytes.
-_STEPS: Final = 10**7
+_STEPS: Final = 4 * 10**7
 _STEPS_PER_BYTE: Final = 20
 _STEPS_PER_CALL: Final = 10**5
 
@@ -42,10 +43,17 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
         uri = f'file:{quote(str(file.resolve()))}?{"mode=ro" if journal else "immutable=1"}'
         database = stack.enter_context(closing(sqlite3.connect(uri, uri=True)))
         database.text_factory = bytes
+        database.row_factory = partial(_counted, tally)
         # Without it, a truncated file (missing index) is not readable.
         database.execute('PRAGMA writable_schema = ON')
-        _bound(database, file.stat().st_size, tally)
+        _bound(database, tally.budget.size, tally)
         yield from _rows(database, tally)
+
+
+def _counted(tally: Tally, _cursor: object, row: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Count a row when it is read: rows may share bytes of the file."""
+    tally.budget.spend(_ROW + sum([len(value) for value in row if isinstance(value, bytes)]), 1)
+    return row
 
 
 def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
@@ -112,7 +120,6 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[MessageBatch]:
         if not some:
             break
         tally.piece += 1
-        tally.budget.spend(sum(_ROW + len(data or b'') for _, _, data in some))
         for key, group in grouped(some).items():
             if tally.enter(topics.get(key), len(group)):
                 times, parts = zip(*group, strict=True)

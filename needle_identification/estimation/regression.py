@@ -368,12 +368,7 @@ def independent_span(correlation: int) -> float:
 
 
 def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
-    """
-    Return the covariance (k, k) of the sum of correlated scores (n, k), zero where unused.
-
-    The triangular window weights their autocovariances with its autocorrelation, the Parzen
-    kernel, which is flat at lag zero and gives no negative variance.
-    """
+    """Return the covariance (k, k) of the sum of correlated scores (n, k), zero where unused."""
     window = _window(correlation)
     padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))
     sums = convolve1d(padded, window, axis=0, mode='constant')

@@ -265,9 +265,8 @@ class LiveFriction:
     """
     Estimate friction from messages as they arrive, with the motion at the stamps of the force.
 
-    Samples that are not finite, out of order, or within a gap of the motion are discarded and
-    counted. Estimation restarts when the clock is set back. ``forgetting`` is the time of steady
-    motion in which the weight of a sample falls to 1 / e [s].
+    Samples that are not finite, out of order, or in a gap of the motion are discarded and counted.
+    A clock that is set back restarts the estimation.
     """
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:

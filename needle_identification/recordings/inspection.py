@@ -15,12 +15,7 @@ from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
-from needle_identification.recordings.samples import (
-    are_gaps,
-    EachJoint,
-    Gathering,
-    source_of,
-)
+from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire

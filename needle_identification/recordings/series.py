@@ -19,10 +19,8 @@ class Series:
     """
     Samples in order of stamp; up to date after `compact`.
 
-    Up to two samples per bin are kept unchanged. Denser samples are averaged over bins of
-    ``width`` [ns], stamps and values alike, which causes no delay. Above `LARGEST` samples,
-    neighbors are averaged. ``late`` counts samples after a later stamp, ``repeated`` those with an
-    equal stamp.
+    More than two samples per bin of ``width`` [ns] are averaged, stamps and values alike; above
+    `LARGEST` samples, neighbors are. ``late`` and ``repeated`` count samples by their stamps.
     """
 
     def __init__(self, columns: int) -> None:

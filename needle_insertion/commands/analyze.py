@@ -66,8 +66,7 @@ def _run(options: argparse.Namespace) -> int:
         if name in changes:
             raise ParameterError(f'{name} is given by --{name}, not by --set')
     parameters = NeedleParameters.preset(
-        options.preset,
-        **{'formulation': options.formulation, 'modes': options.modes, **changes},
+        options.preset, **{'formulation': options.formulation, 'modes': options.modes, **changes}
     )
     points = report.analyze_points(
         NeedleModel(parameters),

@@ -23,8 +23,7 @@ class Subcommand(NamedTuple):
 
     add_arguments: Callable[[ArgumentParser], None]
     run: Callable[[Namespace], int]
-    #: Options whose value may begin with a minus sign.
-    signed: tuple[str, ...] = ()
+    signed: tuple[str, ...] = ()  #: options whose value may begin with a minus sign
 
 
 def add_needle(parser: ArgumentParser) -> None:

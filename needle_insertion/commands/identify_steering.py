@@ -24,8 +24,7 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
 from tqdm import tqdm
 
-#: Name of a medium without a name.
-_ONE = 'all'
+_ONE = 'all'  #: name of a medium without a name
 
 
 def add_steering(what: Any) -> None:

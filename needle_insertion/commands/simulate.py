@@ -23,14 +23,9 @@ from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
-#: Default tip deflection at the start [m], from section 3.2.8.
-_DEFLECTION: Final = 5e-4
-
-#: Default duration if the force does not insert the needle [s].
-_DURATION: Final = 1.0
-
-#: Duration of the warm-up simulation [s].
-_MOMENT: Final = 1e-6
+_DEFLECTION: Final = 5e-4  #: default tip deflection at the start [m], from section 3.2.8
+_DURATION: Final = 1.0  #: default duration if the force does not insert the needle [s]
+_MOMENT: Final = 1e-6  #: duration of the warm-up simulation [s]
 
 #: Default insertion depth at the start [m] and default force [N].
 _DEPTH, _FORCE = 0.02, 3.0

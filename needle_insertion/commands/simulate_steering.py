@@ -27,8 +27,7 @@ TO, SPEED, WAY = 0.1, 5e-3, 1e-3
 #: Columns of a table of guide motion, in addition to the depth.
 COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
 
-#: Most samples of a run.
-_MOST = 1_000_000
+_MOST = 1_000_000  #: most samples of a run
 
 
 def add_steering(parser: argparse.ArgumentParser) -> None:

@@ -9,12 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from needle_controller import (
-    OutOfReachError,
-    SIMULATION_LIMITS,
-    SteeringModel,
-    SteeringPrior,
-)
+from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
@@ -57,17 +52,13 @@ from needle_ros.files import write_whole
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-#: Default target [m].
-TARGET = '0.004,0.1,-0.002'
+TARGET = '0.004,0.1,-0.002'  #: default target [m]
 
 #: Constants of needle and tissue with an effect here; unknown disturbances are in the prior.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
 
-#: Standard deviation of the sampled disturbances, as a fraction of the prior.
-_DRAWN: Final = 0.5
-
-#: Number of needle shapes in the picture.
-_SHOWN: Final = 4
+_DRAWN: Final = 0.5  #: standard deviation of the sampled disturbances, as a fraction of the prior
+_SHOWN: Final = 4  #: number of needle shapes in the picture
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

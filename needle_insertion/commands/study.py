@@ -16,8 +16,7 @@ from needle_insertion.commands.common import check_folder, Subcommand
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.process_pool import processes
 
-#: Timeout for the answer of a scheduler, and for its first worker [s].
-_PATIENCE: Final = 10
+_PATIENCE: Final = 10  #: timeout for the answer of a scheduler, and for its first worker [s]
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

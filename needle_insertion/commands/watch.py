@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     # Takes long to import.
     from needle_insertion.watch.server import Server
 
-#: Signals that end the server.
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  #: signals that end the server
 
 #: Default address and port, as in `watch.server`, which takes long to import.
 HOST, PORT = '127.0.0.1', 8642

@@ -16,8 +16,7 @@ import numpy as np
 #: Scripts: drawing (also used by `needle watch`), and player.
 _SCRIPTS: Final = ('needle.js', 'animation.js')
 
-#: Largest number of points of a needle.
-_POINTS: Final = 40
+_POINTS: Final = 40  #: largest number of points of a needle
 
 #: Keys of a frame that are drawn.
 _DRAWN: Final = ('time', 'needle', 'shape', 'target', 'expected', 'tip', 'depth')
@@ -28,8 +27,7 @@ class Animation:
     """Animation of a needle from frames."""
 
     caption: str
-    #: From `needle_insertion.watch.scene.scene`.
-    scene: Mapping[str, Any]
+    scene: Mapping[str, Any]  #: from `needle_insertion.watch.scene.scene`
     #: Frames of `needle_insertion.watch.view.View.frame`, each with a needle.
     frames: Sequence[Mapping[str, Any]]
 

@@ -41,8 +41,7 @@ class Picture:
     name: str
     caption: str
     figure: Figure
-    #: Alternative text for screen readers; default: the caption.
-    description: str = ''
+    description: str = ''  #: alternative text for screen readers; default: the caption
 
     @cached_property
     def image(self) -> bytes:

@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 #: Smallest depth of the map as a fraction of the needle length; numbers of depths and deflections.
 SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
 
-#: Largest tip deflection of the map if none is given [m].
-LARGEST_DEFLECTION: Final = 2e-3
+LARGEST_DEFLECTION: Final = 2e-3  #: largest tip deflection of the map if none is given [m]
 
 #: Column heads of `OperatingPoint.row`.
 POINT_HEADS: Final = (
@@ -46,11 +45,7 @@ _MAPPED: Final = ('rank', 'distance', 'observed_rank', 'observed_margin', 'outpu
 _PANELS: Final = (
     ('distance', 'distance from losing state controllability', 'change of A, B (natural units)'),
     ('output_gain', 'tip deflection per base travel', 'm per m'),
-    (
-        'observed_margin',
-        'distance from losing observability',
-        'change of A, C (natural units)',
-    ),
+    ('observed_margin', 'distance from losing observability', 'change of A, C (natural units)'),
 )
 
 
@@ -123,11 +118,9 @@ def analyze_points(
     sliding: str | None = None,
 ) -> list[OperatingPoint]:
     """
-    Analyze every combination of depth [m], deflection [m] and velocity [m/s].
+    Analyze combinations of depth [m], deflection [m] and velocity [m/s], which varies fastest.
 
-    ``force`` is the insertion force [N]; ``sliding`` is the branch of dry friction at rest, a key
-    of `needle_dynamics.linearization.SLIDING`. Velocities vary fastest in the result. Raises
-    `NeedleError` if a point is not valid, or the needle sticks there.
+    ``force`` [N] inserts; ``sliding`` is as in `linearize`. `NeedleError` for an invalid point.
     """
     points = []
     for depth, deflection, speed in product(depths, deflections, speeds):

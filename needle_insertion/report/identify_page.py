@@ -42,8 +42,7 @@ import numpy as np
 #: Parameters that can be set on a running plant.
 _LIVE: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
-#: Largest number of recordings with a small plot.
-_MOST_EACH: Final = 60
+_MOST_EACH: Final = 60  #: largest number of recordings with a small plot
 
 _ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
 _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
@@ -268,8 +267,7 @@ def _stiffness_pictures(
             'stiffness_each',
             'Rest positions of the end-effector at each place, and the fitted ellipses.',
             figures.stiffness_each(
-                summary.estimates[:_MOST_EACH],
-                [label for label, _ in rows][:_MOST_EACH],
+                summary.estimates[:_MOST_EACH], [label for label, _ in rows][:_MOST_EACH]
             ),
             f'Small plots of {_shown_of(len(rows))}: points near ellipses.',
         ),

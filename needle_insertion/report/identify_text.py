@@ -181,11 +181,7 @@ def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """
-    Convert dataclasses, sequences, mappings and numbers to plain values for JSON.
-
-    Numbers that are not finite become None; arrays as long as a recording are left out.
-    """
+    """Convert values to JSON: None for numbers that are not finite, without arrays of samples."""
     if is_dataclass(value):
         named = {item.name: getattr(value, item.name) for item in fields(value)}
         # Arrays as long as the recording are only for figures.

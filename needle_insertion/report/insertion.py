@@ -25,14 +25,9 @@ COLUMNS: Final = (
     'torque_x [N m]', 'torque_y [N m]', 'torque_z [N m]',
 )  # fmt: skip
 
-#: Number of drawn needle shapes.
-_DRAWN: Final = 4
-
-#: Width of the picture [in].
-_WIDTH: Final = 9.0
-
-#: Margin around a needle [mm].
-_MARGIN: Final = 4.0
+_DRAWN: Final = 4  #: number of drawn needle shapes
+_WIDTH: Final = 9.0  #: width of the picture [in]
+_MARGIN: Final = 4.0  #: margin around a needle [mm]
 
 
 class InsertionRecord:
@@ -153,12 +148,7 @@ def draw_needle(
             axes.plot(1e3 * beside[:, 1], 1e3 * beside[:, k], color='gray', label='open loop')
         if target is not None:
             axes.plot(1e3 * target[1], 1e3 * target[k], 'x', color='tab:red', label='target')
-        axes.set(
-            ylabel=f'{"xyz"[k]} [mm]',
-            xlim=(begin, end),
-            ylim=limit,
-            aspect='equal',
-        )
+        axes.set(ylabel=f'{"xyz"[k]} [mm]', xlim=(begin, end), ylim=limit, aspect='equal')
         axes.grid(visible=True, alpha=0.3)
     axes.set_xlabel('depth y [mm]')
     figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=4)

@@ -11,8 +11,7 @@ from typing import Any, Final
 from needle_ros.errors import NeedleError
 from tqdm import tqdm
 
-#: Block size for reading a file [bytes].
-_PIECE: Final = 1 << 20
+_PIECE: Final = 1 << 20  #: block size for reading a file [bytes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,13 +19,11 @@ class RecordingSource:
     """Recording of a result."""
 
     name: str
-    #: Lost, discarded or corrected data.
-    losses: tuple[str, ...]
+    losses: tuple[str, ...]  #: lost, discarded or corrected data
     #: Stamps of the force minus stamps of the motion [s], already corrected.
     clock_offset: float
     samples: int
-    #: Paths and SHA-256.
-    files: tuple[tuple[str, str], ...]
+    files: tuple[tuple[str, str], ...]  #: paths and SHA-256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,13 +31,11 @@ class Origin:
     """Recordings and settings of a result."""
 
     settings: Any
-    #: Options of the reader; None for automatic selection by type.
-    reading: Mapping[str, Any]
+    reading: Mapping[str, Any]  #: options of the reader; None for automatic selection by type
     #: Written parameter file, if any.
     result: Path | None
     sources: Sequence[RecordingSource] = ()
-    #: Unusable recordings with reason.
-    failures: Sequence[tuple[str, str]] = ()
+    failures: Sequence[tuple[str, str]] = ()  #: unusable recordings with reason
     #: Recordings with the same samples as another, with its name; used once.
     copies: Sequence[tuple[str, str]] = ()
 

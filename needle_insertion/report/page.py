@@ -24,8 +24,7 @@ from needle_ros.files import write_whole
 #: Largest length of a cell with a number; longer text is for example a checksum.
 _LONGEST_NUMBER: Final = 40
 
-#: Largest length of a cell without sentences.
-_SENTENCE: Final = 30
+_SENTENCE: Final = 30  #: largest length of a cell without sentences
 #: Headings, and smallest number of headings for a table of contents.
 _HEADING: Final = re.compile('<h2 id="([^"]*)">(.*?)</h2>')
 _FEWEST_HEADINGS: Final = 4
@@ -99,9 +98,8 @@ def write_page(
     """
     Write a page atomically, and each of its pictures as a PNG in the same folder.
 
-    ``template`` is a template or its file name; it receives the pictures by name as ``pictures``,
-    the ``animation``, whose script is the only script that the policy permits, and ``content``
-    with at least ``title`` and ``introduction``.
+    The template receives ``pictures`` by name, ``content`` with at least ``title`` and
+    ``introduction``, and the ``animation`` with the only script that the policy permits.
     """
     shown = {one.name: one for one in pictures}
     page = TEMPLATES.get_template(template).render(

@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-#: Number of experiments of each mean and standard deviation.
-EXPERIMENTS: Final = 20
+EXPERIMENTS: Final = 20  #: number of experiments of each mean and standard deviation
 
 #: Table 1: mean and standard deviation of mu_s [N] and mu_v [N s/m].
 TABLE_1: Final[Mapping[str, tuple[float, float]]] = {
@@ -20,8 +19,7 @@ TABLE_1: Final[Mapping[str, tuple[float, float]]] = {
     'viscous_friction': (300.0, 44.7),
 }
 
-#: Force levels of Table 2 [N].
-FORCE_LEVELS: Final = (1.1, 1.2, 1.3, 1.4, 1.5)
+FORCE_LEVELS: Final = (1.1, 1.2, 1.3, 1.4, 1.5)  #: force levels of Table 2 [N]
 
 #: Table 2: means and standard deviations of each entry at each force level [N/m].
 TABLE_2: Final[Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]] = {

@@ -27,8 +27,7 @@ from needle_study.summary import (
 import numpy as np
 import yaml
 
-#: Quantiles of each metric.
-_PARTS: Final = (0.5, 0.95, 0.99)
+_PARTS: Final = (0.5, 0.95, 0.99)  #: quantiles of each metric
 
 #: Most bars of a histogram, and the number of samples from which its tail is cut off.
 _BARS, _TAILED = 80, 1000
@@ -46,8 +45,7 @@ _MOST: Final = 2**17
 
 _MISSING: Final = 'Samples without a value of a metric are excluded from it.'
 
-#: Number of worst samples in the list.
-_WORST: Final = 10
+_WORST: Final = 10  #: number of worst samples in the list
 
 
 def write_study(results: Results, path: Path) -> None:

@@ -9,8 +9,7 @@ import re
 from textwrap import fill, wrap
 from typing import Final
 
-#: Largest width of a table, unless words are longer.
-_WIDTH: Final = 100
+_WIDTH: Final = 100  #: largest width of a table, unless words are longer
 
 #: Spaces without line break: between number, unit and error, and within an interval.
 _TOGETHER: Final = re.compile(r' (±|to) (?=[-\d])|(?<=\d) (?=[A-Za-z%])')
@@ -76,8 +75,7 @@ def _total(widths: Sequence[int]) -> int:
     return sum(widths) + 2 * (len(widths) - 1)
 
 
-#: Heads of the rows of `Check.row`.
-CHECK_HEADS: Final = ('check', 'expected', 'found', 'verdict')
+CHECK_HEADS: Final = ('check', 'expected', 'found', 'verdict')  #: heads of the rows of `Check.row`
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from needle_identification import BagWriter
 
-#: Largest deflection of a linear beam, as a fraction of the insertion depth.
-_LINEAR: Final = 0.1
+_LINEAR: Final = 0.1  #: largest deflection of a linear beam, as a fraction of the insertion depth
 
 #: Modes that decay by exp(-_FADED) within this fraction of a run are negligible.
 _FADED: Final = 7.0

@@ -14,8 +14,7 @@ HEADER: Final = struct.Struct('>H12s20sIIQQ')
 #: Versions of the header: 1 and 2 of OpenIGTLink 1 to 3, and a future version.
 _VERSIONS: Final = (1, 2, 3)
 
-#: Largest accepted body [bytes]: 481 points.
-LARGEST: Final = 1 << 16
+LARGEST: Final = 1 << 16  #: largest accepted body [bytes]: 481 points
 
 #: Largest skipped body [bytes]; a larger size is a protocol error.
 _LARGEST_SKIPPED: Final = 1 << 30
@@ -30,12 +29,7 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """
-    Splitter of a byte stream into messages; unwanted messages are skipped and never stored.
-
-    `wanted` returns whether a message of a type and a device name is wanted; `refuse` is called
-    with a line about a wanted message that is too large.
-    """
+    """Splitter of a byte stream into wanted messages; `refuse` reports too large ones."""
 
     def __init__(
         self, wanted: Callable[[str, str], bool], refuse: Callable[[str], object]
@@ -45,11 +39,7 @@ class Frames:
         self._skip = 0
 
     def take(self, data: bytes) -> list[Frame]:
-        """
-        Process the next bytes of the stream; return the messages that are complete.
-
-        `MessageError` if this is not OpenIGTLink; the start of the next message is unknown then.
-        """
+        """Return the messages completed by further bytes; `MessageError` if not OpenIGTLink."""
         stream, at, found = self._rest + data, 0, []
         while True:
             step = min(self._skip, len(stream) - at)

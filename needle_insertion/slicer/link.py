@@ -23,11 +23,8 @@ from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.errors import MessageError
 from needle_ros.event_log import EventLog, Severity
 
-#: Time between attempts to listen or to connect [s].
-_RETRY: Final = 1.0
-
-#: Timeout of a peer that accepts no byte [s].
-_PATIENCE: Final = 5.0
+_RETRY: Final = 1.0  #: time between attempts to listen or to connect [s]
+_PATIENCE: Final = 5.0  #: timeout of a peer that accepts no byte [s]
 
 #: Largest read, largest sum of reads in a call of `poll`, and largest send queue [bytes].
 _AT_ONCE: Final = 1 << 14

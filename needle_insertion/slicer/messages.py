@@ -37,13 +37,11 @@ STATE: Final = 'NeedleState'
 #: Tolerance of a target on the skin, for 32-bit numbers and manual input [m].
 _ROUNDING: Final = 1e-4
 
-#: Longest state [characters]; the length of a STRING has 16 bits.
-_LONGEST_STATE: Final = 8000
+_LONGEST_STATE: Final = 8000  #: longest state [characters]; the length of a STRING has 16 bits
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
-#: Separators of the numbers of a STRING.
-_BETWEEN: Final = re.compile(r'[\s,;]+')
+_BETWEEN: Final = re.compile(r'[\s,;]+')  #: separators of the numbers of a STRING
 
 #: Exceptions of pyigtl for bodies that do not match their type.
 _NOT_UNDERSTOOD: Final = (struct.error, ValueError, TypeError, IndexError)
@@ -55,22 +53,13 @@ def is_wanted(kind: str, device: str) -> bool:
 
 
 class Interpreter:
-    """
-    Converter from messages of the peer to targets, and from the needle to messages.
-
-    `reach` is the largest accepted distance of a target from the entry point [m].
-    """
+    """Converter of targets, up to `reach` [m] from the entry point, and of needle shapes."""
 
     def __init__(self, registration: Registration, reach: float) -> None:
         self._registration, self._reach = registration, reach
 
     def target(self, frame: Frame) -> FloatArray | None:
-        """
-        Return the target of a message in ``needle_entry`` [m], shape (3,), or None.
-
-        None if the message has other points only; `MessageError` if the message is damaged or the
-        target is invalid. See `is_wanted`.
-        """
+        """Return the target in ``needle_entry`` [m] or None; `MessageError` if it is invalid."""
         found = _coordinates(_message(frame))
         if found is None:
             return None

@@ -10,14 +10,9 @@ from needle_ros.errors import MessageError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Timeout of measurements [s].
-_TIMEOUT: Final = 1.0
-
-#: Largest plausible coordinate [m].
-_FARTHEST: Final = 10.0
-
-#: Largest number of points of a shape: 0.5 m with a point per millimeter.
-MOST_POINTS: Final = 480
+_TIMEOUT: Final = 1.0  #: timeout of measurements [s]
+_FARTHEST: Final = 10.0  #: largest plausible coordinate [m]
+MOST_POINTS: Final = 480  #: largest number of points of a shape: 0.5 m with a point per millimeter
 
 #: Source of a shape: measured, or a straight line.
 MEASURED: Final = 'needle_poses'
@@ -27,14 +22,10 @@ LINE: Final = 'line from guide to tip, not measured'
 class Shape(NamedTuple):
     """Shape of the needle in ``needle_entry``."""
 
-    #: Time of the measurement [ns].
-    stamp: int
-    #: From the guide to the tip, shape (n, 3) [m]; at least two.
-    points: FloatArray
-    #: Orientation of the tip, with y along the needle: quaternion x, y, z, w.
-    turn: FloatArray
-    #: `MEASURED` or `LINE`.
-    source: str
+    stamp: int  #: time of the measurement [ns]
+    points: FloatArray  #: from the guide to the tip, shape (n, 3) [m]; at least two
+    turn: FloatArray  #: orientation of the tip, with y along the needle: quaternion x, y, z, w
+    source: str  #: `MEASURED` or `LINE`
 
 
 class EntryPose(NamedTuple):
@@ -56,11 +47,7 @@ class NeedleView:
         self._guide: tuple[float, FloatArray] | None = None
 
     def take_poses(self, stamp: int, points: ArrayLike, turn: ArrayLike, now: float) -> None:
-        """
-        Store a shape: points (n, 3) from the guide to the tip [m], and the quaternion of the tip.
-
-        ``stamp`` is in ns and ``now`` in s; `MessageError` if the shape is invalid.
-        """
+        """Store points (n, 3) from guide to tip [m] and its turn; `MessageError` if invalid."""
         positions = _places(points)
         if positions.ndim != 2 or not 2 <= len(positions) <= MOST_POINTS:
             raise MessageError(f'it has {len(positions)} poses, a shape has 2 to {MOST_POINTS}')
@@ -79,11 +66,7 @@ class NeedleView:
         self.expected = EntryPose(stamp, _places(position), _quaternion(turn))
 
     def shape(self, now: float) -> Shape | None:
-        """
-        Return the last shape, or after its timeout a line from the guide to the last tip position.
-
-        None after the timeout of both; ``now`` is in s.
-        """
+        """Return the last shape, later a line from guide to tip, or None after both timeouts."""
         if self._shape is not None and now - self._shape[0] <= _TIMEOUT:
             return self._shape[1]
         if self._tip is None or self._guide is None:

@@ -13,19 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-#: Millimeters per meter: OpenIGTLink and 3D Slicer use mm.
-MILLIMETERS: Final = 1e3
-
-#: Tolerance of the norm of a quaternion that is rounded to three digits.
-_ROUNDED: Final = 2e-3
+MILLIMETERS: Final = 1e3  #: millimeters per meter: OpenIGTLink and 3D Slicer use mm
+_ROUNDED: Final = 2e-3  #: tolerance of the norm of a quaternion that is rounded to three digits
 
 
 def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
-    """
-    Return the rotation matrix, shape (3, 3), of a quaternion x, y, z, w.
-
-    The quaternion is normalized; `ParameterError` if its norm is not 1 up to rounding.
-    """
+    """Return the rotation matrix of a quaternion xyzw; `ParameterError` if its norm is not 1."""
     given = np.array(quaternion, dtype=np.float64)
     norm = sqrt(given @ given) if given.shape == (4,) and np.isfinite(given).all() else 0.0
     if abs(norm - 1.0) > _ROUNDED:
@@ -37,13 +30,10 @@ def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
-    r"""
-    Pose of the frame ``needle_entry`` in the images.
+    """
+    Pose of the frame ``needle_entry`` in the images, p_image = R p_needle + t.
 
-    .. math:: p_{image} = R p_{needle} + t
-
-    By default the axes are parallel, and the entry point is the origin of the images: x to the
-    patient's right, y (into the tissue) anterior, z superior.
+    By default the origins are equal, and x is to the patient's right, y anterior, z superior.
     """
 
     rotation: tuple[float, ...] = constant(

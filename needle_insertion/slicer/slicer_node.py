@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 _CHECK: Final = 0.02
 _PERIOD: Final = 0.05
 
-#: Largest number of messages per reading.
-_AT_ONCE: Final = 16
+_AT_ONCE: Final = 16  #: largest number of messages per reading
 
 _PACKAGE: Final = 'pyigtl'
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-#: Time between two transmissions, unless something changes [s].
-_PERIOD: Final = 1.0
+_PERIOD: Final = 1.0  #: time between two transmissions, unless something changes [s]
 
 #: Largest number of nodes, and ages of a silent and of a removed node [s].
 _MOST: Final = 20

@@ -13,8 +13,7 @@ from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.view import RATE, row, SPAN, View
 from needle_ros.errors import ParameterError
 
-#: Time between two frames [s].
-PERIOD: Final = 1.0 / RATE
+PERIOD: Final = 1.0 / RATE  #: time between two frames [s]
 
 
 def _json(content: object) -> str:

@@ -30,8 +30,7 @@ _OTHERS: Final = (contract.NEEDLE_SHAPE, contract.TIP_EXPECTED, contract.DIAGNOS
 #: Largest number of stored messages per topic; longer recordings are decimated by two.
 _MOST: Final = 8192
 
-#: Rows of the history per second [Hz].
-_HISTORY_RATE: Final = 10.0
+_HISTORY_RATE: Final = 10.0  #: rows of the history per second [Hz]
 
 #: Range of the playback speed, relative to real time.
 SLOWEST, FASTEST = 0.02, 50.0
@@ -65,12 +64,7 @@ class _Kept(Generic[_Item]):
 
 
 class ShownRecording:
-    """
-    Content of a bag for the page, by time from its start.
-
-    `duration` is the time from the first to the last shown message [s], and `losses` describes
-    unreadable parts. Raises `RecordingError` if the bag is unreadable or has nothing to show.
-    """
+    """Content of a bag for the page by time [s]; `RecordingError` if it has nothing to show."""
 
     def __init__(self, path: Path) -> None:
         self.name = path.name or str(path)

@@ -35,11 +35,9 @@ def scene(configurations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """
     Return needle, tissue and limits for the page from the parameters of nodes, by node name.
 
-    ``tissue``: source node (``of``), ``length`` of the needle, ``free`` length between guide and
-    skin [m], ``layers`` (depth [m] and stiffness [N/m^2] of each) and ``membranes`` (depth [m] and
-    strength [N]); None without a configuration. ``limits``: of force, load [N], speed [m/s],
-    error, deflection and the depths ``low`` and ``high`` [m], if configured in the controller.
-    ``steered``: whether a node aims the tip.
+    ``tissue`` or None: source node ``of``, ``length``, ``free`` length, ``layers`` (depth,
+    stiffness) and ``membranes`` (depth, strength). ``limits``: force, load, speed, error,
+    deflection, depths ``low`` and ``high``. ``steered``: whether a node aims the tip. SI units.
     """
     whose = next((name for name in CONFIGURED if name in configurations), None)
     return {

@@ -29,8 +29,7 @@ from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 
-#: Default port.
-PORT: Final = 8642
+PORT: Final = 8642  #: default port
 
 #: Largest number of readers, and of bytes in a message of a reader.
 MOST_READERS: Final = 16
@@ -40,11 +39,8 @@ LONGEST: Final = 4096
 _AHEAD: Final = 2
 _MOST_ASKED: Final = 8
 
-#: A reader that accepts no data for this time is disconnected [s].
-_PATIENCE: Final = 10.0
-
-#: Period of the heartbeat of a WebSocket [s].
-_HEARTBEAT: Final = 20.0
+_PATIENCE: Final = 10.0  #: timeout of a reader that accepts no data [s]
+_HEARTBEAT: Final = 20.0  #: period of the heartbeat of a WebSocket [s]
 
 _PAGE: Final = Path(__file__).with_name('page')
 
@@ -90,12 +86,7 @@ class Control(Protocol):
 
 
 class Server:
-    """
-    HTTP and WebSocket server of the page; without a control the page is read-only.
-
-    `readers` returns the source of frames for a new reader; `port` 0 is a free port. Raises
-    `ParameterError` if the address is invalid, or a control would be open to other machines.
-    """
+    """HTTP and WebSocket server; `ParameterError` if a control would be open to other machines."""
 
     def __init__(
         self,
@@ -181,9 +172,7 @@ class Server:
 
     @web.middleware
     async def _guard(
-        self,
-        request: web.Request,
-        handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         """Reject requests that a foreign page can make a browser send."""
         fault = self._fault(request.headers.get('Host', ''), request.headers.get('Origin'))
@@ -273,12 +262,7 @@ class Server:
 
 
 class _Connection:
-    """
-    Connection to one reader, with flow control.
-
-    A frame is sent only after acknowledgement of previous frames, up to `_AHEAD`: a slow reader
-    skips frames, receives no outdated frames, and nothing accumulates.
-    """
+    """Connection to one reader, which skips frames until it acknowledges all but `_AHEAD`."""
 
     def __init__(self, socket: web.WebSocketResponse, reader: FrameReader) -> None:
         self.reader = reader

@@ -14,24 +14,16 @@ from needle_ros.status import ControllerStatus, NodeStatus, read_status, Steerin
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Frames per second.
-RATE: Final = 30.0
-
-#: Duration of the history [s].
-SPAN: Final = 20.0
-
-#: Timeout of the status of a node, which is published every second [s].
-_SILENT_NODE: Final = 3.0
-
-#: Position, velocity and effort of a missing joint.
-_NOTHING: Final = (None, None, None)
+RATE: Final = 30.0  #: frames per second
+SPAN: Final = 20.0  #: duration of the history [s]
+_SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
+_NOTHING: Final = (None, None, None)  #: position, velocity and effort of a missing joint
 
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
 _NODES: Final = 64
 
-#: Half width of a 95 % interval, in standard deviations.
-_NORMAL: Final = 1.96
+_NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 
 
 def number(value: float | None) -> float | None:

@@ -26,18 +26,14 @@ from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 
-#: QoS for the newest message only.
-_NEWEST: Final = contract.SENSOR._replace(depth=1)
-
-#: QoS for needle and path of two pictures.
-_LINES: Final = contract.SENSOR._replace(depth=4)
+_NEWEST: Final = contract.SENSOR._replace(depth=1)  #: QoS for the newest message only
+_LINES: Final = contract.SENSOR._replace(depth=4)  #: QoS for needle and path of two pictures
 
 #: Timeout of a target, including planning, and polling period of answers [s].
 _PLANNED: Final = 60.0
 _CHECK: Final = 0.01
 
-#: Largest number of events per call.
-_EVENTS: Final = 50
+_EVENTS: Final = 50  #: largest number of events per call
 
 #: QoS for the burst of status messages at the start.
 _STATUSES: Final = contract.SENSOR._replace(depth=50)
@@ -47,9 +43,8 @@ class WatchNode(Node):
     """
     Forward the newest message of each topic to a view on request.
 
-    The node is not spun: messages wait in the middleware, which keeps the newest only, and `poll`
-    takes them. Subscriptions are best effort, so that no publisher waits or resends, and the node
-    publishes nothing.
+    The node is not spun: `poll` takes the messages, of which the middleware keeps the newest.
+    Subscriptions are best effort, so that no publisher waits, and the node publishes nothing.
     """
 
     def __init__(self, view: View, context: Context) -> None:
@@ -77,12 +72,7 @@ class WatchNode(Node):
         self._listen(contract.DIAGNOSTICS, _STATUSES, self._on_diagnostics, raw=False)
 
     def _listen(
-        self,
-        topic: Topic,
-        qos: Qos,
-        take: Callable[[Any, float], None],
-        *,
-        raw: bool = True,
+        self, topic: Topic, qos: Qos, take: Callable[[Any, float], None], *, raw: bool = True
     ) -> None:
         """Subscribe to a topic and register the callback for its messages."""
         self._takers.append((waiting(self, topic, qos, raw=raw), take))

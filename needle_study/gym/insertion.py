@@ -24,8 +24,7 @@ TARGETS: Final = (0.03, 0.12)
 SPREAD: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
-#: Mask of a single environment.
-_ONE: Final = np.ones(1, dtype=bool)
+_ONE: Final = np.ones(1, dtype=bool)  #: mask of a single environment
 
 
 class _Needles:
@@ -74,10 +73,9 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
     Push a needle to a depth; friction and tissue are sampled around a preset in each episode.
 
-    The action is the force over 10 ms, as a fraction of 15 N. The observation is the error of
-    depth, velocity and depth in dm and dm/s, and the tip deflection in mm. The reward is the
-    negative error [m] minus a small price of force. The episode ends when the needle rests at its
-    target, or leaves its range, with a reward of -1.
+    Action: force over 10 ms, as a fraction of 15 N. Observation: error of depth, velocity and
+    depth in dm and dm/s, tip deflection in mm. Reward: negative error [m] minus a small price of
+    force. The episode ends at rest at the target, or outside the range with a reward of -1.
     """
 
     metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
@@ -105,11 +103,7 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 
 class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
-    """
-    Many needles at once, each as in `InsertionEnv` with its own seed.
-
-    An episode is truncated after `max_episode_steps`.
-    """
+    """Needles as in `InsertionEnv`, each with its own seed, for up to `max_episode_steps`."""
 
     metadata: ClassVar[dict[str, Any]] = {
         'render_modes': [], 'autoreset_mode': AutoresetMode.NEXT_STEP,

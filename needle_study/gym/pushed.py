@@ -20,14 +20,12 @@ PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
 #: Largest depth error [m] and speed [m/s] of a needle at rest at its target.
 NEAR, SLOW = 2e-4, 1e-3
 
-#: Price of force in the reward [1/N^2].
-PRICE: Final = 1e-5
+PRICE: Final = 1e-5  #: price of force in the reward [1/N^2]
 
 #: Units of an observation: error [m], velocity [m/s], depth [m], deflection [m].
 UNITS: Final = (0.1, 0.1, 0.1, 1e-3)
 
-#: Limit of observations, far above any plausible value.
-BOUND: Final = 1e3
+BOUND: Final = 1e3  #: limit of observations, far above any plausible value
 
 
 class Tissues(NamedTuple):
@@ -43,25 +41,22 @@ class Tissues(NamedTuple):
 class Pushed(NamedTuple):
     """State of n needles."""
 
-    #: Constants that are the same for all.
-    common: CompiledNeedle
+    common: CompiledNeedle  #: constants that are the same for all
     #: Coulomb friction [N] and viscous friction [N s/m], shape (n, 2).
     friction: Matrix
     layers: Tissues
     #: Times [s], shape (n,), and states, shape (n, 2 (2 + modes)).
     times: Vector
     states: Matrix
-    #: Target depths [m], shape (n,).
-    targets: Vector
+    targets: Vector  #: target depths [m], shape (n,)
 
 
 @kernel
 def push(boxed: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
-    Push the needles of the mask `which` for a period; overwrite their times and states.
+    Push the needles of the mask `which` for a period by actions, fractions of `FORCE` in [-1, 1].
 
-    Actions, shape (n,), are forces as fractions of `FORCE`, clipped to [-1, 1]. Returns rewards
-    [m], 0 where not pushed, and where a needle rests at its target or would have left its range.
+    Returns rewards [m], 0 where not pushed, and where a needle has arrived or left its range.
     """
     c, friction, layers, times, states, targets = boxed.value
     n, u = states.shape[0], states.shape[1] // 2

@@ -19,32 +19,20 @@ import numpy as np
 #: Default distribution of the unknown disturbances of a needle.
 PRIOR: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
 
-#: Upper bound of the seeds of paths.
-_SEEDS: Final = 2**63
+_SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 
 
 class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
-    Steer the tip to a target: one step of the needle for each action.
+    Steer the tip to a target in steps of a needle; needle, tissue and target are sampled.
 
-    Needle, tissue and target are sampled in each episode. The action is the position of the guide
-    for the next step, as a fraction of its limit. The observation is the depth over the target
-    depth, and as fractions of the guide limit the measured tip, the target and the guide, each x
-    and z. The reward at the end is the negative distance of the tip from the target [mm], before
-    it is 0. Then the info has ``miss``, the distance [m].
-
-    Parameters
-    ----------
-    needle : str
-        A key of `STEERING_PRESETS`.
-    depth, step : float
-        Depth of the target, and depth per step [m].
-    guide_limit : float
-        Largest displacement of the guide along x and z [m].
-    aside : float
-        Largest distance of the target from the axis, along x and z [m].
-    prior : SteeringPrior
-        Distribution of the needles.
+    ``needle`` is a key of `STEERING_PRESETS`, ``depth`` of the target, ``step`` and the limits of
+    guide and target (``aside``) along x and z in m, ``prior`` the distribution of the needles. The
+    action is the position of the guide for the next step, as a fraction of its limit. The
+    observation is the depth over the target depth, and as fractions of the guide limit the
+    measured tip, the target and the guide, each x and z. The reward at the end is the negative
+    distance of the tip from the target [mm], before it is 0. Then the info has ``miss``, the
+    distance [m].
     """
 
     metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
@@ -81,11 +69,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """
-        Start an episode with a new needle; return the observation and an empty dict.
-
-        ``options`` may have ``truth``, a `GroundTruth`, and ``target``, x and z [m].
-        """
+        """Start an episode; options: ``truth``, a `GroundTruth`, and ``target``, x and z [m]."""
         super().reset(seed=seed, options=options)
         rng, given = self.np_random, options or {}
         truth = sample_truth(
