@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
+from socket import AF_UNIX, SOCK_DGRAM, socket
 from typing import Final
 
-from needle_ros.errors import ParameterError
+from needle_ros.errors import JobError, ParameterError
 
 #: Environment variable of ROS 2: range of node discovery.
 RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -25,6 +26,9 @@ LOCAL: Final = {
 
 #: Environment variable of ROS 2: nodes of different domains are isolated.
 DOMAIN: Final = 'ROS_DOMAIN_ID'
+
+#: Address of the claim of a domain: abstract, without a file, and the same for all users.
+_CLAIM: Final = '\0needle_insertion/domain_{}'
 
 #: Largest domain ID with valid UDP ports for several processes.
 _LARGEST_DOMAIN: Final = 232
@@ -56,3 +60,22 @@ def domain_of(environment: Mapping[str, str]) -> int:
             f'{DOMAIN} must be a whole number from 0 to {_LARGEST_DOMAIN}, got {text!r}'
         )
     return int(text)
+
+
+def claim(domain: int) -> socket:
+    """Claim a domain until the last process with this socket ends; JobError if it is claimed."""
+    claimed = socket(AF_UNIX, SOCK_DGRAM)
+    try:
+        claimed.bind(_CLAIM.format(domain))
+    except OSError as error:
+        claimed.close()
+        raise JobError(
+            f'another session is running on domain {domain}: end it, or choose another {DOMAIN}'
+        ) from error
+    return claimed
+
+
+def is_claimed(domain: int) -> bool:
+    """Return whether a session of this machine has claimed a domain."""
+    with socket(AF_UNIX, SOCK_DGRAM) as probe:
+        return probe.connect_ex(_CLAIM.format(domain)) == 0

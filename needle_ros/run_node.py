@@ -25,7 +25,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-#: Environment variable: if set, a node ends with its parent process.
+#: Environment variable: a node ends with its parent process, of this process ID (1: any parent).
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
 
 _PR_SET_PDEATHSIG = 1
@@ -54,9 +54,8 @@ def run(kind: Callable[[], BaseNode]) -> int:
             # No command has been sent yet. An exception would appear as a compiler error.
             os._exit(0)
 
-    if os.environ.get(END_WITH_PARENT):
-        # Linux sends the signal when the parent process ends for any reason.
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if parent := os.environ.get(END_WITH_PARENT):
+        _end_with_parent(parent)
     for one in _ENDINGS:
         signal.signal(one, stop)
     stay_local(os.environ)
@@ -88,7 +87,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
                 node.begin(refuse)
             while not stopping and status == 0:
                 # Unlike spin_once, this call does not return to Python at each event.
-                executor.spin_until_future_complete(Future(), timeout_sec=0.1)
+                executor.spin_until_future_complete(Future(), timeout_sec=0.02)
         finally:
             # Command zero force also after an error.
             node.stop()
@@ -108,6 +107,14 @@ def run(kind: Callable[[], BaseNode]) -> int:
         # A second Ctrl-C must not change the exit status.
         for one in _ENDINGS:
             signal.signal(one, signal.SIG_IGN)
+
+
+def _end_with_parent(parent: str) -> None:
+    # Linux sends the signal when the parent process ends for any reason.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if parent not in ('1', str(os.getppid())):
+        # It ended before this call.
+        os._exit(0)
 
 
 def _read_files(node: BaseNode) -> None:

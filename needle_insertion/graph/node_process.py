@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from typing import IO
 
 from needle_insertion.nodes import NODES
 from needle_ros.errors import JobError
+from needle_ros.run_node import END_WITH_PARENT
 import yaml
 
 
@@ -23,7 +25,7 @@ class NodeProcess:
     One node of the suite, a key of `NODES`, as a process.
 
     `environment` selects the domain, `log` receives the output of the node, and `parameters`
-    override the ROS parameter file `file`.
+    override the ROS parameter file `file`. It inherits the files `inherited`, and no terminal.
     """
 
     def __init__(
@@ -33,9 +35,11 @@ class NodeProcess:
         environment: Mapping[str, str],
         log: IO[str],
         file: Path | None = None,
+        inherited: Sequence[int] = (),
     ) -> None:
         self.name = name
-        self.killed = False
+        #: Whether its end is intended or known.
+        self.ended = False
         self._log = log
         settings = [] if file is None else ['--params-file', str(file)]
         for key, value in parameters.items():
@@ -44,15 +48,18 @@ class NodeProcess:
             settings += ['-p', f'{key}:={text}']
         self.process = subprocess.Popen(
             [sys.executable, '-m', NODES[name], '--ros-args', *settings],
-            env=dict(environment),
+            env={**environment, END_WITH_PARENT: str(os.getpid())},
             stdout=log,
             stderr=subprocess.STDOUT,
+            pass_fds=inherited,
+            start_new_session=True,
         )
 
     def check(self) -> None:
-        """Raise `GraphError` with the last line of output if the node has ended."""
+        """Raise `GraphError` with the last line of output if the node has ended, once."""
         status = self.process.poll()
-        if status is not None:
+        if status is not None and not self.ended:
+            self.ended = True
             raise GraphError(
                 f'{self.name} ended early with status {status}: {self.last_line or "no output"}'
             )
@@ -66,12 +73,13 @@ class NodeProcess:
 
     def kill(self) -> None:
         """Kill the node, as in a crash, and wait for it."""
-        self.killed = True
+        self.ended = True
         self.process.kill()
         self.process.wait()
 
     def interrupt(self, timeout: float = 15.0) -> None:
         """End the node with SIGINT; raise `GraphError` after a timeout [s] or an error."""
+        self.ended = True
         self.process.send_signal(signal.SIGINT)
         try:
             status = self.process.wait(timeout)

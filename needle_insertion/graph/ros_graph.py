@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 import gc
+from itertools import filterfalse
 import os
 from pathlib import Path
 import subprocess
@@ -17,7 +18,7 @@ from domain_coordinator import domain_id
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.graph.node_process import GraphError, NodeProcess
-from needle_ros.network import domain_of, LOCAL, stay_local
+from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
 from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
@@ -48,7 +49,7 @@ class Graph:
 
     `logs` is the folder of the node output. The executor runs the nodes of this process in the
     thread of the caller, so that an error in a callback is an error of the caller. If `shared`,
-    the graph is on the domain of the user, open to other machines as set in the environment.
+    the graph claims the domain of the user, open to other machines as set in the environment.
     """
 
     def __init__(
@@ -64,17 +65,20 @@ class Graph:
         self._processes: list[NodeProcess] = []
         self._files: list[IO[str]] = []
         self._nodes: list[Node] = []
+        self._domain = ExitStack()
+        self._inherited: list[int] = []
         self._life_cycles: dict[str, Client] = {}
 
     def __enter__(self) -> Graph:
         # The context of this process also reads the environment.
         if self._shared:
             stay_local(os.environ)
-            self._domain: AbstractContextManager[int] = nullcontext(domain_of(os.environ))
+            self.domain = domain_of(os.environ)
+            self._inherited.append(self._domain.enter_context(claim(self.domain)).fileno())
         else:
             os.environ.update(LOCAL)
-            self._domain = domain_id()
-        self.domain = self._domain.__enter__()
+            free = filterfalse(is_claimed, range(1, 101))
+            self.domain = self._domain.enter_context(domain_id(partial(next, free)))
         self.environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(self.domain),
@@ -115,7 +119,7 @@ class Graph:
                 started.process.wait()
             for file in self._files:
                 file.close()
-            self._domain.__exit__(*raised)
+            self._domain.close()
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Create a node of a class in this process, spun by `spin_until`."""
@@ -146,7 +150,7 @@ class Graph:
         # The process writes to it until the graph closes it.
         log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
         self._files.append(log)
-        process = NodeProcess(name, parameters or {}, self.environment, log, file)
+        process = NodeProcess(name, parameters or {}, self.environment, log, file, self._inherited)
         self._processes.append(process)
         return process
 
@@ -224,9 +228,7 @@ class Graph:
             if (now := sign()) != last:
                 deadline, last = time.monotonic() + timeout, now
             for started in self._processes:
-                # A process that was interrupted on purpose ends with status 0.
-                if started.process.poll() not in (None, 0) and not started.killed:
-                    started.check()
+                started.check()
             if time.monotonic() > deadline:
                 lines = [f'{one.name}: {one.last_line}' for one in self._processes]
                 waiting = f'timeout after {timeout:g} s: waiting for {what}'

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import FileIO
 from queue import SimpleQueue
 import readline
 import sys
@@ -37,10 +38,11 @@ class Screen:
             yield
         finally:
             if before is not None:
-                # The thread may still wait for a line, with a terminal in its input mode.
-                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
-                if self._asked:
-                    sys.stdout.write('\n')
+                # The thread may still wait for a line. A closed terminal is an error.
+                with suppress(termios.error, OSError):
+                    termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+                    if self._asked:
+                        sys.stdout.write('\n')
 
     def complete(self, words: Sequence[str]) -> None:
         """Complete words with the tab key."""
@@ -58,7 +60,11 @@ class Screen:
 
     def _line(self) -> str | Exception | None:
         try:
-            return input(_PROMPT if self.typed else '')
+            if self.typed or not sys.stdin:
+                return input(_PROMPT)
+            # A thread that holds the lock of a buffer would abort the end of the process.
+            line = FileIO(sys.stdin.fileno(), closefd=False).readline().decode()
+            return line.rstrip('\r\n') if line else None
         except EOFError:
             return None
         except (OSError, ValueError, RuntimeError) as error:

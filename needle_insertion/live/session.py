@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 import os
 from pathlib import Path
+import signal
 import sys
 from time import monotonic
 from typing import Any, Final
@@ -77,6 +78,7 @@ def run(session: Session) -> int:
     screen = Screen()
     with Graph(session.logs, shared=True) as graph:
         node = graph.node('operator')
+        _check_alone(session, graph, node, own=0, discovery=1.0)
         operator = Operator(node)
         readings = Readings(Node('readings', context=graph.context))
         screen.say(f'starting {", ".join(session.nodes)}')
@@ -87,8 +89,16 @@ def run(session: Session) -> int:
         terminal = Terminal(graph, operator, readings, screen)
         terminal.begin(session.nodes)
         screen.say(f'on domain {graph.domain}; `help` lists the words')
+        # Suspended, the session could not stop the needle.
+        signal.signal(signal.SIGTSTP, signal.SIG_IGN)
         with screen.reading():
-            _converse(terminal, screen, processes, witness)
+            rests = False
+            try:
+                _converse(terminal, screen, witness)
+                rests = terminal.rests
+            finally:
+                if not rests:
+                    terminal.stop()
         # Nodes that move the needle end first, the recorder last: the bag is complete.
         for name in _ENDING:
             for process in processes:
@@ -135,7 +145,7 @@ def _bring_up(
 
     what = 'the nodes' if own else 'a robot that publishes joint_states, and for the nodes'
     graph.spin_until(listen, what, _START)
-    _check_alone(graph, node)
+    _check_alone(session, graph, node, own=1)
     if own:
         show('plant')
         followers = [name for name in session.nodes if name in ('recorder', 'steering')]
@@ -144,27 +154,34 @@ def _bring_up(
     return processes
 
 
-def _check_alone(graph: Graph, node: Node) -> None:
-    """Reject a second plant or controller."""
-    for topic, there in (
-        (contract.JOINT_STATES, 'plant'),
-        (contract.WRENCH_COMMAND, 'controller'),
-    ):
-        if (number := node.count_publishers(topic.name)) > 1:
-            raise GraphError(
-                f'{number} nodes publish {topic.name} on domain {graph.domain}: another {there} '
-                f'is running. End it, or choose another {DOMAIN}'
-            )
-
-
-def _converse(
-    terminal: Terminal,
-    screen: Screen,
-    processes: Sequence[NodeProcess],
-    witness: Witness | None,
+def _check_alone(
+    session: Session, graph: Graph, node: Node, *, own: int, discovery: float = 0.0
 ) -> None:
+    """Reject more than `own` nodes in a role of the session, during a time for discovery [s]."""
+    end = monotonic() + discovery
+
+    def has_passed() -> bool:
+        for name, topic in (
+            ('plant', contract.JOINT_STATES),
+            ('controller', contract.WRENCH_COMMAND),
+            ('controller', contract.REFERENCE),
+            ('steering', contract.TIP_EXPECTED),
+            ('recorder', contract.RECORDED),
+        ):
+            # Without a plant of its own the session needs a robot.
+            if node.count_publishers(topic.name) > (own if name in session.nodes else 1):
+                raise GraphError(
+                    f'another {name} is running on domain {graph.domain}: end it, or choose '
+                    f'another {DOMAIN}'
+                )
+        return monotonic() >= end
+
+    graph.spin_until(has_passed, 'discovery')
+
+
+def _converse(terminal: Terminal, screen: Screen, witness: Witness | None) -> None:
     """Execute one line after another, until `quit` or the end of the script."""
-    while (line := terminal.next_line()) is not None:
+    for number, line in enumerate(iter(terminal.next_line, None), 1):
         word = (line.partition('#')[0].split() or [''])[0]
         if witness is not None and word not in _AT_REST:
             witness.release()
@@ -175,9 +192,9 @@ def _converse(
             if witness is not None and word == 'target':
                 witness.release()
                 witness = None
+        except GraphError:
+            raise
         except NeedleError as error:
-            for process in processes:
-                process.check()
             if not screen.typed:
-                raise
+                raise type(error)(f'line {number}: {error}') from error
             screen.say(f'error: {error}')

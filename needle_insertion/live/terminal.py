@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from math import inf, isfinite
 import re
 import shlex
@@ -11,6 +12,7 @@ from typing import Final
 
 from needle_controller import LAWS
 from needle_insertion.graph.messages import State
+from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.live.readings import Readings
@@ -19,7 +21,7 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
-from needle_ros.status import ControllerStatus, SteeringPhase, SteeringStatus
+from needle_ros.status import ControllerStatus, RecorderStatus, SteeringPhase, SteeringStatus
 from rclpy.task import Future
 import yaml
 
@@ -28,6 +30,10 @@ _ANSWER: Final = 30.0
 
 #: Settling time of the needle after the end of the reference [s].
 _SETTLING: Final = 1.0
+
+#: Timeout of a stop [s], and velocity below which the needle rests [m/s].
+_BRAKING: Final = 2.0
+_REST: Final = 1e-4
 
 #: Timeout of the status of a node, which is published every second [s].
 _SILENT: Final = 5.0
@@ -49,7 +55,7 @@ _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
 _ERROR: Final = _LEVELS.index('ERROR')
 
 #: Phases in which no insertion is under way.
-_AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE)
+_AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE, SteeringPhase.STOPPED)
 
 #: Arguments and description of each command.
 WORDS: Final = {
@@ -107,6 +113,26 @@ class Terminal:
 
         self._spin_until(has_accepted, f'{topic}, an input of {name}', _ANSWER)
 
+    @property
+    def rests(self) -> bool:
+        """Whether the needle rests and no steered insertion is under way."""
+        insertion = self._readings.insertion()
+        return (
+            insertion is not None
+            and abs(insertion[1]) < _REST
+            and not any(
+                isinstance(state.status, SteeringStatus) and state.status.phase not in _AT_REST
+                for state in self._operator.states.values()
+            )
+        )
+
+    def stop(self) -> None:
+        """Stop the needle by the nodes that still run, and wait until it rests."""
+        self._operator.ask('stop')
+        # After the timeout the nodes end all the same.
+        with suppress(GraphError):
+            self._graph.spin_until(lambda: self.rests, 'rest', _BRAKING)
+
     def next_line(self) -> str | None:
         """Wait for the next line, None at the end; raise `GraphError` if a node ends."""
         self._screen.ask()
@@ -154,11 +180,13 @@ class Terminal:
         self._graph.spin_until(holds, what, timeout)
 
     def _print_warnings(self) -> None:
-        """Print new warnings and errors of the nodes."""
+        """Print new warnings and errors of the nodes; raise `GraphError` without a recording."""
         if not self._begun:
             # During the start the nodes wait for each other.
             return
         for name, state in self._operator.states.items():
+            if isinstance(state.status, RecorderStatus) and state.status.failure:
+                raise GraphError(f'{name}: {state.status.failure}')
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
                 level, message = _ERROR, f'no status for {_SILENT:g} s'
