@@ -210,6 +210,11 @@ class Robot:
         As given.
     estimates : bool
         Whether velocities are estimated.
+    probe : float or None
+        Insertion depth that is commanded for a check [m]: NaN for no command; None without a
+        check.
+    felt : tuple of float
+        Last force of the sensor on the needle, along x, y and z of ``needle_base`` [N].
 
     """
 
@@ -218,6 +223,8 @@ class Robot:
         self._gain = settings.sign * settings.scale
         self._axes = settings.axes()
         self._base: Admittance | None = None
+        self.probe: float | None = None
+        self.felt = 0.0, 0.0, 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -384,6 +391,7 @@ class Robot:
         turned = tuple(
             sign * one * numbers[begin + axis] for begin in (0, 3) for axis, one in self._axes
         )
+        self.felt = turned[0], turned[1], turned[2]
         return reading._replace(values=(turned,))
 
     # To the robot.
@@ -418,6 +426,8 @@ class Robot:
             # Without a reference no motion is requested, except for a repeated message.
             if stopped:
                 length = base.give_way()
+            elif answer.reference and self.probe is not None:
+                length = base.place(self.probe, self._depth) if isfinite(self.probe) else None
             elif answer.reference:
                 length = base.step(answer.force - load, self._depth, answer.stamp)
             elif base.answered == answer.stamp:
