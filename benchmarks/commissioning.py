@@ -45,7 +45,7 @@ _MOTION: Final = 0.01
 HARMFUL: Final = 2e-3
 
 #: Duration of a session [s], its request, and the rest after a refusal.
-_DURATION: Final = 10.0
+_DURATION: Final = 7.5
 _REQUEST: Final = 1.0
 _REST: Final = 0.5
 

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
 from math import nan
-from typing import TypeAlias
 
 from needle_controller.controller import Controller, ControllerOutput, Measurement
 from needle_controller.hardware import POSITION, Robot, STAMPS
@@ -34,9 +33,6 @@ _FIRST, _DOUBLING = 1e-5, 0.15
 _WEAKER, _STRONGER = 0.1, 1.5
 #: Number of measurements of a delay, and least change of the force that is a response [N].
 _TRIES, _FELT = 3, 0.05
-
-#: Receives measurements and yields forces [N].
-_Steps: TypeAlias = Generator[float, Measurement, None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,43 +63,37 @@ class CommissioningSettings:
             )
 
 
-def _require(condition: object, reason: str) -> None:
-    if not condition:
-        raise JobError(reason)
-
-
+@dataclass
 class Commissioning:
     """
     Compare the configuration with measured depths, and the first motion with the configuration.
 
-    The first motion is small, slow, and out of the tissue. A robot with position commands follows
-    a ramp. With efforts, the force grows from nearly zero until the needle moves. Before, no force
-    acts and no position is commanded. `phase` and `result` are its state.
+    The first motion is small, slow, and out of the tissue. Before, no force acts and no position
+    is commanded.
     """
 
-    def __init__(
-        self,
-        settings: CommissioningSettings,
-        robot: Robot,
-        controller: Controller,
-        limits: SafetyLimits,
-    ) -> None:
-        self._settings, self._robot, self._controller = settings, robot, controller
+    settings: CommissioningSettings
+    robot: Robot
+    controller: Controller
+    limits: SafetyLimits
+    phase: CommissioningPhase = CommissioningPhase.SKIPPED
+    result: str = ''
+
+    def __post_init__(self) -> None:
         self._time = self._depth = nan
-        self.phase, self.result = CommissioningPhase.SKIPPED, ''
-        if settings.enabled:
-            self._check_configuration(limits)
+        if self.settings.enabled:
+            self._check_configuration()
             self._restart(CommissioningPhase.WAITING)
 
-    def _check_configuration(self, limits: SafetyLimits) -> None:
+    def _check_configuration(self) -> None:
         """Reject a sign, scale, zero, lead or speed that contradicts the measured depths."""
-        settings, own = self._settings, self._robot.settings
-        if not settings.positions:
+        own, limits, tolerance = self.robot.settings, self.limits, self.settings.tolerance
+        if not self.settings.positions:
             return
-        (p, q), (a, b), tolerance = settings.positions, settings.depths, settings.tolerance
+        (p, q), (a, b) = self.settings.positions, self.settings.depths
         gain = (b - a) / (q - p)
         zero, ratio = p - a / gain, abs(gain) / own.scale
-        low, high = self._controller.settings.depths(self._controller.parameters)
+        low, high = self.controller.settings.depths(self.controller.parameters)
         for name, error, most, valid in (
             ('sign', -own.sign * gain, 0.0, f'{-own.sign:g}'),
             ('scale', abs(ratio - 1.0) * (high - low), tolerance, f'{abs(gain):.6g}'),
@@ -120,20 +110,19 @@ class Commissioning:
 
     def _restart(self, phase: CommissioningPhase, result: str = '') -> None:
         """Discard all measurements."""
-        own = self._controller.settings
-        self._steps: _Steps | None = None
+        own = self.controller.settings
+        self._steps: Generator[float, Measurement, None] | None = None
         #: Time, depth, velocity and force at rest, and changes since.
         self._rest: deque[tuple[float, ...]] = deque(maxlen=_AT_REST)
         self._rows = [np.zeros(6)]
         self._rate = RateMonitor(own.rate, own.measurement_timeout)
-        self._robot.probe = nan
-        self.phase, self.result = phase, result
+        self.robot.probe, self.phase, self.result = nan, phase, result
 
     def command(self, measured: Measurement, moves: bool) -> ControllerOutput | None:
         """Answer a measurement; `moves` is a requested motion. Return None when it is passed."""
         if self.phase in (CommissioningPhase.SKIPPED, CommissioningPhase.PASSED):
             return None
-        longest = self._controller.settings.measurement_timeout + self._controller.period
+        longest = self.controller.settings.measurement_timeout + self.controller.period
         elapsed, self._time = measured.time - self._time, measured.time
         if not 0.0 < elapsed <= longest or (self._steps is not None and not moves):
             self._restart(CommissioningPhase.WAITING)
@@ -151,7 +140,7 @@ class Commissioning:
                     next(self._steps)
                     self.phase = CommissioningPhase.MOVING
         except StopIteration:
-            self._robot.probe = None
+            self.robot.probe = None
             return None
         except JobError as error:
             self._restart(CommissioningPhase.REFUSED, str(error))
@@ -159,102 +148,103 @@ class Commissioning:
         return ControllerOutput(force=force, setpoint=Setpoint(self._depth), refusal=refusal)
 
     def _row(self, measured: Measurement) -> tuple[float, ...]:
-        return measured.time, measured.depth, measured.velocity, *self._robot.felt
+        return measured.time, measured.depth, measured.velocity, *self.robot.felt
 
     def _add(self, measured: Measurement) -> None:
         """Add a measurement; the joint must not move against or beyond the command."""
         self._rows.append(self._row(measured) - self._zero)
-        most = self._settings.distance
+        most = self.settings.distance
         beyond = abs(self._rows[-1][1] + 0.5 * most) - (0.5 + _TOLERANCE) * most
-        self._responds(beyond <= self._noise[1], f'at most {-1e3 * most:.3g} mm')
+        self._require_response(beyond <= self._noise[1], f'at most {-1e3 * most:.3g} mm')
 
-    def _responds(self, condition: object, command: str) -> None:
-        _require(
-            condition,
-            f'the joint {self._robot.settings.joint!r} moved {1e3 * self._rows[-1][1]:+.3g} mm on '
-            f'a command of {command}: hardware.joint, sign, scale, command, command_topic or '
-            'command_joints, delay, or the driver',
-        )
+    def _require_response(self, condition: bool, command: str) -> None:
+        if not condition:
+            raise JobError(
+                f'the joint {self.robot.settings.joint!r} moved {1e3 * self._rows[-1][1]:+.3g} mm '
+                f'on a command of {command}: hardware.joint, sign, scale, command, command_topic '
+                'or command_joints, delay, or the driver'
+            )
 
     def _check_at_rest(self) -> None:
         """Check that the facts are stated, and depth, rate and noise at rest."""
-        settings, depth, noise = self._settings, self._zero[1], self._noise[1]
-        _require(
-            settings.positions and settings.start_depth > _UNSTATED,
-            'hardware.commissioning.positions, depths and start_depth are not stated: measure the '
-            'robot once (hardware.commissioning.enabled false skips this check)',
-        )
-        _require(
-            abs(depth - settings.start_depth) <= settings.tolerance,
-            f'the insertion depth is {depth:.6g} m, measured {settings.start_depth:g} m '
-            '(hardware.commissioning.start_depth): hardware.joint or hardware.zero',
-        )
-        line = self._rate.warning() if self._robot.settings.stamps == STAMPS[0] else None
-        _require(line is None, str(line))
-        _require(
-            noise <= settings.distance,
-            f'the insertion depth at rest varies by {noise:.3g} m, more than '
-            f'hardware.commissioning.distance {settings.distance:g} m',
-        )
+        settings, depth, noise = self.settings, self._zero[1], self._noise[1]
+        if not settings.positions or settings.start_depth == _UNSTATED:
+            raise JobError(
+                'hardware.commissioning.positions, depths and start_depth are not stated: measure '
+                'the robot once (hardware.commissioning.enabled false skips this check)'
+            )
+        if abs(depth - settings.start_depth) > settings.tolerance:
+            raise JobError(
+                f'the insertion depth is {depth:.6g} m, measured {settings.start_depth:g} m '
+                '(hardware.commissioning.start_depth): hardware.joint or hardware.zero'
+            )
+        if self.robot.settings.stamps == STAMPS[0] and (line := self._rate.warning()):
+            raise JobError(line)
+        if noise > settings.distance:
+            raise JobError(
+                f'the insertion depth at rest varies by {noise:.3g} m, more than '
+                f'hardware.commissioning.distance {settings.distance:g} m'
+            )
 
-    def _first_motion(self) -> _Steps:
-        """Move, and check velocity and force of the motion."""
-        robot = self._robot
+    def _first_motion(self) -> Generator[float, Measurement, None]:
+        """Receive measurements and yield forces; check velocity and force of the motion."""
+        own = self.robot.settings
         self._zero = np.array([self._time, *np.mean(self._rest, axis=0)[1:]])
         self._noise = _SIGMAS * np.std(self._rest, axis=0)
         self._check_at_rest()
-        lag = yield from (
-            self._by_position() if robot.settings.command == POSITION else self._by_force()
-        )
+        lag = yield from self._by_position() if own.command == POSITION else self._by_force()
         rows = np.array(self._rows)
         moved, by_velocity = rows[-1, 1], np.diff(rows[:, 0]) @ rows[1:, 2]
-        _require(
-            robot.estimates or abs(by_velocity - moved) <= 0.5 * abs(moved) + self._noise[1],
-            f'the position moved {1e3 * moved:.3g} mm, and {1e3 * by_velocity:.3g} mm by its '
-            'velocity: unit of the velocity, or hardware.stamps',
-        )
+        contradiction = abs(by_velocity - moved) > 0.5 * abs(moved) + self._noise[1]
+        if contradiction and not self.robot.estimates:
+            raise JobError(
+                f'the position moved {1e3 * moved:.3g} mm, and {1e3 * by_velocity:.3g} mm by its '
+                'velocity: unit of the velocity, or hardware.stamps'
+            )
         # Largest change of the force, and its axis.
         change = max(rows[:, 3:], key=np.linalg.norm)
         axis = int(np.argmax(np.abs(change)))
         pull, felt = change[axis], 'no force measured'
         if abs(pull) > max(self._noise[3 + axis], _FELT):
-            index, sign = robot.settings.axes()[axis]
-            wanted = ('-' if sign * pull > 0.0 else '') + AXES[index]
-            if axis == 1:
-                wanted += f', or hardware.reaction to {not robot.settings.reaction}'.lower()
-            _require(
-                axis == 1 and pull < 0.0,
-                f'the force on the needle changed by {pull:+.2f} N along {AXES[axis]} of '
-                f'needle_base, not -y: set hardware.force_axis to {wanted}',
-            )
             felt = f'force {pull:+.2f} N'
+            if axis != 1 or pull > 0.0:
+                index, sign = own.axes()[axis]
+                wanted = ('-' if sign * pull > 0.0 else '') + AXES[index]
+                other = f', or hardware.reaction to {not own.reaction}'.lower()
+                raise JobError(
+                    f'the force on the needle changed by {pull:+.2f} N along {AXES[axis]} of '
+                    f'needle_base, not -y: set hardware.force_axis to {wanted}'
+                    + (other if axis == 1 else '')
+                )
         self.phase = CommissioningPhase.PASSED
         self.result = f'moved {1e3 * moved:+.2f} mm, {1e3 * lag:.0f} ms late, {felt}'
 
     def _by_position(self) -> Generator[float, Measurement, float]:
         """Command a ramp; return the delay of the robot [s]."""
-        settings, behind = self._settings, list[float]()
-        length, duration = settings.distance, settings.distance / settings.speed
+        settings, behind = self.settings, list[float]()
+        length, period = settings.distance, self.controller.period
+        # Long enough to measure the delay.
+        duration = max(length / settings.speed, 4.0 * settings.lag + 8.0 * period)
         time = moved = command = 0.0
         while time < duration or moved - command > _TOLERANCE * length:
-            self._responds(time < duration + _SETTLING, f'{1e3 * command:.3g} mm')
-            self._robot.probe = float(self._zero[1]) + command
+            self._require_response(time < duration + _SETTLING, f'{1e3 * command:.3g} mm')
+            self.robot.probe = float(self._zero[1]) + command
             self._add((yield 0.0))
             time, moved, *_ = self._rows[-1]
-            command = -min(settings.speed * time, length)
+            command = -length * min(time / duration, 1.0)
             if 0.5 * duration < time < duration:
                 behind.append(moved - command)
-        lag = float(np.mean(behind)) / settings.speed
-        _require(
-            lag <= settings.lag + self._controller.period,
-            f'the robot follows {lag:.3g} s late, hardware.commissioning.lag is {settings.lag:g} '
-            's: lower this delay, or the gains of the law for it',
-        )
+        lag = float(np.mean(behind)) * duration / length
+        if lag > settings.lag + period:
+            raise JobError(
+                f'the robot follows {lag:.3g} s late, hardware.commissioning.lag is '
+                f'{settings.lag:g} s: lower this delay, or the gains of the law for it'
+            )
         return lag
 
     def _by_force(self) -> Generator[float, Measurement, float]:
         """Pull with a growing force until the needle moves; return the delay of its end [s]."""
-        settings, own = self._settings, self._controller
+        settings, own = self.settings, self.controller
         axis = Axis.insertion(own.parameters)
         dry = axis.coulomb * axis.breakaway * max(axis.withdrawal, 1.0)
         friction = dry + settings.speed * (axis.viscous + axis.inertia / _DOUBLING)
@@ -264,16 +254,16 @@ class Commissioning:
             begin, origin, *_ = time, moved, velocity = self._rows[-1][:3]
             pull = grown = 0.0
             while origin - moved <= _TOLERANCE * settings.distance + self._noise[1]:
-                self._responds(grown < 2.0, f'{-pull:.3g} N, or model.*')
+                self._require_response(grown < 2.0, f'{-pull:.3g} N, or model.*')
                 grown = _FIRST * 2.0 ** ((time - begin) / _DOUBLING)
                 pull = most * min(grown, 1.0)
                 self._add((yield -pull))
                 time, moved, velocity = self._rows[-1][:3]
-            _require(
-                pull >= _WEAKER * friction,
-                f'the needle moves at {pull:.3g} N, the nominal friction is {friction:.3g} N: '
-                'unit of the driver, hardware.scale, hardware.command or model.*',
-            )
+            if pull < _WEAKER * friction:
+                raise JobError(
+                    f'the needle moves at {pull:.3g} N, the nominal friction is {friction:.3g} N: '
+                    'unit of the driver, hardware.scale, hardware.command or model.*'
+                )
             end, fastest = time, abs(velocity)
             while abs(velocity) > 0.5 * fastest and time < end + _SETTLING:
                 self._add((yield 0.0))

@@ -165,7 +165,7 @@ class Terminal:
             if isinstance(status, ControllerStatus) and status.commissioning is not self._checked:
                 self._checked = status.commissioning
                 phase = self._checked.value if self._checked else ''
-                self._say(f'{name}: first motion {phase} {status.commissioning_result}')
+                self._say(f'{name}: first motion {phase} {status.commissioning_result}'.rstrip())
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
                 level, message = _ERROR, f'no status for {_SILENT:g} s'
