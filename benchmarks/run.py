@@ -32,6 +32,7 @@ MODULES = {
     'steering': ('steering',),
     'laws': ('laws',),
     'safety': ('safety',),
+    'commissioning': ('commissioning',),
     'graph': ('graph',),
     'slicer': ('slicer',),
     'study': ('study', 'environments'),
@@ -67,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
     safety = add('safety', help='effect of faults, other nodes and kills on a motion')
     safety.add_argument('--fault', metavar='NAME', help='only this fault, in simulated time')
+    check = add('commissioning', help='errors in hardware.*, refused by the first motion')
+    check.add_argument('--errors', type=int, metavar='N', help='random errors')
     graph = add('graph', help='cost of the nodes compared with bare rclpy nodes')
     plan = graph.add_mutually_exclusive_group()
     plan.add_argument(

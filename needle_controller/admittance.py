@@ -109,6 +109,11 @@ class Admittance:
         self.position = within
         return within
 
+    def place(self, position: float, measured: float) -> float | None:
+        """Rest at an insertion depth [m]; `measured` is the depth of the robot [m]."""
+        self.position, self._measured = position, measured
+        return self.hold()
+
     def hold(self) -> float | None:
         """
         Stop the base at once.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Final, TypeAlias
@@ -144,6 +144,7 @@ class ControllerOutput:
     setpoint: Setpoint = NO_SETPOINT  #: of the measurement; NaN without a reference
     fault: str | None = None  #: why no force is commanded
     notice: str | None = None  #: message for the user
+    refusal: str | None = None  #: why the motion is refused and the system must stop
 
     def is_finite(self) -> bool:
         """Return whether force and torque are finite."""
@@ -219,6 +220,9 @@ class Controller:
         longest = settings.measurement_timeout + self.period
         self._displacement = DisplacementMonitor(settings.jump, longest)
         self._last_depth: float | None = None
+        #: Check before the first motion: answers a measurement, and whether a motion is requested,
+        #: with a command; None without a check.
+        self.check: Callable[[Measurement, bool], ControllerOutput | None] | None = None
         self.forget()
 
     def _checked(
@@ -406,6 +410,10 @@ class Controller:
             self.release()
         else:
             notice = self._returned(measured) or notice
+            moves = self.target is not None and not self.guide.paused
+            answer = self.check(measured, moves) if self.check is not None else None
+            if answer is not None:
+                return answer
         if fault is not None or self.target is None:
             return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice

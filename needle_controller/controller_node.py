@@ -9,6 +9,7 @@ from time import sleep
 from typing import Any
 
 from geometry_msgs.msg import PointStamped
+from needle_controller.commissioning import CommissioningSettings
 from needle_controller.controller import (
     Controller,
     ControllerSettings,
@@ -134,6 +135,7 @@ class ControllerNode(ModelNode):
         self.declare_settings('uncertainty.', Uncertainty())
         self.declare_settings('observer.', ObserverSettings())
         self.declare_settings('hardware.', HardwareSettings())
+        self.declare_settings('hardware.commissioning.', CommissioningSettings())
         for law, axes in DEFAULT_GAINS.items():
             for axis, gains in axes.items():
                 self.declare_settings(f'{law}.{axis}.', gains)
@@ -219,7 +221,8 @@ class ControllerNode(ModelNode):
             observed = self.settings('observer.', ObserverSettings)
         robot = None
         if self._driver is not None:
-            self._driver.configure(controller)
+            facts = self.settings('hardware.commissioning.', CommissioningSettings)
+            self._driver.configure(controller, facts, limits)
             robot = self._driver.robot
         self._supervisor.configure(controller, limits, observed, robot)
         if feedback == 'ground_truth':

@@ -56,16 +56,10 @@ class HardwareSettings:
 
     joint: str = text(INSERTION, 'insertion joint of the robot')
     sign: float = constant(
-        1.0, '1', '1 if the position of the robot increases into the tissue, else -1', low=-1.0,
-        high=1.0,
-    )  # fmt: skip
-    scale: float = constant(
-        1.0, 'm', 'insertion depth per unit of the position of the robot: 1e-3 for mm',
-        open_low=True,
-    )  # fmt: skip
-    zero: float = constant(
-        0.0, 'unit of the robot', 'position of the robot at insertion depth 0', low=-1e9, high=1e9
+        1.0, '1', '1 if the position increases into the tissue, else -1', low=-1.0, high=1.0
     )
+    scale: float = constant(1.0, 'm', 'depth per unit of the joint: 1e-3 for mm', open_low=True)
+    zero: float = constant(0.0, 'unit of the robot', 'position at depth 0', low=-1e9, high=1e9)
     state_topic: str = text(
         '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
     )
@@ -78,17 +72,13 @@ class HardwareSettings:
         '', f'topic of the force sensor; empty: base_wrench; {BY_TYPE}: the only one of its type'
     )
     wrench_frame: str = text('', 'frame of the force sensor; empty: needle_base')
-    force_axis: str = text(
-        'y', 'axis of the force sensor that points into the tissue; may be signed: -z'
-    )
+    force_axis: str = text('y', 'axis of the force sensor into the tissue; may be signed: -z')
     lateral_axis: str = text(
-        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the '
-        'axis after force_axis',
-    )  # fmt: skip
+        '', 'its axis along which the tip deflects; may be signed; empty: the one after force_axis'
+    )
     reaction: bool = flag(
-        False, 'the sensor reports the force of the needle on the sensor, not the force on the '
-        'needle',
-    )  # fmt: skip
+        False, 'the sensor reports the force of the needle on the sensor, not on the needle'
+    )
     command: str = choice(EFFORT, COMMANDS, 'kind of joint command')
     command_topic: str = text('', 'topic of the commands; empty: wrench_command')
     command_type: str = choice('wrench', COMMAND_TYPES)
@@ -99,13 +89,10 @@ class HardwareSettings:
             'The others get zero effort, or hold their position at activation'
         },
     )
-    speed: float = constant(
-        0.05, 'm/s', 'command position: largest speed of the commanded position', open_low=True
-    )
+    speed: float = constant(0.05, 'm/s', 'largest speed of a commanded position', open_low=True)
     lead: float = constant(
-        2e-3, 'm', 'command position: largest distance of the commanded position from the '
-        'measured position', open_low=True,
-    )  # fmt: skip
+        2e-3, 'm', 'largest distance of a commanded from the measured position', open_low=True
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -218,6 +205,10 @@ class Robot:
         self._gain = settings.sign * settings.scale
         self._axes = settings.axes()
         self._base: Admittance | None = None
+        #: Insertion depth to command for a check [m], NaN for no command; None without a check.
+        self.probe: float | None = None
+        #: Last measured force on the needle, along x, y and z of `needle_base` [N].
+        self.felt = 0.0, 0.0, 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -384,6 +375,7 @@ class Robot:
         turned = tuple(
             sign * one * numbers[begin + axis] for begin in (0, 3) for axis, one in self._axes
         )
+        self.felt = turned[0], turned[1], turned[2]
         return reading._replace(values=(turned,))
 
     # To the robot.
@@ -418,6 +410,8 @@ class Robot:
             # Without a reference no motion is requested, except for a repeated message.
             if stopped:
                 length = base.give_way()
+            elif answer.reference and self.probe is not None:
+                length = base.place(self.probe, self._depth) if isfinite(self.probe) else None
             elif answer.reference:
                 length = base.step(answer.force - load, self._depth, answer.stamp)
             elif base.answered == answer.stamp:

@@ -8,6 +8,7 @@ from time import monotonic, sleep
 from typing import Any, Final, NamedTuple
 
 from builtin_interfaces.msg import Duration
+from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import (
@@ -20,6 +21,7 @@ from needle_controller.hardware import (
     STAMPS,
     STATE_TYPES,
 )
+from needle_controller.safety.limits import SafetyLimits
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, SENSOR
 from needle_ros.contract import Topic
@@ -134,6 +136,7 @@ class Driver:
                 ) from error
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._period = Duration()
+        self._check: Commissioning | None = None
 
     def _found(self, topic: Topic, name: str, type_name: str) -> str:
         """Return the name of a topic; `BY_TYPE` selects the only topic of its type."""
@@ -224,6 +227,8 @@ class Driver:
             robot=f'{self.topics.state.name}, {self._settings.command} of {joints} on '
             f'{self.topics.command.name}',
             velocity_source='estimated' if self.robot.estimates else 'reported',
+            commissioning=self._check.phase if self._check else None,
+            commissioning_result=self._check.result if self._check else '',
         )
 
     def missing(self) -> str:
@@ -245,9 +250,13 @@ class Driver:
 
     # To the robot.
 
-    def configure(self, controller: Controller) -> None:
-        """Take the nominal model and the period of a controller."""
+    def configure(
+        self, controller: Controller, settings: CommissioningSettings, limits: SafetyLimits
+    ) -> None:
+        """Take the nominal model and the period of a controller, and check its first motion."""
         self.robot.configure(controller)
+        self._check = Commissioning(settings, self.robot, controller, limits)
+        controller.check = self._check.command
         whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
         self._period = Duration(sec=whole, nanosec=part)
 

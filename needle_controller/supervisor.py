@@ -376,10 +376,10 @@ class Supervisor(StateMachine[ForceCommand]):
         command = controller.command(measured, self.bending.load)
         if command.fault is not None:
             return self._release_for(command.fault, stamp)
-        if not command.is_finite():
+        if command.refusal is not None or not command.is_finite():
             # The memory of the laws is invalid.
             controller.forget()
-            return self._stop_for('the command is not finite', stamp)
+            return self._stop_for(command.refusal or 'the command is not finite', stamp)
         if command.notice is not None:
             self.events.last_rejection = command.notice
             self.events.add(Severity.ERROR, command.notice)

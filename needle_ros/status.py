@@ -62,6 +62,16 @@ class ControllerPhase(Enum):
     STOPPED = 'stopped'
 
 
+class CommissioningPhase(Enum):
+    """Phase of the check of a robot before its first motion."""
+
+    WAITING = 'waiting'
+    MOVING = 'moving'
+    PASSED = 'passed'
+    REFUSED = 'refused'
+    SKIPPED = 'skipped'
+
+
 class SteeringPhase(Enum):
     """Phase of a steered insertion."""
 
@@ -195,6 +205,8 @@ class ControllerStatus(NodeStatus):
     last_rejection: str = entry('', '', 'reason of the last rejection')
     robot: str = entry('', '', 'topics and joints of a robot with topics of its own')
     velocity_source: str = entry('', '', 'velocity of this robot: estimated or reported')
+    commissioning: CommissioningPhase | None = entry(None, '', 'check of this robot')
+    commissioning_result: str = entry('', '', 'response of this robot, or reason of a refusal')
     requests: RequestStatus = entry(RequestStatus, '', 'requests and their acknowledgement')
 
 

@@ -21,7 +21,13 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
-from needle_ros.status import ControllerStatus, RecorderStatus, SteeringPhase, SteeringStatus
+from needle_ros.status import (
+    CommissioningPhase,
+    ControllerStatus,
+    RecorderStatus,
+    SteeringPhase,
+    SteeringStatus,
+)
 from rclpy.task import Future
 import yaml
 
@@ -89,6 +95,8 @@ class Terminal:
         #: Latest message of each node without its numbers, and when it was printed.
         self._last: dict[str, str] = {}
         self._printed: dict[tuple[str, str], float] = {}
+        #: Phase of the check of a robot that was printed last.
+        self._checked: CommissioningPhase | None = None
         #: Whether all nodes have begun.
         self._begun = False
         #: Whether the latest motion is a steered insertion.
@@ -185,8 +193,13 @@ class Terminal:
             # During the start the nodes wait for each other.
             return
         for name, state in self._operator.states.items():
-            if isinstance(state.status, RecorderStatus) and state.status.failure:
-                raise GraphError(f'{name}: {state.status.failure}')
+            status = state.status
+            if isinstance(status, RecorderStatus) and status.failure:
+                raise GraphError(f'{name}: {status.failure}')
+            if isinstance(status, ControllerStatus) and status.commissioning is not self._checked:
+                self._checked = status.commissioning
+                phase = self._checked.value if self._checked else ''
+                self._say(f'{name}: first motion {phase} {status.commissioning_result}'.rstrip())
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
                 level, message = _ERROR, f'no status for {_SILENT:g} s'

@@ -19,6 +19,7 @@ from needle_controller import (
     SafetyLimits,
     Uncertainty,
 )
+from needle_controller.commissioning import CommissioningSettings
 from needle_dynamics import NeedleParameters
 from needle_dynamics.compiled.friction import FrictionConstants
 from needle_dynamics.parameters import _FRICTION_FIELDS
@@ -34,6 +35,7 @@ SETTINGS = (
     SafetyLimits,
     ObserverSettings,
     HardwareSettings,
+    CommissioningSettings,
     InverseDynamicsGains,
     AdaptiveGains,
     PidGains,

@@ -377,8 +377,8 @@ def test_nodes_end_at_the_tip_of_the_simulated_loop(tmp_path: Path, seed: int) -
     """
     The nodes steer a needle as `simulate_steering` does, which `needle steer` and studies use.
 
-    Path and sensor have almost no noise: the two draw it in their own order. The guide of the plant
-    has no tilt.
+    Path and sensor have almost no noise: the two draw it in their own order. The guide of the
+    plant has no tilt.
     """
     target, prior, path_noise = (2e-3, 0.06, -1e-3), SteeringPrior(), 1e-12
     needle, steering, _ = STEERING_PRESETS['bending_35mm']

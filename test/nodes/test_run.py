@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 import pty
 import re
+import runpy
 import select
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_identification import read_topic
 from needle_insertion.replay.rerun import verify
 import pytest
+from support.installed import ROOT
 from support.ros_graph import RosGraph
 
 #: Timeout of a start or a motion on a busy machine [s].
@@ -143,6 +145,39 @@ def test_robot_replaces_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert (status, complained) == (0, ''), said
     assert 'starting recorder, controller\n' in said
     assert 'depth 22.' in said or 'depth 21.9' in said
+
+
+def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Its result is printed, and a refusal ends a script."""
+    drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
+    ros_graph.add(drivers['PositionRobot'])
+    words = [
+        f'-pcontroller.{name}={value}'
+        for name, value in {
+            'deflection_feedback': 'none',
+            'hardware.joint': 'stage',
+            'hardware.scale': 0.001,
+            'hardware.zero': 100.0,
+            'hardware.command': 'position',
+            'hardware.command_topic': 'stage/joint_trajectory',
+            'hardware.command_type': 'joint_trajectory',
+            'hardware.commissioning.positions': [100.0, 250.0],
+            'hardware.commissioning.depths': [0.0, 0.15],
+            'hardware.commissioning.start_depth': 0.02,
+        }.items()
+    ]
+    script = ['target 22mm', 'wait 100']
+    status, said, complained = told(
+        ros_graph, tmp_path / 'run', script, '--hardware', '--no-recording', *words
+    )
+    assert (status, complained) == (0, ''), said
+    assert re.search(r'^controller: first motion passed moved -0\.\d+ mm, \d+ ms late', said, re.M)
+    # The needle is no longer where it was measured.
+    status, said, complained = told(
+        ros_graph, tmp_path / 'again', script, '--hardware', '--no-recording', *words
+    )
+    assert status == 1
+    assert 'first motion refused: the insertion depth is 0.022' in said + complained
 
 
 def test_second_plant_is_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:

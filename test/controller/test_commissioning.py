@@ -1,0 +1,300 @@
+"""Check of a robot before its first motion, on simulated robots that know only their driver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from benchmarks.commissioning import (
+    cases,
+    ERRORS,
+    HARMFUL,
+    KINDS,
+    measure,
+    RATE,
+    run,
+    Session,
+    Setup,
+    setup,
+    SimulatedRobot,
+    Slide,
+    Spindle,
+    Stage,
+)
+from needle_controller.commissioning import CommissioningSettings
+from needle_ros.errors import ParameterError
+from needle_ros.settings import from_values
+from needle_ros.status import CommissioningPhase
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT
+import numpy as np
+import pytest
+
+#: Duration of a session with two first motions [s].
+_LONG = 16.0
+
+
+def correct(kind: type[SimulatedRobot], seed: int = 3) -> Setup:
+    """Return a robot with its correct configuration."""
+    return setup(kind, np.random.default_rng(seed))
+
+
+def changed_robot(one: Setup, **values: Any) -> Setup:
+    """Return the same configuration for another robot."""
+    return replace(one, robot=lambda: replace(one.robot(), **values))
+
+
+def refused(one: Setup) -> Session:
+    """Run a session that the check refuses, within 2 mm."""
+    found = run(one, check=True)
+    assert found.phase is CommissioningPhase.REFUSED
+    assert found.motion <= HARMFUL
+    return found
+
+
+@pytest.mark.parametrize('case', cases(0, 9), ids=str)
+def test_correct_configurations_pass_and_arrive(case: Any) -> None:
+    """With any unit, sign, zero, sensor axis, and with friction and delay within their ranges."""
+    found = run(setup(case.robot, np.random.default_rng(case.seed)), check=True)
+    assert (found.reason, found.phase) == ('', CommissioningPhase.PASSED)
+    assert found.arrived
+
+
+@pytest.mark.parametrize('error', ERRORS)
+@pytest.mark.parametrize('kind', KINDS)
+def test_harmful_errors_are_refused_within_two_millimeters(
+    error: str, kind: type[SimulatedRobot]
+) -> None:
+    """The benchmark repeats this with 500 errors."""
+    (case,) = (one for one in cases(len(ERRORS) * len(KINDS), 0)
+               if (one.error, one.robot) == (error, kind))  # fmt: skip
+    found = measure(case)
+    assert found.refused or not found.harmful
+    assert not found.refused or found.checked.motion <= HARMFUL
+
+
+@pytest.mark.parametrize(
+    ('error', 'parameter'),
+    [
+        ('scale', 'hardware.scale must be '),
+        ('scale with matching zero', 'hardware.scale must be '),
+        ('sign', 'hardware.sign must be '),
+        ('sign with matching zero', 'hardware.sign must be '),
+        ('zero', 'hardware.zero must be '),
+        ('lead and speed', 'hardware.lead must be <= 0.01 '),
+    ],
+)
+@pytest.mark.parametrize('kind', KINDS)
+def test_contradictions_of_the_measured_depths_are_rejected(
+    error: str, parameter: str, kind: type[SimulatedRobot]
+) -> None:
+    """Before the controller starts, with the parameter and its value."""
+    found = run(ERRORS[error](correct(kind), np.random.default_rng(1)), check=True)
+    assert found.phase is None
+    assert found.reason.startswith(parameter)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_other_depth_than_measured_is_refused_at_rest(kind: type[SimulatedRobot]) -> None:
+    """A lost zero of the encoder, or another joint."""
+    one = correct(kind)
+    robot = one.robot()
+    found = refused(changed_robot(one, zero=robot.zero + 5e-3 / robot.gain))
+    assert 'hardware.joint or hardware.zero' in found.reason
+    assert found.motion == 0.0
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_missing_response_is_refused(kind: type[SimulatedRobot]) -> None:
+    found = refused(replace(correct(kind), connected=False))
+    assert "the joint 'axis' moved " in found.reason
+    assert 'command_topic' in found.reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_other_joint_at_the_same_depth_is_refused(kind: type[SimulatedRobot]) -> None:
+    """It does not respond, while the needle is pulled by less than 2 mm."""
+    one = correct(kind)
+    robot = one.robot()
+    near = changed_robot(one, other=robot.position(robot.depth + 0.5e-3))
+    found = refused(replace(near, hardware={**one.hardware, 'joint': 'door'}))
+    assert "the joint 'door' moved " in found.reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_reversed_driver_is_refused(kind: type[SimulatedRobot]) -> None:
+    """A driver whose commands have the opposite direction of its joint states."""
+    one = correct(kind)
+
+    class Reversed(kind):  # type: ignore[misc, valid-type]
+        def take(self, value: float | None) -> None:
+            super().take(None if value is None else 2.0 * here - value)
+
+    robot = one.robot()
+    here = robot.position(robot.depth) if kind is not Slide else 0.0
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+    found = refused(replace(one, robot=lambda: Reversed(**values)))
+    assert "the joint 'axis' moved +" in found.reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('rate', [50.0, 1000.0])
+def test_wrong_rate_is_refused_at_rest(kind: type[SimulatedRobot], rate: float) -> None:
+    found = refused(replace(correct(kind), rate=rate))
+    assert f'received at {RATE:g} Hz, rate is {rate:g} Hz: set rate to 200' in found.reason
+    assert found.motion == 0.0
+
+
+@pytest.mark.parametrize(
+    ('kind', 'late', 'said'),
+    [
+        (Stage, {'lag': 0.2}, 'hardware.commissioning.lag'),
+        (Spindle, {'dead': 20}, 'hardware.commissioning.lag'),
+        (Slide, {'dead': 5}, 'the force acts 5 periods late, delay is 1: set delay to 5'),
+    ],
+)
+def test_delay_is_refused(kind: type[SimulatedRobot], late: dict[str, Any], said: str) -> None:
+    assert said in refused(changed_robot(correct(kind), **late)).reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_force_sensor_axes_are_refused_with_the_correct_axis(kind: type[SimulatedRobot]) -> None:
+    """The proposed axis passes."""
+    one = correct(kind)
+    others = [axis for axis in ('x', 'y', 'z', '-x', '-y', '-z') if axis != one.robot().force_axis]
+    for axis in others:
+        found = refused(replace(one, hardware={**one.hardware, 'force_axis': axis}))
+        _, _, rest = found.reason.partition('set hardware.force_axis to ')
+        assert rest.split(',')[0] == one.robot().force_axis
+    turned = {**one.hardware, 'reaction': not one.hardware['reaction']}
+    found = refused(replace(one, hardware=turned))
+    assert f'or hardware.reaction to {str(one.hardware["reaction"]).lower()}' in found.reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_unstated_facts_are_refused_without_motion(kind: type[SimulatedRobot]) -> None:
+    """Unless the check is skipped."""
+    one = replace(correct(kind), facts={})
+    found = refused(one)
+    assert 'positions, depths and start_depth are not stated' in found.reason
+    assert 'hardware.commissioning.enabled false skips' in found.reason
+    assert found.motion == 0.0
+    skipped = run(one, check=False)
+    assert (skipped.phase, skipped.arrived) == (CommissioningPhase.SKIPPED, True)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('depth', [0.0, 1e-3])
+def test_needle_may_start_at_the_entry(kind: type[SimulatedRobot], depth: float) -> None:
+    """The first motion may leave the range of depths by its length."""
+    one = changed_robot(correct(kind), depth=depth)
+    found = run(replace(one, facts={**one.facts, 'start_depth': depth}), check=True)
+    assert (found.reason, found.phase) == ('', CommissioningPhase.PASSED)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_robot_without_a_force_sensor_passes(kind: type[SimulatedRobot]) -> None:
+    """Its readings do not change."""
+    one = correct(kind)
+
+    class Insensible(kind):  # type: ignore[misc, valid-type]
+        def resistance(self) -> float:
+            return 0.0
+
+    robot = one.robot()
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+    found = run(replace(one, robot=lambda: Insensible(**values)), check=True)
+    assert found.phase is CommissioningPhase.PASSED
+
+
+@pytest.mark.parametrize('kind', [Spindle, Slide])
+def test_velocity_of_another_unit_is_refused(kind: type[SimulatedRobot]) -> None:
+    """Degrees in place of radians, or mm in place of m."""
+    one = correct(kind)
+
+    class Degrees(kind):  # type: ignore[misc, valid-type]
+        def states(self, stamp: int) -> Any:
+            reading = super().states(stamp)
+            positions, velocities, efforts = reading.values
+            scaled = tuple(57.3 * velocity for velocity in velocities)
+            return reading._replace(values=(positions, scaled, efforts))
+
+    robot = one.robot()
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+    found = run(replace(one, robot=lambda: Degrees(**values)), check=True)
+    assert found.phase is not CommissioningPhase.PASSED
+    assert found.motion <= HARMFUL
+
+
+def test_noise_above_the_motion_is_refused() -> None:
+    """8 standard deviations of 0.1 mm are more than 0.5 mm."""
+    one = changed_robot(correct(Stage), noise=(1e-4, 0.0, 0.02))
+    assert 'hardware.commissioning.distance 0.0005 m' in refused(one).reason
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_first_motion_is_small_and_slow(kind: type[SimulatedRobot]) -> None:
+    """Its length and speed are the parameters."""
+    one = correct(kind)
+    facts = {**one.facts, 'distance': 1e-3, 'speed': 5e-4}
+    paths: list[float] = []
+
+    def watched(make: Callable[[], SimulatedRobot]) -> SimulatedRobot:
+        robot = make()
+        move = robot.move
+
+        def moved(h: float) -> None:
+            move(h)
+            paths.append(robot.depth)
+
+        robot.move = moved  # type: ignore[method-assign]
+        return robot
+
+    run(replace(one, facts=facts, robot=lambda: watched(one.robot)), check=True, duration=8.0)
+    path = np.array(paths)
+    first = path[: int(np.argmin(path)) + 1]
+    # 20 % of the length with efforts; the delay of 15 ms of growing force adds a little.
+    least, most = (0.2e-3, 0.5e-3) if kind is Slide else (0.9e-3, 1.2e-3)
+    assert least < one.robot().depth - first[-1] < most
+    if kind is not Slide:
+        # Per simulation step of 0.5 ms; a drive of second order overshoots by less than 20 %.
+        assert np.abs(np.diff(first)).max() < 1.2 * 5e-4 * 5e-4
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_pause_interrupts_the_first_motion(kind: type[SimulatedRobot]) -> None:
+    """It is repeated after the pause, in which the needle rests."""
+    begins = 3.0 if kind is Slide else 1.3
+    words = {begins: PAUSE, begins + 0.5: RESUME}
+    found = run(correct(kind), check=True, duration=_LONG, words=words)
+    assert (found.reason, found.phase) == ('', CommissioningPhase.PASSED)
+    assert found.arrived
+    held = run(correct(kind), check=True, duration=_LONG, words={begins: PAUSE})
+    assert held.phase is CommissioningPhase.WAITING
+    assert held.motion <= HARMFUL
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_first_motion_is_repeated_after_a_refusal(kind: type[SimulatedRobot]) -> None:
+    """By a retraction after the stop is cleared, again within 2 mm."""
+    one = replace(correct(kind), connected=False)
+    found = run(one, check=True, duration=_LONG, words={7.0: CLEAR_STOP, 7.1: RETRACT})
+    assert found.phase is CommissioningPhase.REFUSED
+    assert found.motion <= HARMFUL
+
+
+@pytest.mark.parametrize(
+    ('values', 'said'),
+    [
+        ({'positions': [1.0]}, 'positions and depths must be two each, 0.01 m apart or more, got'),
+        ({'positions': [1.0, 1.0], 'depths': [0.0, 0.1]}, 'positions and depths must be two each'),
+        ({'positions': [1.0, 2.0], 'depths': [0.0, 5e-3]}, 'positions and depths must be two'),
+        ({'distance': 2e-3}, 'distance must be finite, >= 0.0001 and <= 0.0015 m, got 0.002'),
+        ({'speed': 0.1}, 'speed must be finite, >= 0.0001 and <= 0.005 m/s, got 0.1'),
+        ({'enabled': 0}, 'enabled must be true or false, got 0'),
+    ],
+)
+def test_invalid_facts_are_rejected_in_one_line(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(ParameterError) as raised:
+        from_values(CommissioningSettings, values, 'hardware.commissioning.')
+    assert str(raised.value).startswith(f'hardware.commissioning.{said}')
