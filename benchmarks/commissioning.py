@@ -36,9 +36,11 @@ from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Rate of the robots [Hz], and steps of their simulation in a period.
+#: Rate of the robots [Hz], periods between two checks of the inputs, and steps of the simulation
+#: in a period.
 RATE: Final = 200.0
-_STEPS: Final = 10
+_WATCH: Final = 10
+_STEPS: Final = 4
 
 #: Requested motion, and allowed distance from it [m].
 _MOTION: Final = 0.01
@@ -377,13 +379,16 @@ def run(
     begin, ends = now, now + round(duration * NANOSECONDS)
     requested, motion, beyond, apart, reported = False, 0.0, 0.0, 0.0, start
     first: float | None = None
+    sample = 0
     named = one.hardware['command_type'] != 'float64_multi_array'
     while now < ends:
         now += period
         supervisor.wrench(adapter.wrench(robot.wrench(now)), now)
         reading, measured = robot.states(now), robot.depth
         answer: ForceCommand | None = supervisor.encoders(reading, now)
-        answer = supervisor.watch(now, {'wrench_command': 1}) or answer
+        if sample % _WATCH == 0:
+            answer = supervisor.watch(now, {'wrench_command': 1}) or answer
+        sample += 1
         value = None
         if answer is not None:
             stopped = supervisor.safety.stop is not None
@@ -406,6 +411,8 @@ def run(
             requested = True
         for time in [time for time in later if now - begin > time * NANOSECONDS]:
             supervisor.request(later.pop(time), now)
+        if not check and max(beyond, apart) > HARMFUL:
+            break
         if supervisor.safety.stop is not None and not later:
             ends = min(ends, now + round(_REST * NANOSECONDS))
     aimed = controller.target is not None
@@ -433,13 +440,14 @@ class Outcome(NamedTuple):
 
     case: Case
     checked: Session
-    unchecked: Session
+    #: None for a correct configuration.
+    unchecked: Session | None
 
     @property
     def harmful(self) -> bool:
         """Whether the needle moves beyond the request, or is elsewhere than reported."""
         found = self.unchecked
-        return max(found.beyond, found.apart, abs(found.error)) > HARMFUL
+        return found is not None and max(found.beyond, found.apart, abs(found.error)) > HARMFUL
 
     @property
     def refused(self) -> bool:
@@ -465,14 +473,18 @@ def measure(case: Case) -> Outcome:
     one = setup(case.robot, rng)
     if case.error:
         one = ERRORS[case.error](one, rng)
-    return Outcome(case, run(one, check=True), run(one, check=False))
+    return Outcome(case, run(one, check=True), run(one, check=False) if case.error else None)
 
 
-def compare(tick: Tick, errors: int = 504, correct: int = 150) -> Answer:
-    """Measure random errors and correct configurations, half a minute per hundred."""
+def compare(tick: Tick, errors: int = 504, correct: int = 90) -> Answer:
+    """Measure random errors and correct configurations."""
     tick('sessions in simulated time')
     with processes(os.cpu_count() or 1) as pool:
-        found = list(pool.map(measure, cases(errors, correct)))
+        return conclude(list(pool.map(measure, cases(errors, correct))))
+
+
+def conclude(found: Sequence[Outcome]) -> Answer:
+    """Return tables and bars of the measured cases."""
     wrong = [one for one in found if one.case.error]
     right = [one for one in found if not one.case.error]
     harmful = [one for one in wrong if one.harmful]
@@ -483,8 +495,8 @@ def compare(tick: Tick, errors: int = 504, correct: int = 150) -> Answer:
              'worst motion with the check [mm]', 'without [mm]'),
             [_row(name, [one for one in wrong if one.case.error == name]) for name in ERRORS],
             'Motion is the largest distance of the needle from its start until 0.5 s after the '
-            'refusal, or in the whole session if it is not refused and not harmful. A request '
-            'is 10 mm. An error is harmful if the needle, without the check, moves more than '
+            'refusal; without the check, until the error is found to be harmful. A request is '
+            '10 mm. An error is harmful if the needle, without the check, moves more than '
             '2 mm beyond the request, moves more than 2 mm otherwise than reported, or rests more '
             'than 2 mm from the reported depth.',
         ),
@@ -521,7 +533,7 @@ def _row(name: str, found: Sequence[Outcome]) -> tuple[str, ...]:
         f'{sum(one.refused for one in harmful)}',
         f'{len(refused)}',
         f'{1e3 * max(moved, default=0.0):.2f}',
-        f'{1e3 * max((one.unchecked.motion for one in found), default=0.0):.4g}',
+        f'{1e3 * max((one.unchecked.motion for one in found if one.unchecked), default=0.0):.4g}',
     )
 
 

@@ -249,13 +249,14 @@ class Commissioning:
         dry = axis.coulomb * axis.breakaway * max(axis.withdrawal, 1.0)
         friction = dry + settings.speed * (axis.viscous + axis.inertia / _DOUBLING)
         most = min(_STRONGER * friction, own.settings.force_limit)
+        first = _FIRST
         # A busy machine may be late.
         for _ in range(_TRIES):
             begin, origin, *_ = time, moved, velocity = self._rows[-1][:3]
             pull = grown = 0.0
             while origin - moved <= _TOLERANCE * settings.distance + self._noise[1]:
                 self._require_response(grown < 2.0, f'{-pull:.3g} N, or model.*')
-                grown = _FIRST * 2.0 ** ((time - begin) / _DOUBLING)
+                grown = first * 2.0 ** ((time - begin) / _DOUBLING)
                 pull = most * min(grown, 1.0)
                 self._add((yield -pull))
                 time, moved, velocity = self._rows[-1][:3]
@@ -264,7 +265,7 @@ class Commissioning:
                     f'the needle moves at {pull:.3g} N, the nominal friction is {friction:.3g} N: '
                     'unit of the driver, hardware.scale, hardware.command or model.*'
                 )
-            end, fastest = time, abs(velocity)
+            first, end, fastest = 0.1 * grown, time, abs(velocity)
             while abs(velocity) > 0.5 * fastest and time < end + _SETTLING:
                 self._add((yield 0.0))
                 time, _, velocity = self._rows[-1][:3]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.commissioning import (
+    Case,
     cases,
     ERRORS,
     HARMFUL,
@@ -53,22 +54,27 @@ def refused(one: Setup) -> Session:
 
 
 @pytest.mark.parametrize('case', cases(0, 9), ids=str)
-def test_correct_configurations_pass_and_arrive(case: Any) -> None:
+def test_correct_configurations_pass_and_arrive(case: Case) -> None:
     """With any unit, sign, zero, sensor axis, and with friction and delay within their ranges."""
-    found = run(setup(case.robot, np.random.default_rng(case.seed)), check=True)
-    assert (found.reason, found.phase) == ('', CommissioningPhase.PASSED)
-    assert found.arrived
-
-
-@pytest.mark.parametrize('error', ERRORS)
-@pytest.mark.parametrize('kind', KINDS)
-def test_harmful_errors_are_refused_within_two_millimeters(
-    error: str, kind: type[SimulatedRobot]
-) -> None:
-    """The benchmark repeats this with 500 errors."""
-    (case,) = (one for one in cases(len(ERRORS) * len(KINDS), 0)
-               if (one.error, one.robot) == (error, kind))  # fmt: skip
     found = measure(case)
+    assert (found.checked.reason, found.checked.phase) == ('', CommissioningPhase.PASSED)
+    assert found.checked.arrived
+    assert not found.harmful
+
+
+#: Each error on one of the robots, and the harmful ones of the worst kinds on all.
+SOME = [
+    case
+    for k, case in enumerate(cases(len(ERRORS) * len(KINDS), 0))
+    if k // len(KINDS) % len(KINDS) == k % len(KINDS) or case.error == 'sign with matching zero'
+]
+
+
+@pytest.mark.parametrize('case', SOME, ids=lambda case: f'{case.error}, {case.robot.__name__}')
+def test_harmful_errors_are_refused_within_two_millimeters(case: Case) -> None:
+    """The benchmark repeats this with 500 errors."""
+    found = measure(case)
+    assert found.harmful or case.error != 'sign with matching zero'
     assert found.refused or not found.harmful
     assert not found.refused or found.checked.motion <= HARMFUL
 
