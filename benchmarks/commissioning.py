@@ -9,15 +9,15 @@ beyond the requested motion, or rests elsewhere than the controller reports. Tim
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import copysign, exp, inf, isfinite, pi
+from math import inf, isfinite, pi
 import os
 from typing import Any, Final, NamedTuple
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
+from benchmarks.robots import OTHER, PHANTOM, RATE, SimulatedRobot, Slide, Spindle, Stage
 from needle_controller import (
     Controller,
     ControllerSettings,
@@ -28,19 +28,14 @@ from needle_controller import (
 )
 from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.supervisor import Supervisor
-from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
 from needle_ros.status import CommissioningPhase
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reading
 import numpy as np
 
-#: Rate of the robots [Hz], periods between two checks of the inputs, and steps of the simulation
-#: in a period.
-RATE: Final = 200.0
+#: Periods between two checks of the inputs.
 _WATCH: Final = 10
-_STEPS: Final = 4
 
 #: Requested motion, and allowed distance from it [m].
 _MOTION: Final = 0.01
@@ -51,127 +46,7 @@ _DURATION: Final = 7.5
 _REQUEST: Final = 1.0
 _REST: Final = 0.5
 
-#: A joint that is not the insertion joint.
-_OTHER: Final = 'door'
-
-_PHANTOM: Final = NeedleParameters.preset('phantom')
 _AXES: Final = ('x', 'y', 'z', '-x', '-y', '-z')
-
-
-@dataclass
-class SimulatedRobot:
-    """
-    Joint with its own unit, and a force sensor in its own axes; subclasses move it.
-
-    `depth` and `velocity` are the truth [m, m/s]. The joint is at `zero` at depth 0, and its
-    position grows by 1 / `gain` per meter. `friction` is a factor on the friction of the needle.
-    """
-
-    joint: str = 'axis'
-    gain: float = 1.0
-    zero: float = 0.0
-    #: Position of the other joint, in its unit.
-    other: float = 1.0
-    #: Axis of the sensor into the tissue, and whether it reports the reaction.
-    force_axis: str = 'y'
-    reaction: bool = False
-    friction: float = 1.0
-    #: Time constant [s] and dead time [periods] of the drive.
-    lag: float = 0.02
-    dead: int = 0
-    #: Standard deviations of depth [m], velocity [m/s] and force [N].
-    noise: tuple[float, float, float] = (2e-6, 1e-4, 0.02)
-    depth: float = 0.02
-    velocity: float = 0.0
-    seed: int = 0
-
-    #: Whether the joint states have a velocity.
-    REPORTS_VELOCITY = True
-
-    def __post_init__(self) -> None:
-        self._rng = np.random.default_rng(self.seed)
-        self.pending: deque[float | None] = deque([None] * self.dead)
-        self.goal: float | None = None
-
-    def position(self, depth: float) -> float:
-        """Return the position of the joint at a depth [m], in its unit."""
-        return depth / self.gain + self.zero
-
-    def take(self, value: float | None) -> None:
-        """Receive a command in the unit of the joint, or none, and move for a period."""
-        self.pending.append(value)
-        value = self.pending.popleft()
-        if value is not None:
-            self.goal = value
-        for _ in range(_STEPS):
-            self.move(1.0 / RATE / _STEPS)
-
-    def move(self, h: float) -> None:
-        """Move for a time [s]."""
-        raise NotImplementedError
-
-    def resistance(self) -> float:
-        """Return the force of the tissue against the motion [N]."""
-        dry = _PHANTOM.coulomb_friction * min(abs(self.velocity) / 1e-4, 1.0)
-        viscous = _PHANTOM.viscous_friction * self.velocity
-        return self.friction * (copysign(dry, self.velocity) + viscous)
-
-    def states(self, stamp: int) -> Reading:
-        """Return the joint states."""
-        depth, velocity = (
-            true + deviation * self._rng.standard_normal()
-            for true, deviation in zip((self.depth, self.velocity), self.noise, strict=False)
-        )
-        velocities = (0.0, velocity / self.gain) if self.REPORTS_VELOCITY else ()
-        positions = (self.other, self.position(depth))
-        return Reading(stamp, '', (_OTHER, self.joint), (positions, velocities, ()))
-
-    def wrench(self, stamp: int) -> Reading:
-        """Return the reading of the force sensor."""
-        values = [self.noise[2] * self._rng.standard_normal() for _ in range(3)]
-        sign = (-1.0 if self.force_axis[0] == '-' else 1.0) * (-1.0 if self.reaction else 1.0)
-        values['xyz'.index(self.force_axis[-1])] += sign * self.resistance()
-        return Reading(stamp, 'needle_base', (), ((*values, 0.0, 0.0, 0.0),))
-
-
-class Stage(SimulatedRobot):
-    """Follows positions with a lag of first order, without velocities in its joint states."""
-
-    REPORTS_VELOCITY = False
-
-    def move(self, h: float) -> None:
-        """Approach the commanded position."""
-        if self.goal is None:
-            return
-        aim = self.gain * (self.goal - self.zero)
-        step = (aim - self.depth) * (1.0 - exp(-h / self.lag))
-        self.depth, self.velocity = self.depth + step, step / h
-
-
-class Spindle(SimulatedRobot):
-    """Drive with a velocity loop of 5 ms, at most 0.2 m/s, around which positions are followed."""
-
-    def move(self, h: float) -> None:
-        """Turn the spindle at the velocity of the drive."""
-        if self.goal is None:
-            return
-        aim = self.gain * (self.goal - self.zero)
-        wanted = min(max((aim - self.depth) / self.lag, -0.2), 0.2)
-        self.velocity += (wanted - self.velocity) * (1.0 - exp(-h / 5e-3))
-        self.depth += self.velocity * h
-
-
-class Slide(SimulatedRobot):
-    """Mass of 0.5 kg with the friction of the needle, moved by forces."""
-
-    def move(self, h: float) -> None:
-        """Advance the mass under the last effort."""
-        force = (self.goal or 0.0) / self.gain
-        push = self.velocity + force * h / 0.5
-        dry = self.friction * _PHANTOM.coulomb_friction * h / 0.5
-        viscous = self.friction * _PHANTOM.viscous_friction * h / 0.5
-        self.velocity = copysign(max(abs(push) - dry, 0.0), push) / (1.0 + viscous)
-        self.depth += self.velocity * h
 
 
 @dataclass(frozen=True)
@@ -275,7 +150,7 @@ def _lost_zero(one: Setup, rng: np.random.Generator) -> Setup:
 def _joint(one: Setup, rng: np.random.Generator) -> Setup:
     robot = one.robot()
     near = robot.position(robot.depth + float(rng.uniform(-0.02, 0.02)))
-    return _changed(_of_robot(one, other=near), joint=_OTHER)
+    return _changed(_of_robot(one, other=near), joint=OTHER)
 
 
 def _rate(one: Setup, rng: np.random.Generator) -> Setup:
@@ -331,7 +206,7 @@ ERRORS: Final[dict[str, _Error]] = {
 }
 
 
-class Session(NamedTuple):
+class RobotSession(NamedTuple):
     """Result of a session: reason of a refusal or stop, and motion of the needle."""
 
     reason: str
@@ -353,7 +228,7 @@ def run(
     check: bool,
     duration: float = _DURATION,
     words: Mapping[float, str] | None = None,
-) -> Session:
+) -> RobotSession:
     """
     Run a session with a request of 10 mm after 1 s; without the check, as far as it goes.
 
@@ -366,12 +241,12 @@ def run(
     try:
         adapter = Robot(HardwareSettings(**one.hardware))
         control = ControllerSettings(rate=one.rate, delay=float(one.delay))
-        controller = Controller(_PHANTOM, settings=control)
+        controller = Controller(PHANTOM, settings=control)
         adapter.configure(controller)
         facts = CommissioningSettings(enabled=check, **one.facts)
         commissioning = Commissioning(facts, adapter, controller, SafetyLimits())
     except ParameterError as error:
-        return Session(str(error), None, 0.0, 0.0, 0.0, 0.0, False)
+        return RobotSession(str(error), None, 0.0, 0.0, 0.0, 0.0, False)
     controller.check = commissioning.command
     supervisor = Supervisor(lambda: now / NANOSECONDS)
     supervisor.configure(controller, SafetyLimits(), None, adapter)
@@ -399,10 +274,10 @@ def run(
                 value = values[0] if moved and isfinite(values[0]) else None
         robot.take(value)
         if not isfinite(robot.depth) or abs(robot.depth) > 1e6:
-            return Session('', commissioning.phase, inf, inf, inf, inf, False)
+            return RobotSession('', commissioning.phase, inf, inf, inf, inf, False)
         motion = max(motion, abs(robot.depth - start))
         beyond = max(beyond, start - robot.depth, robot.depth - start - _MOTION)
-        own = 0 if adapter.settings.joint == _OTHER else 1
+        own = 0 if adapter.settings.joint == OTHER else 1
         reported = adapter.length(reading.values[0][own])
         first = reported if first is None else first
         apart = max(apart, abs(measured - start - (reported - first)))
@@ -416,7 +291,7 @@ def run(
         if supervisor.safety.stop is not None and not later:
             ends = min(ends, now + round(_REST * NANOSECONDS))
     aimed = controller.target is not None
-    return Session(
+    return RobotSession(
         supervisor.safety.stop or '',
         commissioning.phase,
         motion,
@@ -439,9 +314,9 @@ class Outcome(NamedTuple):
     """Sessions with and without the check."""
 
     case: Case
-    checked: Session
+    checked: RobotSession
     #: None for a correct configuration.
-    unchecked: Session | None
+    unchecked: RobotSession | None
 
     @property
     def harmful(self) -> bool:

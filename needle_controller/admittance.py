@@ -110,7 +110,22 @@ class Admittance:
         return within
 
     def place(self, position: float, measured: float) -> float | None:
-        """Rest at an insertion depth [m]; `measured` is the depth of the robot [m]."""
+        """
+        Rest at an insertion depth.
+
+        Parameters
+        ----------
+        position : float
+            Insertion depth [m].
+        measured : float
+            Insertion depth of the robot [m].
+
+        Returns
+        -------
+        float or None
+            As for `hold`.
+
+        """
         self.position, self._measured = position, measured
         return self.hold()
 

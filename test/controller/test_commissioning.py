@@ -13,16 +13,12 @@ from benchmarks.commissioning import (
     HARMFUL,
     KINDS,
     measure,
-    RATE,
+    RobotSession,
     run,
-    Session,
     Setup,
     setup,
-    SimulatedRobot,
-    Slide,
-    Spindle,
-    Stage,
 )
+from benchmarks.robots import RATE, SimulatedRobot, Slide, Spindle, Stage
 from needle_controller.commissioning import CommissioningSettings
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values
@@ -45,7 +41,7 @@ def changed_robot(one: Setup, **values: Any) -> Setup:
     return replace(one, robot=lambda: replace(one.robot(), **values))
 
 
-def refused(one: Setup) -> Session:
+def refused(one: Setup) -> RobotSession:
     """Run a session that the check refuses, within 2 mm."""
     found = run(one, check=True)
     assert found.phase is CommissioningPhase.REFUSED
