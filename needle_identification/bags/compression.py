@@ -39,10 +39,8 @@ LARGEST_MESSAGE: Final = 2**26
 _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
-#: Records allowed for any file, and bytes of the file per record: a compressed message takes more.
+#: Records allowed for any file, else one per byte: a message at rest is compressed to 2 or 3 bytes.
 _RECORDS: Final = 2**20
-_BYTES_PER_RECORD: Final = 4
-
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
 
@@ -102,7 +100,7 @@ class Budget:
         times = factor()
         self.name, self.size = file.name, file.stat().st_size
         self._most = self._left = round(times * max(_AT_LEAST, _RATIO * self.size))
-        most = round(times * max(_RECORDS, self.size // _BYTES_PER_RECORD))
+        most = round(times * max(_RECORDS, self.size))
         self._most_records = self._records_left = most
         self.largest = round(times * LARGEST_RECORD)
         self.largest_message = round(times * LARGEST_MESSAGE)

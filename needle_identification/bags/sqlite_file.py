@@ -22,8 +22,8 @@ _TABLES: Final = ('messages', 'topics', 'message_definitions')
 _ROW: Final = 16  # size of a row in addition to its data [bytes]
 
 #: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
-#: A message takes about 20 steps and 40 bytes.
-_STEPS: Final = 4 * 10**7
+#: A message takes 20 to 40 steps and 40 bytes.
+_STEPS: Final = 10**8
 _STEPS_PER_BYTE: Final = 20
 _STEPS_PER_CALL: Final = 10**5
 

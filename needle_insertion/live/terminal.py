@@ -135,9 +135,8 @@ class Terminal:
         )
 
     def stop(self) -> None:
-        """Stop the needle by the nodes that still run, and wait until it rests."""
+        """Stop the needle by the nodes that still run; wait until it rests, or for a timeout."""
         self._operator.ask('stop')
-        # After the timeout the nodes end all the same.
         with suppress(GraphError):
             self._graph.spin_until(lambda: self.rests, 'rest', _BRAKING)
 

@@ -253,7 +253,7 @@ def rows(table: str) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         numbers = 'WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n LIMIT 1200000)'
-        values = "0, k, x''" if table == 'messages' else "k, 'a', 'b', 'cdr'"
+        values = "0, 0, x''" if table == 'messages' else "0, 'a', 'b', 'cdr'"
         plain = database(
             'CREATE TABLE messages (topic_id, timestamp, data)',
             f'INSERT INTO {table} {numbers} SELECT {values} FROM n',  # noqa: S608
@@ -386,7 +386,7 @@ def test_many_small_records_are_rejected_in_one_line(
 
 
 def test_recording_at_rest_is_within_the_limit_of_records(tmp_path: Path) -> None:
-    """Equal messages on ten topics at 1 kHz, compressed as far as possible."""
+    """Equal messages on ten topics at 1 kHz, compressed by zstd."""
     file, messages = tmp_path / 'rest.mcap', 10 * 5000
     with file.open('wb') as stream:
         writer = McapWriter(stream, compression=CompressionType.NONE)
@@ -398,9 +398,9 @@ def test_recording_at_rest_is_within_the_limit_of_records(tmp_path: Path) -> Non
             data = joint_states(stamp, 0.0, 0.0)
             writer.add_message(channels[k % 10], log_time=stamp, publish_time=stamp, data=data)
         writer.finish()
-    packed = zstandard.ZstdCompressor(level=19).compress(file.read_bytes())
-    # Half of the limit: chunks and their topics count too.
-    assert len(packed) > 2 * 4 * messages
+    packed = zstandard.compress(file.read_bytes())
+    # The limit is a record per byte; chunks and their topics count too.
+    assert len(packed) > 1.5 * messages
 
 
 @pytest.mark.parametrize('make', [index, tables])
