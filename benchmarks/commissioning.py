@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
-from benchmarks.robots import OTHER, PHANTOM, RATE, SimulatedRobot, Slide, Spindle, Stage
+from benchmarks.robots import OTHER, RATE, SimulatedRobot, Slide, Spindle, Stage
 from needle_controller import (
     Controller,
     ControllerSettings,
@@ -28,6 +28,7 @@ from needle_controller import (
 )
 from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.supervisor import Supervisor
+from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
 from needle_ros.status import CommissioningPhase
@@ -46,11 +47,12 @@ _DURATION: Final = 7.5
 _REQUEST: Final = 1.0
 _REST: Final = 0.5
 
+_PHANTOM: Final = NeedleParameters.preset('phantom')
 _AXES: Final = ('x', 'y', 'z', '-x', '-y', '-z')
 
 
 @dataclass(frozen=True)
-class Setup:
+class RobotSetup:
     """A robot, and the parameters of the controller for it."""
 
     robot: Callable[[], SimulatedRobot]
@@ -63,7 +65,7 @@ class Setup:
     connected: bool = True
 
 
-def setup(kind: type[SimulatedRobot], rng: np.random.Generator) -> Setup:
+def setup(kind: type[SimulatedRobot], rng: np.random.Generator) -> RobotSetup:
     """Draw a robot with its correct configuration, and depths measured with a ruler."""
     sign = float(rng.choice([-1.0, 1.0]))
     scale = {Stage: 1e-3, Spindle: float(rng.choice([2e-3, 5e-3])) / (2.0 * pi), Slide: 1.0}[kind]
@@ -95,28 +97,28 @@ def setup(kind: type[SimulatedRobot], rng: np.random.Generator) -> Setup:
         'depths': tuple(depth + error for depth, error in zip(depths, off, strict=False)),
         'start_depth': robot.depth + off[2],
     }
-    return Setup(lambda: kind(**values), hardware, facts)
+    return RobotSetup(lambda: kind(**values), hardware, facts)
 
 
 # Errors: each returns a wrong configuration of a correct one.
 
-_Error = Callable[[Setup, np.random.Generator], Setup]
+_Error = Callable[[RobotSetup, np.random.Generator], RobotSetup]
 
 
-def _changed(one: Setup, **values: Any) -> Setup:
+def _changed(one: RobotSetup, **values: Any) -> RobotSetup:
     return replace(one, hardware={**one.hardware, **values})
 
 
-def _of_robot(one: Setup, **values: Any) -> Setup:
+def _of_robot(one: RobotSetup, **values: Any) -> RobotSetup:
     return replace(one, robot=lambda: replace(one.robot(), **values))
 
 
-def _wrong_scale(one: Setup, rng: np.random.Generator) -> Setup:
+def _wrong_scale(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     common = [1e3, 1e-3, 10.0, 0.1, 25.4, 2.0 * pi, 180.0 / pi, float(rng.uniform(0.3, 3.0))]
     return _changed(one, scale=one.hardware['scale'] * common[rng.integers(len(common))])
 
 
-def _scale_and_zero(one: Setup, rng: np.random.Generator) -> Setup:
+def _scale_and_zero(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     # The depth at the start is correct.
     wrong = _wrong_scale(one, rng).hardware
     robot, gain = one.robot(), wrong['sign'] * wrong['scale']
@@ -124,64 +126,64 @@ def _scale_and_zero(one: Setup, rng: np.random.Generator) -> Setup:
     return _changed(one, scale=wrong['scale'], zero=zero)
 
 
-def _sign(one: Setup, _rng: np.random.Generator) -> Setup:
+def _sign(one: RobotSetup, _rng: np.random.Generator) -> RobotSetup:
     return _changed(one, sign=-one.hardware['sign'])
 
 
-def _sign_and_zero(one: Setup, _rng: np.random.Generator) -> Setup:
+def _sign_and_zero(one: RobotSetup, _rng: np.random.Generator) -> RobotSetup:
     # The depth at the start is correct.
     robot = one.robot()
     position = robot.position(robot.depth)
     return _changed(_sign(one, _rng), zero=2.0 * position - one.hardware['zero'])
 
 
-def _zero(one: Setup, rng: np.random.Generator) -> Setup:
+def _zero(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     off = float(rng.choice([-1.0, 1.0]) * rng.uniform(2e-3, 0.1))
     return _changed(one, zero=one.hardware['zero'] + off / one.hardware['scale'])
 
 
-def _lost_zero(one: Setup, rng: np.random.Generator) -> Setup:
+def _lost_zero(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     # The encoder has another zero than at the time of the measurement.
     robot = one.robot()
     off = float(rng.choice([-1.0, 1.0]) * rng.uniform(2e-3, 0.1))
     return _of_robot(one, zero=robot.zero + off / robot.gain)
 
 
-def _joint(one: Setup, rng: np.random.Generator) -> Setup:
+def _joint(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     robot = one.robot()
     near = robot.position(robot.depth + float(rng.uniform(-0.02, 0.02)))
     return _changed(_of_robot(one, other=near), joint=OTHER)
 
 
-def _rate(one: Setup, rng: np.random.Generator) -> Setup:
+def _rate(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     return replace(one, rate=float(rng.choice([50.0, 100.0, 500.0, 1000.0])))
 
 
-def _delay(one: Setup, rng: np.random.Generator) -> Setup:
+def _delay(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     robot = one.robot()
     if isinstance(robot, Slide):
         return _of_robot(one, dead=int(rng.integers(4, 12)))
     return _of_robot(one, lag=float(rng.uniform(0.1, 0.3)), dead=int(rng.integers(5, 20)))
 
 
-def _force_axis(one: Setup, rng: np.random.Generator) -> Setup:
+def _force_axis(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     own = one.hardware['force_axis'][-1]
     return _changed(one, force_axis=str(rng.choice([a for a in _AXES if a[-1] != own])))
 
 
-def _force_sign(one: Setup, _rng: np.random.Generator) -> Setup:
+def _force_sign(one: RobotSetup, _rng: np.random.Generator) -> RobotSetup:
     return _changed(one, reaction=not one.hardware['reaction'])
 
 
-def _lead(one: Setup, _rng: np.random.Generator) -> Setup:
+def _lead(one: RobotSetup, _rng: np.random.Generator) -> RobotSetup:
     return _changed(one, lead=2.0, speed=50.0)
 
 
-def _topic(one: Setup, _rng: np.random.Generator) -> Setup:
+def _topic(one: RobotSetup, _rng: np.random.Generator) -> RobotSetup:
     return replace(one, connected=False)
 
 
-def _two(one: Setup, rng: np.random.Generator) -> Setup:
+def _two(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     names = [name for name in ERRORS if name != 'two of these']
     for name in rng.choice(names, 2, replace=False):
         one = ERRORS[str(name)](one, rng)
@@ -206,7 +208,7 @@ ERRORS: Final[dict[str, _Error]] = {
 }
 
 
-class RobotSession(NamedTuple):
+class FirstMotionSession(NamedTuple):
     """Result of a session: reason of a refusal or stop, and motion of the needle."""
 
     reason: str
@@ -223,12 +225,12 @@ class RobotSession(NamedTuple):
 
 
 def run(
-    one: Setup,
+    one: RobotSetup,
     *,
     check: bool,
     duration: float = _DURATION,
     words: Mapping[float, str] | None = None,
-) -> RobotSession:
+) -> FirstMotionSession:
     """
     Run a session with a request of 10 mm after 1 s; without the check, as far as it goes.
 
@@ -241,12 +243,12 @@ def run(
     try:
         adapter = Robot(HardwareSettings(**one.hardware))
         control = ControllerSettings(rate=one.rate, delay=float(one.delay))
-        controller = Controller(PHANTOM, settings=control)
+        controller = Controller(_PHANTOM, settings=control)
         adapter.configure(controller)
         facts = CommissioningSettings(enabled=check, **one.facts)
         commissioning = Commissioning(facts, adapter, controller, SafetyLimits())
     except ParameterError as error:
-        return RobotSession(str(error), None, 0.0, 0.0, 0.0, 0.0, False)
+        return FirstMotionSession(str(error), None, 0.0, 0.0, 0.0, 0.0, False)
     controller.check = commissioning.command
     supervisor = Supervisor(lambda: now / NANOSECONDS)
     supervisor.configure(controller, SafetyLimits(), None, adapter)
@@ -274,7 +276,7 @@ def run(
                 value = values[0] if moved and isfinite(values[0]) else None
         robot.take(value)
         if not isfinite(robot.depth) or abs(robot.depth) > 1e6:
-            return RobotSession('', commissioning.phase, inf, inf, inf, inf, False)
+            return FirstMotionSession('', commissioning.phase, inf, inf, inf, inf, False)
         motion = max(motion, abs(robot.depth - start))
         beyond = max(beyond, start - robot.depth, robot.depth - start - _MOTION)
         own = 0 if adapter.settings.joint == OTHER else 1
@@ -291,7 +293,7 @@ def run(
         if supervisor.safety.stop is not None and not later:
             ends = min(ends, now + round(_REST * NANOSECONDS))
     aimed = controller.target is not None
-    return RobotSession(
+    return FirstMotionSession(
         supervisor.safety.stop or '',
         commissioning.phase,
         motion,
@@ -302,7 +304,7 @@ def run(
     )
 
 
-class Case(NamedTuple):
+class ErrorCase(NamedTuple):
     """An error on a robot; without an error for correct configurations."""
 
     error: str
@@ -310,13 +312,13 @@ class Case(NamedTuple):
     seed: int
 
 
-class Outcome(NamedTuple):
+class ErrorOutcome(NamedTuple):
     """Sessions with and without the check."""
 
-    case: Case
-    checked: RobotSession
+    case: ErrorCase
+    checked: FirstMotionSession
     #: None for a correct configuration.
-    unchecked: RobotSession | None
+    unchecked: FirstMotionSession | None
 
     @property
     def harmful(self) -> bool:
@@ -333,22 +335,23 @@ class Outcome(NamedTuple):
 KINDS: Final = (Stage, Spindle, Slide)
 
 
-def cases(count: int, correct: int) -> list[Case]:
+def cases(count: int, correct: int) -> list[ErrorCase]:
     """Return random errors, each kind and robot equally often, and correct configurations."""
     names = list(ERRORS)
     found = [
-        Case(names[k // len(KINDS) % len(names)], KINDS[k % len(KINDS)], k) for k in range(count)
+        ErrorCase(names[k // len(KINDS) % len(names)], KINDS[k % len(KINDS)], k)
+        for k in range(count)
     ]
-    return found + [Case('', KINDS[k % len(KINDS)], 10_000 + k) for k in range(correct)]
+    return found + [ErrorCase('', KINDS[k % len(KINDS)], 10_000 + k) for k in range(correct)]
 
 
-def measure(case: Case) -> Outcome:
+def measure(case: ErrorCase) -> ErrorOutcome:
     """Run both sessions of a case."""
     rng = np.random.default_rng([7, case.seed])
     one = setup(case.robot, rng)
     if case.error:
         one = ERRORS[case.error](one, rng)
-    return Outcome(case, run(one, check=True), run(one, check=False) if case.error else None)
+    return ErrorOutcome(case, run(one, check=True), run(one, check=False) if case.error else None)
 
 
 def compare(tick: Tick, errors: int = 504, correct: int = 90) -> Answer:
@@ -358,7 +361,7 @@ def compare(tick: Tick, errors: int = 504, correct: int = 90) -> Answer:
         return conclude(list(pool.map(measure, cases(errors, correct))))
 
 
-def conclude(found: Sequence[Outcome]) -> Answer:
+def conclude(found: Sequence[ErrorOutcome]) -> Answer:
     """Return tables and bars of the measured cases."""
     wrong = [one for one in found if one.case.error]
     right = [one for one in found if not one.case.error]
@@ -397,7 +400,7 @@ def conclude(found: Sequence[Outcome]) -> Answer:
     return sections, bars
 
 
-def _row(name: str, found: Sequence[Outcome]) -> tuple[str, ...]:
+def _row(name: str, found: Sequence[ErrorOutcome]) -> tuple[str, ...]:
     harmful = [one for one in found if one.harmful]
     refused = [one for one in found if one.refused]
     moved = [one.checked.motion for one in found if one.refused or one.harmful]
@@ -412,7 +415,7 @@ def _row(name: str, found: Sequence[Outcome]) -> tuple[str, ...]:
     )
 
 
-def _correct(kind: type[SimulatedRobot], found: Sequence[Outcome]) -> tuple[str, ...]:
+def _correct(kind: type[SimulatedRobot], found: Sequence[ErrorOutcome]) -> tuple[str, ...]:
     refused = sum(one.refused for one in found)
     arrived = sum(one.checked.arrived for one in found)
     return kind.__name__.lower(), f'{len(found)}', f'{refused}', f'{arrived}'

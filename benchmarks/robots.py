@@ -1,4 +1,4 @@
-"""Simulated robots of the commissioning benchmark, which know nothing about the controller."""
+"""Simulated robots with their own joints and units, which know nothing about the controller."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from needle_dynamics import NeedleParameters
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Rate of the robots [Hz], and steps of the simulation in a period.
+#: Rate of the robots [Hz], and steps of their simulation in a period.
 RATE: Final = 200.0
-_STEPS: Final = 4
+STEPS: Final = 4
 
 #: A joint that is not the insertion joint.
 OTHER: Final = 'door'
 
-PHANTOM: Final = NeedleParameters.preset('phantom')
+_PHANTOM: Final = NeedleParameters.preset('phantom')
 
 
 @dataclass
@@ -66,8 +66,8 @@ class SimulatedRobot:
         value = self.pending.popleft()
         if value is not None:
             self.goal = value
-        for _ in range(_STEPS):
-            self.move(1.0 / RATE / _STEPS)
+        for _ in range(STEPS):
+            self.move(1.0 / RATE / STEPS)
 
     def move(self, h: float) -> None:
         """Move for a time [s]."""
@@ -75,8 +75,8 @@ class SimulatedRobot:
 
     def resistance(self) -> float:
         """Return the force of the tissue against the motion [N]."""
-        dry = PHANTOM.coulomb_friction * min(abs(self.velocity) / 1e-4, 1.0)
-        viscous = PHANTOM.viscous_friction * self.velocity
+        dry = _PHANTOM.coulomb_friction * min(abs(self.velocity) / 1e-4, 1.0)
+        viscous = _PHANTOM.viscous_friction * self.velocity
         return self.friction * (copysign(dry, self.velocity) + viscous)
 
     def states(self, stamp: int) -> Reading:
@@ -131,7 +131,7 @@ class Slide(SimulatedRobot):
         """Advance the mass under the last effort."""
         force = (self.goal or 0.0) / self.gain
         push = self.velocity + force * h / 0.5
-        dry = self.friction * PHANTOM.coulomb_friction * h / 0.5
-        viscous = self.friction * PHANTOM.viscous_friction * h / 0.5
+        dry = self.friction * _PHANTOM.coulomb_friction * h / 0.5
+        viscous = self.friction * _PHANTOM.viscous_friction * h / 0.5
         self.velocity = copysign(max(abs(push) - dry, 0.0), push) / (1.0 + viscous)
         self.depth += self.velocity * h

@@ -69,7 +69,7 @@ class Admittance:
         #: Velocity of the base [m/s].
         self.velocity = 0.0
         #: Last measured insertion depth [m].
-        self._measured = 0.0
+        self.measured = 0.0
         #: Stamp of the last step [ns]; None at rest.
         self.answered: int | None = None
 
@@ -97,7 +97,7 @@ class Admittance:
         if self.answered is not None:
             longest = _LONGEST * self._period
             elapsed = min(max((stamp - self.answered) / NANOSECONDS, 0.0), longest)
-        self.answered, self._measured = stamp, measured
+        self.answered, self.measured = stamp, measured
         most = self._speed
         aim, velocity = self.axis.propagate(before, self.velocity, force, elapsed)
         velocity = min(max(velocity, -most), most)
@@ -108,26 +108,6 @@ class Admittance:
         self.velocity = velocity if within == aim else 0.0
         self.position = within
         return within
-
-    def place(self, position: float, measured: float) -> float | None:
-        """
-        Rest at an insertion depth.
-
-        Parameters
-        ----------
-        position : float
-            Insertion depth [m].
-        measured : float
-            Insertion depth of the robot [m].
-
-        Returns
-        -------
-        float or None
-            As for `hold`.
-
-        """
-        self.position, self._measured = position, measured
-        return self.hold()
 
     def hold(self) -> float | None:
         """
@@ -153,5 +133,5 @@ class Admittance:
 
         """
         if self.position is not None:
-            self.position = self._measured
+            self.position = self.measured
         return self.hold()

@@ -411,7 +411,9 @@ class Robot:
             if stopped:
                 length = base.give_way()
             elif answer.reference and self.probe is not None:
-                length = base.place(self.probe, self._depth) if isfinite(self.probe) else None
+                if isfinite(self.probe):
+                    base.position, base.measured = self.probe, self._depth
+                    length = base.hold()
             elif answer.reference:
                 length = base.step(answer.force - load, self._depth, answer.stamp)
             elif base.answered == answer.stamp:
