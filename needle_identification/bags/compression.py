@@ -39,7 +39,7 @@ LARGEST_MESSAGE: Final = 2**26
 _AT_LEAST: Final = 2**28
 _RATIO: Final = 50
 
-#: Records allowed for any file, else one per byte: a message at rest is compressed to 2 or 3 bytes.
+#: Records allowed for any file, else one per byte: a message at rest takes 2 or 3 bytes.
 _RECORDS: Final = 2**20
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
