@@ -201,6 +201,7 @@ def one_line(folder: Path) -> Path:
     return file
 
 
+@pytest.mark.requirement('S-168', 'S-169', 'S-170', 'S-171', 'S-172', 'S-173', 'S-174', 'S-177')
 @pytest.mark.parametrize(
     ('make', 'reason'),
     [
@@ -242,6 +243,7 @@ def test_decompression_bomb_is_rejected_in_one_line(
     assert peak(command) < MEMORY
 
 
+@pytest.mark.requirement('S-168')
 @pytest.mark.parametrize('bomb', [LAUGHS, MERGES])
 def test_recorded_parameters_with_a_yaml_bomb_are_ignored(bomb: str, tmp_path: Path) -> None:
     """They are ignored like other invalid text."""
@@ -276,6 +278,7 @@ def peak(command: list[str]) -> int:
     return int(run.stdout)
 
 
+@pytest.mark.requirement('S-176')
 def test_limits_can_be_raised(tmp_path: Path) -> None:
     """A common factor scales all limits; an invalid factor is rejected."""
     file = tmp_path / 'bag.mcap'
@@ -300,10 +303,19 @@ def test_limits_can_be_raised(tmp_path: Path) -> None:
         assert f'NEEDLE_BAG_FACTOR must be a positive number, got {factor!r}' in said[factor]
 
 
+@pytest.mark.requirement('S-167', 'S-172')
 @pytest.mark.parametrize(
-    'text', ['a: &x 1\nb: *x', '{' * 40, '"' + 'a' * 2**20 + '"', 'a: [', '\0']
+    'text',
+    [
+        'a: &x 1\nb: *x',
+        '{' * 40,
+        '"' + 'a' * 2**20 + '"',
+        'a: [',
+        '\0',
+        '!!python/object/apply:os.getcwd []',
+    ],
 )
 def test_documents_that_expand_are_rejected(text: str) -> None:
-    """Aliases, nesting depth, length, and invalid YAML."""
+    """Aliases, nesting depth, length, invalid YAML, and code."""
     with pytest.raises(DocumentError):
         read_document(text)
