@@ -353,6 +353,28 @@ def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> No
     assert_allclose(robot.at, before, atol=1e-9)
 
 
+@pytest.mark.requirement('S-187')
+@pytest.mark.parametrize('continuous', [False, True])
+def test_needle_moved_deeper_after_the_insertion_stops_the_system(continuous: bool) -> None:
+    """At five times its tolerance beyond the target; a withdrawn needle is no fault."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    robot.steer()
+    offset = -5e-3
+    robot.moves = lambda wanted: np.add(wanted, (offset, 0.0, 0.0))
+    robot.tick(10)
+    assert robot.loop.fault == ''
+    offset = 0.0
+    for _ in range(100):
+        offset += 1e-4
+        robot.tick()
+        if robot.loop.fault:
+            break
+    assert offset == pytest.approx(5.0 * SETTINGS.depth_tolerance, abs=2e-4)
+    assert robot.loop.phase is Phase.STOPPED
+    assert robot.loop.authority.reason == robot.loop.fault
+    assert 'after the insertion insertion is at 61.' in robot.loop.fault
+
+
 def test_slow_needle_is_no_fault() -> None:
     robot = Robot(replace(CONTINUOUS, speed=5e-3))
     robot.steer()
