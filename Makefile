@@ -17,6 +17,7 @@ check: $(VENV)/.dev
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
 	$(BIN)/python -m tools.language
+	$(BIN)/python -m tools.safety_file
 
 # Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs

@@ -31,7 +31,7 @@ MODULES = {
     'steering-fit': ('steering_fit',),
     'steering': ('steering',),
     'laws': ('laws',),
-    'safety': ('safety',),
+    'safety': ('safety', 'steering_faults'),
     'commissioning': ('commissioning',),
     'graph': ('graph',),
     'slicer': ('slicer',),

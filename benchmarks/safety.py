@@ -14,7 +14,7 @@ from math import inf, nan
 import os
 from typing import Final, NamedTuple, TypeAlias
 
-from benchmarks import strangers
+from benchmarks import steering_faults, strangers
 from benchmarks.loop import Commanded, Loop, LoopFault, MEASURED, Sent
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
@@ -294,10 +294,13 @@ def _recovery(loop: Loop) -> float:
 
 def compare(tick: Tick, fault: str = '') -> Answer:
     """Measure all cells, or a single fault without real nodes."""
+    faults = dict.fromkeys(cell.fault for cell in cells())
+    faults |= dict.fromkeys(cell.fault for cell in steering_faults.cells())
+    if fault and fault not in faults:
+        raise ParameterError(f'--fault must be one of {", ".join(faults)}, got {fault!r}')
     chosen = [cell for cell in cells() if fault in ('', cell.fault)]
     if not chosen:
-        known = ', '.join(dict.fromkeys(cell.fault for cell in cells()))
-        raise ParameterError(f'--fault must be one of {known}, got {fault!r}')
+        return [], []
     tick('simulated time')
     with processes(os.cpu_count() or 1) as pool:
         found = list(pool.map(measure, chosen))

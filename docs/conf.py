@@ -19,6 +19,7 @@ extensions = [
     'myst_parser',
     'api',
     'repository_pages',
+    'safety_file',
     'mathml',
 ]
 # The README is included in the home page.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Generator
+from datetime import datetime, timezone
 import faulthandler
 import os
 import signal
@@ -13,6 +14,7 @@ from typing import Any, Final
 from hypothesis import settings
 import psutil
 import pytest
+from tools.safety_file import RESULTS
 
 # No deadline per example: tests run in parallel.
 settings.register_profile('tests', deadline=None)
@@ -38,6 +40,10 @@ ENDING: Final = 120.0
 
 #: Time for child processes to print their stacks [s].
 PRINTING: Final = 5.0
+
+#: Outcomes of the tests that name a requirement, and outcomes in the order of their severity.
+OUTCOMES: dict[str, str] = {}
+SEVERITIES: Final = '', 'passed', 'skipped', 'failed'
 
 #: A copy of standard error outside the capture of pytest, and the time limit of a test [s].
 STDERR, LIMIT = pytest.StashKey[int](), pytest.StashKey[float]()
@@ -112,6 +118,24 @@ def abort_children() -> None:
 def runs(process: psutil.Process) -> bool:
     """Return whether a process is running; its parent reaps it."""
     return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Collect the outcome of the tests that name a requirement, the worst of all parameters."""
+    name = report.nodeid.partition('[')[0]
+    if 'requirement' in report.keywords and (report.when == 'call' or not report.passed):
+        worse = max(OUTCOMES.get(name, ''), report.outcome, key=SEVERITIES.index)
+        OUTCOMES[name] = worse
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Keep the outcomes for the safety file, see tools/safety_file.py."""
+    cache = getattr(config, 'cache', None)
+    if OUTCOMES and cache is not None and not hasattr(config, 'workerinput'):
+        today = f'{datetime.now(timezone.utc):%Y-%m-%d}'
+        found = {name: {'outcome': one, 'date': today} for name, one in OUTCOMES.items()}
+        cache.set(RESULTS, {**cache.get(RESULTS, {}), **found})
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -359,10 +359,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
         found = dict(zip(reading.names, reading.values[0], strict=False))
         missing = [name for name in self.settings.joints if name not in found]
         if missing:
-            names = ', '.join(missing)
-            self.events.reject(
-                f'joint_states lacks a position of {names}, got names {list(reading.names)}'
-            )
+            got = f'got names {list(reading.names)}'
+            self.events.reject(f'joint_states lacks a position of {", ".join(missing)}, {got}')
             return None
         at = [found[name] for name in self.settings.joints]
         if not self._is_valid(self._joint_stream, reading, at, now):
@@ -374,6 +372,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if self._obeyed is Mode.PAUSED:
             return None
         if not self.steers:
+            if self.phase is Phase.DONE and motions.beyond:
+                self.fault = f'after the insertion {motions.astray()}'
+                return self._stop(self.fault, now)
             retraction = self._retraction
             return None if retraction is None else retraction.follow(now)
         if motions.astray():

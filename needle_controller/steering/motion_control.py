@@ -181,6 +181,11 @@ class MotionControl:
                 )
         return ''
 
+    @property
+    def beyond(self) -> bool:
+        """Whether the needle is deeper than the end of its motion."""
+        return bool(self.at[0] > self.goal[0] + LAGGING * self._settings.depth_tolerance)
+
     def missed(self, which: BoolArray | None = None) -> str:
         """Describe the joints (or given joints) that are not at their goal, '' if all are."""
         far = np.abs(self.at - self.goal) > self._settings.tolerances

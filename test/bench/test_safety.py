@@ -10,6 +10,7 @@ from needle_ros.errors import ParameterError
 import pytest
 
 
+@pytest.mark.requirement('S-152', 'S-153')
 def test_cells_cover_faults_topics_and_moments() -> None:
     """At least 500 cells without duplicates."""
     all_cells = cells()
@@ -17,6 +18,7 @@ def test_cells_cover_faults_topics_and_moments() -> None:
     assert {cell.moment for cell in all_cells} == set(safety.MOMENTS)
 
 
+@pytest.mark.requirement('S-001')
 @pytest.mark.parametrize(
     ('cell', 'outcome'),
     [
@@ -37,6 +39,7 @@ def test_cell_outcome_is_measured(cell: FaultCell, outcome: str) -> None:
     assert measure(cell) == found
 
 
+@pytest.mark.requirement('S-153')
 def test_single_fault_is_selected() -> None:
     """Tables of the topics with this fault, and bars that are met; an unknown name is rejected."""
     sections, bars = safety.compare(lambda _stage: None, fault='swapped')

@@ -374,6 +374,7 @@ MANY = [
 DURATION = 120.0
 
 
+@pytest.mark.requirement('S-188')
 @pytest.mark.parametrize('make', MANY)
 def test_many_small_records_are_rejected_in_one_line(
     make: Callable[[Path], Path], tmp_path: Path
@@ -385,6 +386,7 @@ def test_many_small_records_are_rejected_in_one_line(
     assert cost.memory < MEMORY
 
 
+@pytest.mark.requirement('S-188')
 def test_recording_at_rest_is_within_the_limit_of_records(tmp_path: Path) -> None:
     """Equal messages on ten topics at 1 kHz, compressed by zstd."""
     file, messages = tmp_path / 'rest.mcap', 10 * 5000
@@ -403,6 +405,7 @@ def test_recording_at_rest_is_within_the_limit_of_records(tmp_path: Path) -> Non
     assert len(packed) > 1.5 * messages
 
 
+@pytest.mark.requirement('S-168')
 @pytest.mark.parametrize('make', [index, tables])
 def test_large_tables_of_contents_are_skipped(
     make: Callable[[Path], Path], tmp_path: Path
@@ -413,6 +416,7 @@ def test_large_tables_of_contents_are_skipped(
     assert cost.memory < MEMORY
 
 
+@pytest.mark.requirement('S-168', 'S-169', 'S-170', 'S-171', 'S-172', 'S-173', 'S-174', 'S-177')
 @pytest.mark.parametrize(
     ('make', 'reason'),
     [
@@ -445,6 +449,7 @@ def test_decompression_bomb_is_rejected_in_one_line(
     assert cost.memory < MEMORY
 
 
+@pytest.mark.requirement('S-168')
 @pytest.mark.parametrize('bomb', [LAUGHS, MERGES])
 def test_recorded_parameters_with_a_yaml_bomb_are_ignored(bomb: str, tmp_path: Path) -> None:
     """They are ignored like other invalid text."""
@@ -493,6 +498,7 @@ def measured(command: list[str]) -> tuple[str, Cost]:
     return lines[0], Cost(float(duration), int(memory))
 
 
+@pytest.mark.requirement('S-176')
 def test_limits_can_be_raised(tmp_path: Path) -> None:
     """A common factor scales all limits; an invalid factor is rejected."""
     file = tmp_path / 'bag.mcap'
@@ -517,10 +523,19 @@ def test_limits_can_be_raised(tmp_path: Path) -> None:
         assert f'NEEDLE_BAG_FACTOR must be a positive number, got {factor!r}' in said[factor]
 
 
+@pytest.mark.requirement('S-167', 'S-172')
 @pytest.mark.parametrize(
-    'text', ['a: &x 1\nb: *x', '{' * 40, '"' + 'a' * 2**20 + '"', 'a: [', '\0']
+    'text',
+    [
+        'a: &x 1\nb: *x',
+        '{' * 40,
+        '"' + 'a' * 2**20 + '"',
+        'a: [',
+        '\0',
+        '!!python/object/apply:os.getcwd []',
+    ],
 )
 def test_documents_that_expand_are_rejected(text: str) -> None:
-    """Aliases, nesting depth, length, and invalid YAML."""
+    """Aliases, nesting depth, length, invalid YAML, and code."""
     with pytest.raises(DocumentError):
         read_document(text)

@@ -102,6 +102,7 @@ def test_invalid_law_is_rejected_in_one_line(
     assert said.count('\n') == 1
 
 
+@pytest.mark.requirement('S-135')
 @pytest.mark.parametrize(
     ('plan', 'fault'),
     [

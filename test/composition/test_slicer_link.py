@@ -150,6 +150,7 @@ def test_other_protocol_closes_connection(
     assert '\n' not in ''.join(desk.lines)
 
 
+@pytest.mark.requirement('S-165')
 def test_second_peer_is_rejected(desk: Desk, stack: ExitStack) -> None:
     """The first connection stays."""
     first = visitor(desk, stack)
@@ -163,6 +164,7 @@ def test_second_peer_is_rejected(desk: Desk, stack: ExitStack) -> None:
     desk.until(lambda: desk.frames, 'the message')
 
 
+@pytest.mark.requirement('S-164')
 def test_link_listens_on_configured_address_only(desk: Desk) -> None:
     """Connections to other local addresses are refused."""
     with pytest.raises(ConnectionRefusedError):

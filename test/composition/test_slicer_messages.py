@@ -238,6 +238,7 @@ def test_points_with_other_names_are_ignored() -> None:
     assert Interpreter(Registration(), REACH).target(framed(message.pack())) is None
 
 
+@pytest.mark.requirement('S-166')
 @given(
     st.sampled_from(['POINT', 'TRANSFORM', 'STRING']),
     st.binary(max_size=300),
@@ -391,6 +392,7 @@ def test_random_bytes_are_rejected_or_skipped(data: bytes) -> None:
         assert Frames(is_wanted, pytest.fail).take(data) == []
 
 
+@pytest.mark.requirement('S-166')
 def test_oversized_messages_are_skipped_without_storage() -> None:
     """A target of a gigabyte is rejected by its header and skipped; a larger size is an error."""
     complaints: list[str] = []

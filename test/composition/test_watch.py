@@ -527,6 +527,7 @@ async def test_page_has_no_external_content() -> None:
                 assert reply.status == 404
 
 
+@pytest.mark.requirement('S-161')
 @in_loop
 async def test_foreign_host_header_is_rejected() -> None:
     """DNS rebinding: a foreign name that resolves to 127.0.0.1 is rejected."""
@@ -546,6 +547,7 @@ async def test_foreign_host_header_is_rejected() -> None:
                 assert reply.status == 200
 
 
+@pytest.mark.requirement('S-161')
 @in_loop
 async def test_foreign_origin_is_rejected() -> None:
     """Cross-site requests: the WebSocket of a foreign page is rejected."""
@@ -557,6 +559,7 @@ async def test_foreign_origin_is_rejected() -> None:
         assert (await stream.receive_json())['frame'] == 1
 
 
+@pytest.mark.requirement('S-161')
 @in_loop
 async def test_commands_require_token() -> None:
     """A missing or wrong token has no effect, and the answer explains the source of the token."""
@@ -769,6 +772,7 @@ async def test_port_in_use_is_reported() -> None:
     )
 
 
+@pytest.mark.requirement('S-161')
 def test_control_is_restricted_to_loopback() -> None:
     """Control and other machines exclude each other; the host must be an address."""
     with pytest.raises(ParameterError, match='--control works on this machine only'):

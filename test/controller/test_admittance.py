@@ -77,6 +77,7 @@ def test_command_stays_within_its_limits(forces: list[tuple[float, int]]) -> Non
         at = then
 
 
+@pytest.mark.requirement('S-109', 'S-115')
 @given(st.lists(st.tuples(st.floats(-15.0, 15.0), st.floats(-0.1, 0.1)), min_size=1))
 def test_command_stays_within_lead_of_robot(samples: list[tuple[float, float]]) -> None:
     """For any measured position; the command does not wind up against an obstacle."""

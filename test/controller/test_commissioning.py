@@ -75,6 +75,7 @@ def test_harmful_errors_are_refused_within_two_millimeters(case: ErrorCase) -> N
     assert not found.refused or found.checked.motion <= HARMFUL
 
 
+@pytest.mark.requirement('S-189')
 @pytest.mark.parametrize(
     ('error', 'parameter'),
     [
@@ -96,6 +97,7 @@ def test_contradictions_of_the_measured_depths_are_rejected(
     assert found.reason.startswith(parameter)
 
 
+@pytest.mark.requirement('S-190')
 @pytest.mark.parametrize('kind', KINDS)
 def test_other_depth_than_measured_is_refused_at_rest(kind: type[SimulatedRobot]) -> None:
     """A lost zero of the encoder, or another joint."""
@@ -106,6 +108,7 @@ def test_other_depth_than_measured_is_refused_at_rest(kind: type[SimulatedRobot]
     assert found.motion == 0.0
 
 
+@pytest.mark.requirement('S-191')
 @pytest.mark.parametrize('kind', KINDS)
 def test_missing_response_is_refused(kind: type[SimulatedRobot]) -> None:
     found = refused(replace(correct(kind), connected=False))
@@ -123,6 +126,7 @@ def test_other_joint_at_the_same_depth_is_refused(kind: type[SimulatedRobot]) ->
     assert "the joint 'door' moved " in found.reason
 
 
+@pytest.mark.requirement('S-191')
 @pytest.mark.parametrize('kind', KINDS)
 def test_reversed_driver_is_refused(kind: type[SimulatedRobot]) -> None:
     """A driver whose commands have the opposite direction of its joint states."""
@@ -139,6 +143,7 @@ def test_reversed_driver_is_refused(kind: type[SimulatedRobot]) -> None:
     assert "the joint 'axis' moved +" in found.reason
 
 
+@pytest.mark.requirement('S-190')
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('rate', [50.0, 1000.0])
 def test_wrong_rate_is_refused_at_rest(kind: type[SimulatedRobot], rate: float) -> None:
@@ -147,6 +152,7 @@ def test_wrong_rate_is_refused_at_rest(kind: type[SimulatedRobot], rate: float) 
     assert found.motion == 0.0
 
 
+@pytest.mark.requirement('S-191')
 @pytest.mark.parametrize(
     ('kind', 'late', 'said'),
     [
@@ -159,6 +165,7 @@ def test_delay_is_refused(kind: type[SimulatedRobot], late: dict[str, Any], said
     assert said in refused(changed_robot(correct(kind), **late)).reason
 
 
+@pytest.mark.requirement('S-191')
 @pytest.mark.parametrize('kind', KINDS)
 def test_force_sensor_axes_are_refused_with_the_correct_axis(kind: type[SimulatedRobot]) -> None:
     """The proposed axis passes."""
@@ -173,6 +180,7 @@ def test_force_sensor_axes_are_refused_with_the_correct_axis(kind: type[Simulate
     assert f'or hardware.reaction to {str(one.hardware["reaction"]).lower()}' in found.reason
 
 
+@pytest.mark.requirement('S-190')
 @pytest.mark.parametrize('kind', KINDS)
 def test_unstated_facts_are_refused_without_motion(kind: type[SimulatedRobot]) -> None:
     """Unless the check is skipped."""

@@ -143,6 +143,7 @@ def test_constants_with_unstable_gains_are_rejected() -> None:
     assert steering.command(measured) == other.command(measured)
 
 
+@pytest.mark.requirement('S-020', 'S-022')
 def test_forces_stay_within_their_limit() -> None:
     """No command exceeds the force limit, for any error."""
     steering = controller(force_limit=2.0)
@@ -154,6 +155,7 @@ def test_forces_stay_within_their_limit() -> None:
     assert max(forces) == 2.0
 
 
+@pytest.mark.requirement('S-024')
 @pytest.mark.parametrize('depth', [nan, -0.01, 0.0, 0.21, np.inf])
 def test_targets_out_of_range_are_rejected(depth: float) -> None:
     """Before the skin, beyond the hub and not a number: rejected with the valid range."""
@@ -263,6 +265,7 @@ def test_stability_limits_are_reported() -> None:
         controller(stability_margin=0.1)
 
 
+@pytest.mark.requirement('S-055')
 @pytest.mark.parametrize(
     ('depth', 'speed', 'fault'),
     [(0.025, 0.0, 'moved by 0.005 m'), (0.02, 9e3, 'moved by 0 m'), (nan, 0.0, 'must be finite')],
@@ -285,6 +288,7 @@ def test_inconsistent_measurement_gives_zero_force(depth: float, speed: float, f
     assert steering.target == 0.05
 
 
+@pytest.mark.requirement('S-072')
 def test_needle_moved_during_a_fault_clears_the_target() -> None:
     """One message, and no motion before a new target."""
     steering = controller()
@@ -318,6 +322,7 @@ def test_integral_is_frozen_without_a_command() -> None:
     assert loop.memory[INTEGRAL] == 0.0
 
 
+@pytest.mark.requirement('S-084')
 @pytest.mark.parametrize('step', [7.0, -7.0], ids=['forward', 'back'])
 def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
     """No fault and no jump of the reference: to the same target from the measured depth."""
@@ -345,6 +350,7 @@ def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
     assert after.force > 0.0
 
 
+@pytest.mark.requirement('S-087')
 @pytest.mark.parametrize('load', [nan, inf])
 def test_command_detects_non_finite_values(load: float) -> None:
     """An invalid load gives a command that must not be sent."""
@@ -356,6 +362,7 @@ def test_command_detects_non_finite_values(load: float) -> None:
     assert not ControllerOutput(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
 
 
+@pytest.mark.requirement('S-024')
 def test_depth_range_limits_the_targets() -> None:
     """Targets outside it are rejected, and also an empty range."""
     steering = controller(lowest_depth=0.02, highest_depth=0.1)

@@ -110,6 +110,7 @@ def test_joint_is_found_by_name(names: list[str]) -> None:
         assert isnan(found.force)
 
 
+@pytest.mark.requirement('S-112')
 def test_missing_joints_and_velocities_are_named() -> None:
     """With the available joints."""
     with pytest.raises(
@@ -224,6 +225,7 @@ def test_other_joints_hold_their_position() -> None:
     assert robot.command(push(SECOND, 0.0)) == [2.0, 0.03]
 
 
+@pytest.mark.requirement('S-114')
 def test_position_command_rests_without_a_reference() -> None:
     """It holds the last command in a fault, and yields to the robot in a stop."""
     robot = moves(scale=1e-3)

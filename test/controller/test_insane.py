@@ -32,6 +32,7 @@ class Insane(LoopFault):
         return (sent._replace(values=told[: len(sent.values)]),)
 
 
+@pytest.mark.requirement('S-001', 'S-039')
 @settings(max_examples=20, deadline=None)
 @example('adaptive', 'joint_states', [0.02, 0.0, 1e300, 0.0, 0.0, 0.0], 1)
 @example('adaptive', 'base_wrench', [0.0, 1e300, 0.0, 0.0, 0.0, 0.0], 3)
@@ -68,6 +69,7 @@ def test_controller_recovers_from_implausible_inputs(
     assert abs(loop.acting) < 2.0
 
 
+@pytest.mark.requirement('S-037')
 @pytest.mark.parametrize('value', [1e100, -1e100, 1e7, float('inf'), float('nan')])
 def test_observer_ignores_implausible_sensors(value: float) -> None:
     """A single reading has no effect on later estimates."""
@@ -85,6 +87,7 @@ def test_observer_ignores_implausible_sensors(value: float) -> None:
     assert loads[0] == loads[1]
 
 
+@pytest.mark.requirement('S-038')
 def test_observer_rejects_an_implausible_velocity() -> None:
     """It is finite, and would give a load of 1e296 N."""
     observer = Observer(PHANTOM, ObserverSettings(), 1e-3)

@@ -7,6 +7,7 @@ from needle_ros.timing import NANOSECONDS
 import pytest
 
 
+@pytest.mark.requirement('S-082')
 @pytest.mark.parametrize(
     ('rate', 'late', 'said'),
     [(1000, 40, False), (1000, 60, True), (20, 2, False), (20, 10, True)],

@@ -1010,6 +1010,7 @@ def test_repeated_and_invalid_samples_are_rejected() -> None:
     assert_allclose(np.array(observer.modal), np.array(clean.modal), rtol=0, atol=0)
 
 
+@pytest.mark.requirement('S-062')
 @pytest.mark.parametrize('missing', [(nan, nan), (nan, 0.01), (0.1, nan), (float('inf'), 0.01)])
 def test_each_channel_may_be_missing(missing: tuple[float, float]) -> None:
     observer = Observer(phantom(), ObserverSettings(), PERIOD)
@@ -1084,6 +1085,7 @@ def test_gap_in_encoder_samples_is_bridged() -> None:
     assert_allclose(whole.covariance, gap.covariance, rtol=1e-9, atol=0)
 
 
+@pytest.mark.requirement('S-062')
 @pytest.mark.parametrize('name', ['paper_mm', 'phantom'])
 def test_covariance_stays_finite_without_measurements(name: str) -> None:
     """Ten minutes of encoders only: the covariance grows as the noise, symmetric and positive."""

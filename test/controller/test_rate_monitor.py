@@ -30,6 +30,7 @@ def judged(
     return pace.warning()
 
 
+@pytest.mark.requirement('S-110')
 @pytest.mark.parametrize(('rate', 'true'), [(1000.0, 500.0), (500.0, 1000.0), (100.0, 125.0)])
 def test_wrong_rate_gives_a_warning(rate: float, true: float) -> None:
     """The warning has both rates and the correction, with jitter too."""
@@ -42,6 +43,7 @@ def test_wrong_rate_gives_a_warning(rate: float, true: float) -> None:
         assert f'rate is {rate:g} Hz: set rate to {found:.3g}' in said
 
 
+@pytest.mark.requirement('S-110')
 @pytest.mark.parametrize('rate', [50.0, 200.0, 1000.0])
 def test_correct_rate_gives_no_warning(rate: float) -> None:
     """For any jitter, lost samples and small clock differences."""

@@ -84,6 +84,7 @@ def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponen
     assert (np.abs(high - found.max(axis=1)) <= 1e-4 * size).all()
 
 
+@pytest.mark.requirement('S-023')
 @settings(deadline=None)
 @given(depths, depths)
 def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
@@ -95,6 +96,7 @@ def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
     assert motion.duration == pytest.approx(least, rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.requirement('S-023')
 def test_minimum_jerk_reaches_its_speed_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
@@ -169,6 +171,7 @@ def test_lines_are_followed_exactly_between_their_corners() -> None:
     assert off <= 0.013**2 / (8.0 * LIMITS.acceleration) * (1.0 + 1e-9)
 
 
+@pytest.mark.requirement('S-024')
 @pytest.mark.parametrize(
     ('times', 'positions', 'rates', 'reason'),
     [
@@ -251,6 +254,7 @@ def test_reference_is_continuous_across_all_changes(
     assert np.abs(np.diff(speed)).max() <= 1e-3 * LIMITS.acceleration * (1.0 + 1e-6)
 
 
+@pytest.mark.requirement('S-008')
 @KINDS
 def test_pause_brakes_holds_and_resumes(kind: str) -> None:
     """In motion it stops within v^2 / 2a (2.9 times that with minimum jerk), then continues."""
@@ -317,6 +321,7 @@ narrow_events = st.lists(
 )
 
 
+@pytest.mark.requirement('S-023')
 @KINDS
 @settings(deadline=None, max_examples=40)
 @given(start=inside, events=narrow_events)

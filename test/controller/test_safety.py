@@ -38,6 +38,7 @@ def safety(expected: tuple[str, ...] = (), **limits: Any) -> Safety:
     return whole
 
 
+@pytest.mark.requirement('S-046', 'S-047')
 @pytest.mark.parametrize(
     ('stamp', 'kind', 'words'),
     [
@@ -59,6 +60,7 @@ def test_stale_future_and_missing_stamps_are_rejected(
     assert wrench.counts[kind or 'accepted'] == 1
 
 
+@pytest.mark.requirement('S-060')
 def test_zero_stamps_are_valid_at_time_zero() -> None:
     """The first sample of a simulation has a stamp of zero, and is not unstamped."""
     wrench = stream()
@@ -67,6 +69,7 @@ def test_zero_stamps_are_valid_at_time_zero() -> None:
     assert wrench.check(MILLISECOND, MILLISECOND) is None
 
 
+@pytest.mark.requirement('S-051', 'S-052')
 def test_repeated_and_out_of_order_messages_are_discarded() -> None:
     """A repeated or late message is discarded, and is no fault."""
     wrench = stream()
@@ -81,6 +84,7 @@ def test_repeated_and_out_of_order_messages_are_discarded() -> None:
     assert (status.rejected, status.age) == ({}, 0.0)
 
 
+@pytest.mark.requirement('S-053', 'S-054')
 def test_wrong_frames_and_non_finite_values_are_rejected() -> None:
     """With the received frame and values."""
     wrench = stream(frames=('needle_base',))
@@ -103,6 +107,7 @@ def feed(watched: InputMonitor, readings: list[Any]) -> list[str]:
     return kinds
 
 
+@pytest.mark.requirement('S-055', 'S-061')
 def test_first_reading_after_a_jump_is_rejected() -> None:
     """Both edges of a spike are rejected; a step is valid from its second reading on."""
     assert feed(stream(jumps=[1.0]), [0, 0, 9, 0, 0]) == ['', '', 'jump', 'jump', '']
@@ -110,6 +115,7 @@ def test_first_reading_after_a_jump_is_rejected() -> None:
     assert feed(stream(jumps=[1.0]), [0, 0.9, 1.8]) == [''] * 3
 
 
+@pytest.mark.requirement('S-056')
 def test_constant_readings_of_a_noisy_sensor_are_frozen() -> None:
     """After the timeout of 0.5 s they are rejected until a change."""
     rng = np.random.default_rng(1)
@@ -124,6 +130,7 @@ def test_constant_readings_of_a_noisy_sensor_are_frozen() -> None:
     assert not wrench.frozen
 
 
+@pytest.mark.requirement('S-056')
 @pytest.mark.parametrize(
     'readings',
     [[0.0] * 2000, [0.1 * 0.9**i if i < 300 else 0.0 for i in range(2000)]],
@@ -160,6 +167,7 @@ GUARD = [
 ]
 
 
+@pytest.mark.requirement('S-025', 'S-026', 'S-027', 'S-028', 'S-036')
 @pytest.mark.parametrize(('name', 'values', 'words'), GUARD)
 def test_two_readings_beyond_a_limit_violate_it(
     name: str, values: tuple[Any, ...], words: str
@@ -177,6 +185,7 @@ def test_two_readings_beyond_a_limit_violate_it(
     assert guard.violated is None
 
 
+@pytest.mark.requirement('S-025')
 def test_readings_at_a_limit_are_within_it() -> None:
     """Limits are the largest valid values."""
     guard, limits = Guard(SafetyLimits(), (0.001, 0.1)), SafetyLimits()
@@ -200,6 +209,7 @@ def test_readings_at_a_limit_are_within_it() -> None:
         assert guard.tracking(-limits.tracking_error) is None
 
 
+@pytest.mark.requirement('S-041')
 def test_stop_cannot_be_cleared_beyond_a_limit() -> None:
     """The first reason stays; clearing is rejected with the limit that is still exceeded."""
     whole = safety()
@@ -217,6 +227,7 @@ def test_stop_cannot_be_cleared_beyond_a_limit() -> None:
     assert (whole.stop, whole.stops) == (None, 1)
 
 
+@pytest.mark.requirement('S-042')
 def test_silent_sensor_does_not_block_clearing_the_stop() -> None:
     """Its last reading is outdated."""
     whole = safety()
@@ -228,6 +239,7 @@ def test_silent_sensor_does_not_block_clearing_the_stop() -> None:
     assert whole.clear(now + 2 * SECOND) is None
 
 
+@pytest.mark.requirement('S-042')
 def test_discarded_reference_does_not_block_clearing_the_stop() -> None:
     """The motion restarts from the measured depth."""
     whole = safety()
@@ -236,6 +248,7 @@ def test_discarded_reference_does_not_block_clearing_the_stop() -> None:
     assert whole.clear(10 * SECOND) is None
 
 
+@pytest.mark.requirement('S-073')
 def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
     """Logged once, shown until the sensor is back, and not before the plant starts."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
@@ -259,6 +272,7 @@ def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
     assert whole.new_warnings(now + 9 * SECOND) == []
 
 
+@pytest.mark.requirement('S-073')
 def test_silence_is_measured_from_the_first_clock_message() -> None:
     """A node with simulated time is at 0 before the first /clock."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
@@ -269,6 +283,7 @@ def test_silence_is_measured_from_the_first_clock_message() -> None:
     assert whole.new_warnings(now) == []
 
 
+@pytest.mark.requirement('S-073')
 def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
     """With `sensors_required` clearing is rejected until then."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5, sensors_required=True)
@@ -285,6 +300,7 @@ def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
     assert whole.clear(later) is None
 
 
+@pytest.mark.requirement('S-079', 'S-163')
 def test_duplicate_publishers_of_commands_are_reported() -> None:
     """Each topic with more than one publisher, until there is one again."""
     whole = safety()
@@ -294,6 +310,7 @@ def test_duplicate_publishers_of_commands_are_reported() -> None:
     assert whole.duplicate_publishers is None
 
 
+@pytest.mark.requirement('S-049', 'S-081', 'S-163')
 def test_sensor_with_two_publishers_is_rejected() -> None:
     """No force with duplicate encoders; after the duplicate ends, the sensor is valid again."""
     whole, now = safety(), 5 * SECOND
@@ -309,6 +326,7 @@ def test_sensor_with_two_publishers_is_rejected() -> None:
     assert whole.streams['joint_states'].check(now - SECOND // 100, now) is None
 
 
+@pytest.mark.requirement('S-048')
 @pytest.mark.parametrize('name', ['joint_states', 'ground_truth', 'base_wrench', 'tip_deflection'])
 def test_stamp_may_be_one_period_in_the_future(name: str) -> None:
     """A larger lead is rejected: the stamps of the true source would be late."""
@@ -322,6 +340,7 @@ def test_stamp_may_be_one_period_in_the_future(name: str) -> None:
     assert stream.check(now + period + 1, now, frame) is None
 
 
+@pytest.mark.requirement('S-050')
 def test_out_of_order_encoders_stop_the_motion() -> None:
     """A stop above 90 % of out-of-order messages, a warning above 50 %; none at low rates."""
     for late, warned, stopped in ((4, False, False), (6, True, False), (19, True, True)):
@@ -337,6 +356,7 @@ def test_out_of_order_encoders_stop_the_motion() -> None:
         assert whole.mixed_sources(now) == (said if stopped else None)
 
 
+@pytest.mark.requirement('S-019')
 @pytest.mark.parametrize(
     ('change', 'reason'),
     [
@@ -357,6 +377,7 @@ def joints(names: list[str], positions: list[float], speeds: list[float]) -> Rea
     return Reading(SECOND, '', tuple(names), (tuple(positions), tuple(speeds), ()))
 
 
+@pytest.mark.requirement('S-054')
 def test_encoders_are_read_by_name() -> None:
     """In any order, with or without the rotation."""
     both = read_encoders(joints(['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01]))
@@ -366,6 +387,7 @@ def test_encoders_are_read_by_name() -> None:
     assert read_encoders(joints(['insertion'], [0.02], [0.01])).angle == 0.0
 
 
+@pytest.mark.requirement('S-054', 'S-071')
 @pytest.mark.parametrize(
     ('names', 'positions', 'speeds'),
     [

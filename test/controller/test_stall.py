@@ -28,6 +28,7 @@ class Frozen(LoopFault):
         return (sent._replace(values=values),)
 
 
+@pytest.mark.requirement('S-056', 'S-070')
 @pytest.mark.parametrize('law', LAWS)
 @pytest.mark.parametrize('effort', [True, False], ids=['effort', 'no effort'])
 @pytest.mark.parametrize('begin', [40, 60, 150])
@@ -50,6 +51,7 @@ def test_encoders_frozen_in_motion_stop_the_needle(
     assert 'encoders do not move' in loop.supervisor.authority.reason
 
 
+@pytest.mark.requirement('S-070')
 @pytest.mark.parametrize('law', LAWS)
 @pytest.mark.parametrize('factor', [0.2, 1.0, 2.0, 4.0])
 def test_other_friction_is_no_stall(law: str, factor: float) -> None:

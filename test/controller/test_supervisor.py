@@ -134,6 +134,7 @@ EVENTS: list[Callable[[Loop], ForceCommand | None]] = [
 events = st.lists(st.sampled_from(EVENTS), max_size=40)
 
 
+@pytest.mark.requirement('S-007', 'S-043', 'S-058')
 @given(events, events)
 def test_stop_gives_zero_force_until_cleared(
     before: list[Callable[[Loop], ForceCommand | None]],
@@ -151,6 +152,7 @@ def test_stop_gives_zero_force_until_cleared(
     assert loop.supervisor.safety.stop == stop
 
 
+@pytest.mark.requirement('S-002', 'S-090')
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
 def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     happens: list[Callable[[Loop], ForceCommand | None]],
@@ -177,6 +179,7 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
         assert loop.supervisor.fault is None or answer.force == 0.0
 
 
+@pytest.mark.requirement('S-002')
 @given(events)
 def test_valid_measurements_restart_the_motion_after_faults(
     happens: list[Callable[[Loop], ForceCommand | None]],
@@ -216,6 +219,7 @@ def test_zero_force_without_a_target(
     assert last.force == 0.0
 
 
+@pytest.mark.requirement('S-025', 'S-026', 'S-027', 'S-028', 'S-029', 'S-030', 'S-031')
 def test_all_safety_limits_are_read_by_the_supervisor() -> None:
     """In a motion with measurements of all sensors; reads of other classes do not count."""
     read = set()
@@ -260,6 +264,7 @@ class Robot:
         return self.loop.supervisor._last.reference[0]
 
 
+@pytest.mark.requirement('S-078', 'S-099')
 def test_reference_waits_while_plant_does_not_follow() -> None:
     """No stop is latched, the force stays, and the motion continues when the plant follows."""
     robot = Robot()
@@ -285,6 +290,7 @@ def test_reference_waits_while_plant_does_not_follow() -> None:
     assert robot.aim > waits + 0.02
 
 
+@pytest.mark.requirement('S-078')
 def test_gap_ends_the_wait_of_the_reference() -> None:
     """The motion restarts from the measured depth after a gap, with zero force at first."""
     robot = Robot()
@@ -299,6 +305,7 @@ def test_gap_ends_the_wait_of_the_reference() -> None:
     assert robot.loop.depth > depth + 0.01
 
 
+@pytest.mark.requirement('S-100')
 @pytest.mark.parametrize('moves', [False, True])
 def test_response_monitor_ignores_robots_without_force_or_in_motion(moves: bool) -> None:
     """Missing efforts, or zero efforts of a moving needle, are no fault."""
@@ -311,6 +318,7 @@ def test_response_monitor_ignores_robots_without_force_or_in_motion(moves: bool)
     assert not robot.loop.supervisor.controller.guide.waits
 
 
+@pytest.mark.requirement('S-051', 'S-066')
 def test_repeated_measurement_gets_the_same_command() -> None:
     """The reference is not published again; after a stop the command is zero."""
     loop = Loop()
@@ -322,6 +330,7 @@ def test_repeated_measurement_gets_the_same_command() -> None:
     assert loop.encoders(loop.now - PERIOD, loop.depth, 0.0) is None
 
 
+@pytest.mark.requirement('S-037')
 def test_measurement_beyond_a_limit_gets_one_zero_command_with_its_stamp() -> None:
     """The second reading in a row latches the stop, with no further command."""
     loop = Loop()
@@ -335,6 +344,7 @@ def test_measurement_beyond_a_limit_gets_one_zero_command_with_its_stamp() -> No
     )
 
 
+@pytest.mark.requirement('S-045', 'S-057')
 def test_inactive_supervisor_accepts_only_the_stop() -> None:
     """The stop survives configuration, and measurements are not answered."""
     supervisor = Supervisor()
@@ -373,6 +383,30 @@ def test_load_of_ground_truth_is_compensated() -> None:
     assert 'ignored' in bent.said()[-1]
 
 
+@pytest.mark.requirement('S-075')
+def test_load_of_ground_truth_ends_with_its_topic() -> None:
+    """It is zero after the timeout of the measurements."""
+    loop = Loop()
+    state = (PHANTOM.length - 0.02, 0.0, 3e-4, 0.0)
+    loop.supervisor.truth(Reading(loop.now, '', (), (state, (0.0,) * 4, ())), loop.now)
+    loop.watch()
+    assert loop.supervisor.bending.load != 0.0
+    loop.passes(SECOND // 5)
+    assert loop.supervisor.bending.load == 0.0
+
+
+@pytest.mark.requirement('S-038')
+def test_stop_resets_the_observer() -> None:
+    """The stop, and its release."""
+    loop = Loop(observed=ObserverSettings())
+    observer = loop.supervisor.bending.observer
+    for word in (STOP, CLEAR_STOP):
+        loop.measure()
+        assert observer.ready
+        loop.request(word)
+        assert not observer.ready
+
+
 def test_wrench_waits_for_encoders_of_its_stamp() -> None:
     """A wrench received before the encoder sample of its stamp is used with that sample."""
     loop = Loop(observed=ObserverSettings())
@@ -395,6 +429,7 @@ def test_invalid_observer_settings_are_named() -> None:
         )
 
 
+@pytest.mark.requirement('S-003')
 def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
     """Each kind has its own limit; a line without a kind is always logged."""
     times = iter([0.0, 0.5, 1.0, 1.9, 2.1, 2.1])
@@ -426,6 +461,7 @@ def test_many_rejected_targets_give_one_log_line_per_second() -> None:
     assert changes == 1
 
 
+@pytest.mark.requirement('S-175')
 def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
     """The number of points is checked first; long and unprintable lines are shortened."""
     loop = Loop()
@@ -443,6 +479,7 @@ def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
     assert line.isprintable()
 
 
+@pytest.mark.requirement('S-035')
 def test_force_above_eulers_load_gives_a_warning() -> None:
     """With almost the whole needle outside and stronger friction, it buckles at 13 N."""
     loop = Loop()
@@ -499,6 +536,7 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
     assert loop.supervisor.controller.target == 0.01
 
 
+@pytest.mark.requirement('S-010', 'S-014')
 def test_clearance_of_another_node_does_not_end_a_violation() -> None:
     """The limit stops the system again, also a retraction; below the limit the stop ends."""
     loop, other = Loop(), Authority('/steering')
@@ -539,6 +577,7 @@ def test_live_friction_changes_the_expected_motion() -> None:
         assert bool(loop.supervisor.authority.reason) == stops
 
 
+@pytest.mark.requirement('S-009')
 def test_repeated_retraction_withdraws_a_needle_that_was_moved() -> None:
     """The state of the system remains the same in between."""
     loop = Loop(target=None)
@@ -553,6 +592,7 @@ def test_repeated_retraction_withdraws_a_needle_that_was_moved() -> None:
         assert loop.supervisor.controller.target == 0.01
 
 
+@pytest.mark.requirement('S-085')
 def test_clock_set_back_is_detected() -> None:
     """By more than the timeout of 0.1 s; forward steps and pauses of the clock are no fault."""
     supervisor, timeout = Supervisor(), SECOND // 10
@@ -561,6 +601,7 @@ def test_clock_set_back_is_detected() -> None:
     assert found == [0, 0, 0, 0, 0, 48.95, 0]
 
 
+@pytest.mark.requirement('S-030', 'S-031', 'S-040')
 @pytest.mark.parametrize(
     ('topic', 'component', 'size'),
     [
@@ -598,6 +639,7 @@ def test_every_component_of_a_sensor_has_a_limit(
     assert 'is beyond the limit' in loop.supervisor.authority.reason
 
 
+@pytest.mark.requirement('S-029')
 @pytest.mark.parametrize(('within', 'beyond'), [(0.25, 0.26), (-0.045, -0.055)])
 def test_depth_of_the_tip_has_a_limit(within: float, beyond: float) -> None:
     """50 mm and the tolerance outside of the range of depths, 1 to 200 mm."""
@@ -607,6 +649,7 @@ def test_depth_of_the_tip_has_a_limit(within: float, beyond: float) -> None:
     assert 'distance of the tip' in (guard.tip(0.0, beyond) or '')
 
 
+@pytest.mark.requirement('S-030')
 def test_component_that_a_sensor_does_not_measure_is_no_fault() -> None:
     """NaN in a component that the controller does not use."""
     loop = Loop()

@@ -52,6 +52,7 @@ def test_zero_stamp_means_now() -> None:
     assert commands.newest == AppliedForces(NOW, 2.0)
 
 
+@pytest.mark.requirement('S-086')
 @pytest.mark.parametrize('age', [100 * PERIOD + 1, -100 * PERIOD - 1])
 def test_commands_with_old_or_future_stamps_are_rejected(age: int) -> None:
     """The command is counted and its age is reported; the held command continues."""
@@ -65,6 +66,7 @@ def test_commands_with_old_or_future_stamps_are_rejected(age: int) -> None:
     assert (commands.stale, commands.refused, commands.overtaken) == (1, 0, 0)
 
 
+@pytest.mark.requirement('S-067', 'S-091')
 def test_out_of_order_commands_are_discarded() -> None:
     """The order of stamps applies, unless the newest stamp is in the future."""
     commands = made()
@@ -78,6 +80,7 @@ def test_out_of_order_commands_are_discarded() -> None:
     assert commands.newest == AppliedForces(back, 2.0)
 
 
+@pytest.mark.requirement('S-032', 'S-086')
 @pytest.mark.parametrize(
     ('frame', 'force', 'torque', 'complaint'),
     [
@@ -100,6 +103,7 @@ def test_invalid_command_sets_zero_force(
     assert commands.refused == 1
 
 
+@pytest.mark.requirement('S-079')
 def test_no_force_acts_with_several_command_publishers() -> None:
     """From the detection until the next command of the remaining publisher."""
     commands = made()
@@ -116,6 +120,7 @@ def test_no_force_acts_with_several_command_publishers() -> None:
     assert commands.newest.force == 1.0
 
 
+@pytest.mark.requirement('S-033')
 @given(st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=30))
 def test_force_growth_is_rate_limited_and_release_is_immediate(forces: list[float]) -> None:
     """From one sample to the next; the force may cross zero and grow from there."""
@@ -140,6 +145,7 @@ def test_force_growth_is_rate_limited_and_release_is_immediate(forces: list[floa
     assert commands.acting.force == 0.0
 
 
+@pytest.mark.requirement('S-034')
 def test_no_force_acts_above_the_energy_limit() -> None:
     """5 N at 0.4 m/s are 2 W: above 1 J within a second, until the energy is half of it."""
     commands = made(interval=1e-3, power_limit=1.0)
@@ -166,6 +172,7 @@ def test_no_force_acts_above_the_energy_limit() -> None:
     assert not commands.exhausted
 
 
+@pytest.mark.requirement('S-094')
 def test_no_command_acts_for_the_timeout_after_a_short_lived_publisher() -> None:
     """Its commands may arrive late, and expire within the timeout."""
     commands = made()
@@ -176,6 +183,25 @@ def test_no_command_acts_for_the_timeout_after_a_short_lived_publisher() -> None
         at = NOW + k * PERIOD
         commands.offer(at, '', 2.0, 0.0, at)
         assert (commands.newest.force == 2.0) == acts
+
+
+@pytest.mark.requirement('S-017')
+def test_no_command_acts_during_a_stop() -> None:
+    """A force ends at once, and a later command acts only after the stop."""
+    commands = made()
+    commands.offer(NOW, '', 2.0, 0.2, NOW)
+    commands.stop()
+    commands.hold(NOW)
+    assert commands.acting == AppliedForces(NOW)
+    commands.offer(NOW + 1, '', 2.0, 0.2, NOW + 1)
+    commands.hold(NOW + 1)
+    assert commands.acting == AppliedForces(NOW + 1)
+    commands.stopped = False
+    commands.hold(NOW + 2)
+    assert commands.acting == AppliedForces(NOW + 1)
+    commands.offer(NOW + 3, '', 2.0, 0.2, NOW + 3)
+    commands.hold(NOW + 3)
+    assert commands.acting == AppliedForces(NOW + 3, 2.0, 0.2)
 
 
 def test_reset_and_activation_discard_commands() -> None:
@@ -190,6 +216,7 @@ def test_reset_and_activation_discard_commands() -> None:
     assert commands.acting == commands.newest == AppliedForces()
 
 
+@pytest.mark.requirement('S-095')
 def test_force_without_the_stamp_of_a_sample_is_rejected() -> None:
     """Until the number of publishers changes, so that another node may take over."""
     commands = made()

@@ -163,6 +163,7 @@ def test_velocity_is_held_and_ends_after_the_last_message() -> None:
     assert depths[-1] == pytest.approx(depths[-100], abs=1e-7)
 
 
+@pytest.mark.requirement('S-092')
 def test_force_is_held_and_ends_after_the_last_message() -> None:
     """At a tenth of the rate the velocity is (f - mu_s) / mu_v, and finally zero."""
     plant = run()
@@ -177,6 +178,7 @@ def test_force_is_held_and_ends_after_the_last_message() -> None:
     assert plant.commands.acting.force == 0.0
 
 
+@pytest.mark.requirement('S-092')
 @pytest.mark.parametrize('value', [nan, inf, -16.0])
 def test_invalid_forces_are_rejected(value: float) -> None:
     """The force is counted and reported, and the previous force ends."""

@@ -180,6 +180,7 @@ def test_no_force_before_a_target(ros_graph: RosGraph) -> None:
     assert Bench(ros_graph).measure(0.02) == 0.0
 
 
+@pytest.mark.requirement('S-068', 'S-076')
 def test_zero_force_after_the_measurement_timeout(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
@@ -188,6 +189,7 @@ def test_zero_force_after_the_measurement_timeout(ros_graph: RosGraph) -> None:
     assert 'stale' in bench.status.fault
 
 
+@pytest.mark.requirement('S-054', 'S-071')
 @pytest.mark.parametrize(
     'message',
     [
@@ -208,6 +210,7 @@ def test_zero_force_for_invalid_measurements(ros_graph: RosGraph, message: Joint
     assert 'joint_states' in bench.status.fault
 
 
+@pytest.mark.requirement('S-088')
 def test_stop_latches(ros_graph: RosGraph) -> None:
     """The force is zero until the stop is cleared and a user sends a new target."""
     bench = Bench(ros_graph)
@@ -262,6 +265,7 @@ def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:
     assert 'clean up the node first' in result.reason
 
 
+@pytest.mark.requirement('S-046', 'S-065')
 @pytest.mark.parametrize('offset', [-10.0, 3600.0, None], ids=['old', 'ahead', 'not stamped'])
 def test_zero_force_for_stale_future_and_missing_stamps(
     ros_graph: RosGraph, offset: float | None
@@ -280,6 +284,7 @@ def test_zero_force_for_stale_future_and_missing_stamps(
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-069')
 def test_target_is_discarded_if_the_needle_moved_during_a_fault(
     ros_graph: RosGraph,
 ) -> None:
@@ -405,6 +410,7 @@ def path(*points: tuple[float, float, None], joint: str = 'insertion') -> JointT
     return message
 
 
+@pytest.mark.requirement('S-008')
 def test_pause_resume_and_retract(ros_graph: RosGraph) -> None:
     """The reference brakes, holds, continues to its target, and retracts."""
     loop = Loop(ros_graph, retract_depth=0.019)
@@ -504,6 +510,7 @@ def test_invalid_gains_are_rejected_while_active(
     assert reason in node.diagnose().status.last_rejection
 
 
+@pytest.mark.requirement('S-072')
 def test_zero_force_after_a_position_jump(ros_graph: RosGraph) -> None:
     """A jump of 5 mm within a period is not a needle motion."""
     bench = Bench(ros_graph)
@@ -537,6 +544,7 @@ def test_observer_estimates_the_tip(ros_graph: RosGraph) -> None:
     assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
 
 
+@pytest.mark.requirement('S-044')
 def test_integral_is_frozen_during_a_stop(ros_graph: RosGraph) -> None:
     """The integral of PID, which compensates friction, is kept."""
     bench = Bench(ros_graph, law='pid')
@@ -567,6 +575,7 @@ BEYOND = {
 }
 
 
+@pytest.mark.requirement('S-021', 'S-041')
 @pytest.mark.parametrize('limit', BEYOND)
 def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None:
     """Zero force and reason on /diagnostics; the stop cannot be cleared while it persists."""
@@ -611,6 +620,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-070')
 def test_frozen_encoders_cause_a_stop(ros_graph: RosGraph) -> None:
     """Frozen encoders with a moving reference are a fault."""
     bench = Bench(ros_graph)
@@ -622,6 +632,7 @@ def test_frozen_encoders_cause_a_stop(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-037')
 def test_single_spike_is_rejected_without_a_stop(ros_graph: RosGraph) -> None:
     """The motion continues."""
     bench = Bench(ros_graph)
@@ -637,6 +648,7 @@ def test_single_spike_is_rejected_without_a_stop(ros_graph: RosGraph) -> None:
     assert bench.status.stops == 0
 
 
+@pytest.mark.requirement('S-059', 'S-063')
 @pytest.mark.parametrize(
     ('send', 'topic', 'kind'),
     [
@@ -663,6 +675,7 @@ def test_invalid_readings_are_counted_and_discarded(
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-073')
 def test_motion_continues_without_optional_sensors(ros_graph: RosGraph) -> None:
     """Diagnostics warn while sensors are missing; the force is unchanged."""
     bench = Bench(ros_graph, **LIGHT, **{'safety.sensor_timeout': 0.3})
@@ -687,6 +700,7 @@ def test_motion_continues_without_optional_sensors(ros_graph: RosGraph) -> None:
     assert bench.measure(depth) > 0.5
 
 
+@pytest.mark.requirement('S-073')
 def test_missing_required_sensors_cause_a_stop(ros_graph: RosGraph) -> None:
     bench = Bench(
         ros_graph,
@@ -703,6 +717,7 @@ def test_missing_required_sensors_cause_a_stop(ros_graph: RosGraph) -> None:
     assert 'is stale' in bench.call('clear_stop').message
 
 
+@pytest.mark.requirement('S-079')
 def test_duplicate_commanders_command_zero_force(ros_graph: RosGraph) -> None:
     """The force is zero while another node publishes commands, and returns afterwards."""
     bench = Bench(ros_graph, **{'safety.tracking_error': 1.0})
@@ -716,6 +731,7 @@ def test_duplicate_commanders_command_zero_force(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-089')
 def test_commands_have_the_stamp_of_the_measurement(ros_graph: RosGraph) -> None:
     """A repeated measurement gets the same command; other commands have the current time."""
     bench = Bench(ros_graph, measurement_timeout=1.0)
@@ -769,6 +785,7 @@ class SimulatedTime(Bench):
         return super().measure(depth, speed)
 
 
+@pytest.mark.requirement('S-060')
 def test_first_sample_with_stamp_zero_is_answered(ros_graph: RosGraph) -> None:
     bench = SimulatedTime(ros_graph)
     message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
@@ -778,6 +795,7 @@ def test_first_sample_with_stamp_zero_is_answered(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-085')
 def test_clock_set_back_restarts_the_motion(ros_graph: RosGraph) -> None:
     """Zero force first; the next sample is answered despite its earlier stamp."""
     bench = SimulatedTime(ros_graph)
@@ -791,6 +809,7 @@ def test_clock_set_back_restarts_the_motion(ros_graph: RosGraph) -> None:
     assert bench.status.phase is ControllerPhase.ACTIVE
 
 
+@pytest.mark.requirement('S-084')
 def test_clock_jump_ahead_restarts_the_motion(ros_graph: RosGraph) -> None:
     """The motion restarts at the position of the needle, without a fault."""
     bench = SimulatedTime(ros_graph)
@@ -813,6 +832,7 @@ def test_clock_jump_ahead_restarts_the_motion(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-083', 'S-101')
 def test_stopped_clock_is_not_a_fault(ros_graph: RosGraph) -> None:
     """No timeout in paused time; a repeated sample gets the same force."""
     bench = SimulatedTime(ros_graph)
@@ -834,6 +854,7 @@ def test_stopped_clock_is_not_a_fault(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-053')
 @pytest.mark.parametrize(
     ('frame', 'stamp', 'reason'),
     [
@@ -882,6 +903,7 @@ def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-071')
 @pytest.mark.parametrize(
     'message',
     [
@@ -927,6 +949,7 @@ def test_malformed_ground_truth_raises_no_error(ros_graph: RosGraph, message: Jo
     assert bench.push() > 0.5
 
 
+@pytest.mark.requirement('S-022', 'S-063')
 def test_diagnostics_report_rates_and_saturation(ros_graph: RosGraph) -> None:
     """Rate of each input in the last second, and time at the force limit."""
     bench = SimulatedTime(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})

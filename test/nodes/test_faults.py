@@ -143,6 +143,7 @@ class Loop:
         return answer.result()
 
 
+@pytest.mark.requirement('S-064', 'S-067')
 @pytest.mark.parametrize(
     ('kind', 'values'),
     [
@@ -164,6 +165,7 @@ def test_lost_and_reordered_measurements_are_tolerated(
     assert loop.status.stops == 0
 
 
+@pytest.mark.requirement('S-073')
 @pytest.mark.parametrize('topic', ['base_wrench', 'tip_deflection'])
 @pytest.mark.parametrize(
     ('kind', 'values'),
@@ -182,6 +184,7 @@ def test_motion_continues_without_bending_sensors(
     loop.arrives()
 
 
+@pytest.mark.requirement('S-003')
 @pytest.mark.parametrize(
     ('kind', 'values'), [('drop', {}), ('nan', {}), ('delay', {'delay': 0.5})]
 )
@@ -199,6 +202,7 @@ def test_encoder_loss_gives_zero_force_until_recovery(
     loop.arrives(0.04)
 
 
+@pytest.mark.requirement('S-069')
 @pytest.mark.parametrize(
     ('kind', 'values', 'why'),
     [
@@ -219,6 +223,7 @@ def test_inconsistent_encoders_end_the_motion(
     loop.until(lambda: loop.speed == 0.0, 'rest')
 
 
+@pytest.mark.requirement('S-021', 'S-043', 'S-074')
 @pytest.mark.parametrize(
     ('topic', 'size', 'why'),
     [('base_wrench', 50.0, 'load'), ('tip_deflection', 0.06, 'tip_deflection')],
@@ -244,6 +249,7 @@ def test_overload_latches_a_stop(ros_graph: RosGraph, topic: str, size: float, w
     loop.arrives(0.04)
 
 
+@pytest.mark.requirement('S-077', 'S-098')
 def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> None:
     """The plant applies command_timeout; a new controller takes over within seconds."""
     probe = ros_graph.node('probe')
@@ -277,6 +283,7 @@ def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> Non
     ros_graph.spin_until(is_well, 'no stop')
 
 
+@pytest.mark.requirement('S-098')
 def test_controller_resumes_after_a_plant_restart(ros_graph: RosGraph) -> None:
     """It commands zero, reports the reason, and continues with the new plant."""
     probe = ros_graph.node('probe')
@@ -333,6 +340,7 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     assert count > size / 2 / 200
 
 
+@pytest.mark.requirement('S-101')
 def test_clock_jumps_do_not_move_the_needle(ros_graph: RosGraph) -> None:
     """The loop continues after jumps of an external clock, with zero force in between."""
     clocks = ros_graph.node('clock')

@@ -235,6 +235,7 @@ def test_message_types_are_equivalent(ros_graph: RosGraph, kind: str, command: s
     assert list(velocities) == []
 
 
+@pytest.mark.requirement('S-102')
 @pytest.mark.parametrize('which', ROBOTS)
 def test_foreign_robot_is_controlled_by_parameters_only(ros_graph: RosGraph, which: str) -> None:
     """To 0.05 m and back to 0.03 m, by effort and by position."""
@@ -298,6 +299,7 @@ def test_wrong_sign_is_rejected_at_the_start(ros_graph: RosGraph) -> None:
     assert str(controller.failure).startswith('hardware.sign must be -1 with the depths 0 and ')
 
 
+@pytest.mark.requirement('S-208')
 def test_check_is_skipped_by_a_parameter(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, hardware__commissioning__enabled=False)
     assert bench.status.commissioning is CommissioningPhase.SKIPPED
@@ -305,6 +307,7 @@ def test_check_is_skipped_by_a_parameter(ros_graph: RosGraph) -> None:
     bench.arrive(0.03)
 
 
+@pytest.mark.requirement('S-107')
 def test_force_sensor_limit_stops_the_robot(ros_graph: RosGraph) -> None:
     """The mapped axial force above its limit ends the motion."""
     bench = Bench(ros_graph, safety__axial_load=0.3)
@@ -316,6 +319,7 @@ def test_force_sensor_limit_stops_the_robot(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.values()[-1] == 0.0 == bench.robot.mass.velocity, 'rest')
 
 
+@pytest.mark.requirement('S-107')
 def test_position_robot_holds_its_measured_position_after_a_stop(ros_graph: RosGraph) -> None:
     """A load above its limit ends the motion at the position of the robot."""
     bench = Bench(ros_graph, 'position', hardware__wrench_topic='load')
@@ -342,6 +346,7 @@ def test_position_robot_holds_its_measured_position_after_a_stop(ros_graph: RosG
     assert 0.025 < bench.depth < 0.05
 
 
+@pytest.mark.requirement('S-113')
 def test_wrong_frame_is_reported(ros_graph: RosGraph) -> None:
     """With the expected frame."""
     bench = Bench(ros_graph, hardware__wrench_frame='tool0')
@@ -414,6 +419,7 @@ def stranger(ros_graph: RosGraph) -> Iterator[Node]:
     context.try_shutdown()
 
 
+@pytest.mark.requirement('S-112')
 @pytest.mark.parametrize('there', ['elsewhere', 'another type', 'other joints'])
 def test_missing_input_is_explained(ros_graph: RosGraph, stranger: Node, there: str) -> None:
     """With the existing topics, their types, and their joints."""
@@ -458,6 +464,7 @@ def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
     )
 
 
+@pytest.mark.requirement('S-106')
 @pytest.mark.parametrize(
     ('kind', 'topic', 'said'),
     [
@@ -479,6 +486,7 @@ def test_duplicate_source_or_commander_gives_zero_force(
     bench.until(lambda: bench.robot.mass.velocity < -1e-3, 'motion again')
 
 
+@pytest.mark.requirement('S-103')
 def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph) -> None:
     """A driver without a timeout would keep the last effort if one message is lost."""
     bench = Bench(ros_graph)
@@ -492,6 +500,7 @@ def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph
     assert {*bench.values()[-10:]} == {0.0}
 
 
+@pytest.mark.requirement('S-104')
 @pytest.mark.parametrize('which', ROBOTS)
 def test_final_command_is_repeated(ros_graph: RosGraph, which: str) -> None:
     """At deactivation: zero effort, or the current position."""
@@ -510,6 +519,7 @@ def test_final_command_is_repeated(ros_graph: RosGraph, which: str) -> None:
         bench.until(lambda: abs(bench.robot.position - rest) < 1e-3, 'rest')
 
 
+@pytest.mark.requirement('S-105')
 @pytest.mark.parametrize('ending', ['interrupted', 'fails'])
 def test_ended_process_leaves_zero_effort(
     ros_graph: RosGraph, tmp_path: Path, ending: str
@@ -575,6 +585,7 @@ def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
     bench.until(lambda: re.match(words, bench.status.warning), 'the rate')
 
 
+@pytest.mark.requirement('S-111')
 @pytest.mark.parametrize(
     ('stamps', 'said'),
     [
@@ -596,6 +607,7 @@ def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, 
     ros_graph.spin_until(says, said)
 
 
+@pytest.mark.requirement('S-108')
 def test_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph)
     bench.aim(0.15)

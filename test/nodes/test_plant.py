@@ -141,6 +141,7 @@ def test_four_topics_are_published_per_sample(ros_graph: RosGraph) -> None:
     assert topics['base_wrench'][-1].header.frame_id == 'needle_base'
 
 
+@pytest.mark.requirement('S-064', 'S-065')
 def test_moves_under_a_command_until_the_command_timeout(ros_graph: RosGraph) -> None:
     """A constant force moves the needle at (f - mu_s) / mu_v, until the command is too old."""
     probe = ros_graph.node('probe')
@@ -160,6 +161,7 @@ def test_moves_under_a_command_until_the_command_timeout(ros_graph: RosGraph) ->
     ros_graph.spin_until(lambda: states[-1].velocity[0] == 0.0, 'the stop after the timeout')
 
 
+@pytest.mark.requirement('S-032')
 @pytest.mark.parametrize('force', [float('nan'), float('inf'), -1e300])
 def test_invalid_force_commands_are_rejected(ros_graph: RosGraph, force: float) -> None:
     """NaN, infinite and implausible forces are counted and do not move the needle."""

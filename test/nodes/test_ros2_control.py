@@ -210,6 +210,7 @@ def test_effort_controller_reaches_its_goal(
     assert driver.state['insertion', 'effort'] == 0.0
 
 
+@pytest.mark.requirement('S-093')
 def test_duplicate_commanders_move_nothing(ros_graph: RosGraph, tmp_path: Path) -> None:
     """On either topic; the first continues when it is the only commander again."""
     driver = Driver(ros_graph, tmp_path, PUSHED, mode='simulation', depth=0.02)

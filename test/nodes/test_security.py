@@ -134,6 +134,7 @@ def seen_in_graph(folder: Path, name: str, tries: int = 3) -> Profile:
     return seen_in_graph(folder, name, tries - 1)
 
 
+@pytest.mark.requirement('S-116', 'S-178', 'S-179', 'S-180', 'S-181', 'S-182')
 @pytest.mark.parametrize('name', NODES)
 def test_policy_equals_the_entities_of_each_node(
     ros_graph: RosGraph, tmp_path: Path, name: str
@@ -151,6 +152,7 @@ def test_policy_equals_the_entities_of_each_node(
             assert there == allowed, rule
 
 
+@pytest.mark.requirement('S-178', 'S-180')
 def test_recorder_and_player_may_use_all_topics() -> None:
     """Each request has a node that answers."""
     said = frozenset().union(*(profile.publish for profile in POLICY.values())) - NOT_RECORDED
@@ -165,6 +167,7 @@ def test_recorder_and_player_may_use_all_topics() -> None:
     assert commanding == {'controller', 'player'}
 
 
+@pytest.mark.requirement('S-183', 'S-184')
 def test_enforced_security_rejects_nodes_without_credentials(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
@@ -189,6 +192,7 @@ def test_enforced_security_rejects_nodes_without_credentials(
     assert probe.count_publishers('joint_states') == 0
 
 
+@pytest.mark.requirement('S-157', 'S-160')
 def test_started_nodes_stay_on_this_machine(ros_graph: RosGraph) -> None:
     """Range and transports of all processes, unless the environment opens nodes and launch."""
     assert LOCAL.items() <= ros_graph.environment.items()
@@ -209,6 +213,22 @@ def test_started_nodes_stay_on_this_machine(ros_graph: RosGraph) -> None:
         assert environment == before
 
 
+@pytest.mark.requirement('S-154', 'S-156')
+def test_profile_has_one_transport_on_this_machine() -> None:
+    """UDP on 127.0.0.1, without the default transports, of which one is shared memory."""
+    names = {'f': 'http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles'}
+    tree = etree.parse(LOCAL[PROFILES[0]])
+
+    def texts(path: str) -> list[str]:
+        return [one.text for one in tree.iterfind(f'.//f:{path}', names)]
+
+    assert texts('type') == ['UDPv4']
+    assert texts('interfaceWhiteList/f:address') == ['127.0.0.1']
+    assert texts('userTransports/f:transport_id') == texts('transport_descriptor/f:transport_id')
+    assert texts('useBuiltinTransports') == ['false']
+
+
+@pytest.mark.requirement('S-159')
 @pytest.mark.parametrize('range_', ['LOCALHOST', 'SUBNET'])
 def test_local_nodes_discover_each_other(ros_graph: RosGraph, range_: str) -> None:
     """A local node without the profile receives the plant topics, and is discovered."""
@@ -299,6 +319,7 @@ def cable() -> Iterator[tuple[str, str]]:
             subprocess.run([ip, 'netns', 'delete', end], capture_output=True, check=False)
 
 
+@pytest.mark.requirement('S-155', 'S-158')
 @pytest.mark.parametrize(('opened', 'found'), [({}, '0'), ({RANGE: 'SUBNET'}, '1')])
 def test_another_machine_cannot_reach_the_plant(
     ros_graph: RosGraph, cable: tuple[str, str], opened: dict[str, str], found: str

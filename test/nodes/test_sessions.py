@@ -192,6 +192,7 @@ def ends(watcher: Watcher, running: Session) -> int:
 # One session per domain.
 
 
+@pytest.mark.requirement('S-194')
 def test_second_session_does_not_disturb_the_first(ros_graph: RosGraph, tmp_path: Path) -> None:
     """It ends before it starts a node, with a line; the insertion of the first continues."""
     watcher = Watcher(ros_graph)
@@ -214,6 +215,7 @@ def test_second_session_does_not_disturb_the_first(ros_graph: RosGraph, tmp_path
         assert first.positions[-1].depth == pytest.approx(0.06, abs=3e-4)
 
 
+@pytest.mark.requirement('S-196')
 def test_session_rejects_nodes_that_it_has_not_started(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
@@ -254,6 +256,7 @@ input()
 """
 
 
+@pytest.mark.requirement('S-192', 'S-193')
 def test_claim_is_atomic_and_ends_with_the_last_process(ros_graph: RosGraph) -> None:
     """Of processes that claim a domain at the same time one has it, until its nodes end."""
     domain = ros_graph.domain
@@ -292,6 +295,7 @@ def test_claim_is_atomic_and_ends_with_the_last_process(ros_graph: RosGraph) -> 
     claim(domain).close()
 
 
+@pytest.mark.requirement('S-195')
 def test_private_graph_avoids_the_domain_of_a_session(tmp_path: Path) -> None:
     """A demo or a test during a session is on another domain."""
     with RosGraph(tmp_path / 'first') as graph:
@@ -353,6 +357,7 @@ CAUSES: Mapping[str, tuple[Callable[[Session], object], int, str]] = {
 }
 
 
+@pytest.mark.requirement('S-197', 'S-198', 'S-199', 'S-200', 'S-201', 'S-206', 'S-207')
 @pytest.mark.parametrize('cause', CAUSES)
 def test_needle_stops_before_the_nodes_end(
     ros_graph: RosGraph, tmp_path: Path, cause: str
@@ -386,6 +391,7 @@ def stopped(running: Session) -> int:
     return int(found[1] + found[2])
 
 
+@pytest.mark.requirement('S-202', 'S-203')
 def test_killed_session_stops_a_robot_that_continues(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Its nodes end with it; the domain is free for the next session, which is not disturbed."""
     watcher = Watcher(ros_graph)
@@ -418,6 +424,7 @@ def alive(pid: int) -> bool:
         return False
 
 
+@pytest.mark.requirement('S-205')
 def test_killed_steering_stops_the_needle_within_its_step(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
@@ -438,6 +445,7 @@ def test_killed_steering_stops_the_needle_within_its_step(
         assert_needle_brakes(watcher, begin)
 
 
+@pytest.mark.requirement('S-204')
 def test_node_ends_if_its_parent_ended_before(ros_graph: RosGraph) -> None:
     """Also if the session is killed before the node requests a signal at its end."""
     line = [sys.executable, '-m', 'needle_dynamics.plant_node']

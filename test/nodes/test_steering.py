@@ -265,6 +265,7 @@ def test_steered_controller_ignores_targets(ros_graph: RosGraph) -> None:
     assert steered.diagnose().status.rejected == 0
 
 
+@pytest.mark.requirement('S-122')
 def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
     """The needle rests within a step, and the node reports the reason."""
     bench = Bench(ros_graph)
@@ -286,6 +287,7 @@ def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
     assert len(bench.moves) == count
 
 
+@pytest.mark.requirement('S-137')
 @pytest.mark.parametrize('how', ['service', 'deactivated'])
 def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
     """Needle and guide stop."""
@@ -415,6 +417,7 @@ def test_shipped_parameters_start_the_three_nodes(ros_graph: RosGraph) -> None:
     assert 'target' not in steering.diagnose().status.last_rejection
 
 
+@pytest.mark.requirement('S-117', 'S-118', 'S-138')
 def test_needle_and_guide_rest_after_a_kill_of_the_node(ros_graph: RosGraph) -> None:
     """A robot completes its last motion; no other follows."""
     ros_graph.add(PlantNode, parameters={**PLANT, 'mode': 'robot', 'steering.bevel_load': [0.1]})

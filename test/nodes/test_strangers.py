@@ -11,6 +11,7 @@ from support.ros_graph import RosGraph
 TRIES = 5
 
 
+@pytest.mark.requirement('S-094', 'S-096')
 @pytest.mark.parametrize('when', ['found', 'blind'])
 @pytest.mark.parametrize('force', [900.0, 14.0])
 def test_second_commander_does_not_move_the_needle(
@@ -32,6 +33,7 @@ def test_second_commander_does_not_move_the_needle(
     assert bystander.stops == {0}
 
 
+@pytest.mark.requirement('S-080', 'S-097')
 @pytest.mark.parametrize('ahead', [0.0, 0.09])
 def test_second_robot_does_not_move_the_needle(ros_graph: RosGraph, ahead: float) -> None:
     """Its measurements are discarded; its stamps do not make measurements of the first late."""
@@ -50,6 +52,7 @@ def test_second_robot_does_not_move_the_needle(ros_graph: RosGraph, ahead: float
     assert bystander.stops == {0}
 
 
+@pytest.mark.requirement('S-096')
 def test_command_flood_does_not_move_the_needle(ros_graph: RosGraph) -> None:
     """At the maximum rate of a process; a valid command is accepted afterwards."""
     bystander = Bystander(ros_graph)

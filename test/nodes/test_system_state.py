@@ -75,6 +75,7 @@ class System(Bench):
         return self.at('insertion')
 
 
+@pytest.mark.requirement('S-004', 'S-005', 'S-017', 'S-088')
 @pytest.mark.parametrize('asked', NODES)
 def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> None:
     """Pause, resume, retract, stop and clear during an insertion, by any of the nodes."""
@@ -109,6 +110,7 @@ def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> 
     system.until(lambda: abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4, 'the guide')
 
 
+@pytest.mark.requirement('S-006', 'S-088')
 def test_emergency_topic_stops_and_a_late_node_knows(ros_graph: RosGraph) -> None:
     """The force is zero; a node that starts during stop or pause follows it, too."""
     system = System(ros_graph)

@@ -53,6 +53,7 @@ def perform(node: Authority, word: str) -> None:
         node.request(word)
 
 
+@pytest.mark.requirement('S-011', 'S-018')
 @given(steps=steps, order=st.permutations([0, 1, 2]))
 def test_nodes_agree_for_any_order_of_messages(
     steps: list[tuple[int, str, list[int]]], order: list[int]
@@ -70,6 +71,7 @@ def test_nodes_agree_for_any_order_of_messages(
     assert nodes[0].state == before
 
 
+@pytest.mark.requirement('S-011', 'S-012')
 @given(before=steps, after=steps, concurrent=st.sampled_from([PAUSE, RESUME, RETRACT, CLEAR_STOP]))
 def test_a_stop_holds_until_it_is_cleared(
     before: list[tuple[int, str, list[int]]],
@@ -97,6 +99,7 @@ def test_a_stop_holds_until_it_is_cleared(
     assert {node.mode for node in nodes} == {Mode.RUNNING}
 
 
+@pytest.mark.requirement('S-004')
 @given(steps=steps)
 def test_state_survives_its_values(steps: list[tuple[int, str, list[int]]]) -> None:
     """Converting a state to text values and back changes nothing."""
@@ -108,6 +111,7 @@ def test_state_survives_its_values(steps: list[tuple[int, str, list[int]]]) -> N
     assert SystemState.from_values(state.to_values()) == state
 
 
+@pytest.mark.requirement('S-004')
 @given(st.dictionaries(st.text(), st.text()))
 def test_any_values_are_read(values: dict[str, str]) -> None:
     """Values of another node are ignored if they are no state."""
@@ -118,6 +122,7 @@ def test_any_values_are_read(values: dict[str, str]) -> None:
     assert '/x' not in found.cleared
 
 
+@pytest.mark.requirement('S-011', 'S-058')
 @pytest.mark.parametrize('word', [PAUSE, RESUME, RETRACT])
 def test_requests_are_refused_during_a_stop(word: str) -> None:
     """The line names the reason and the release."""
@@ -131,6 +136,7 @@ def test_requests_are_refused_during_a_stop(word: str) -> None:
     assert node.reason == 'axial force 40 N'
 
 
+@pytest.mark.requirement('S-008')
 def test_pause_of_a_retraction_resumes_the_retraction() -> None:
     """A request of a motion ends the retraction, a pause does not."""
     node = Authority('/steering')

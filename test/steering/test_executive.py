@@ -55,6 +55,7 @@ def test_motion_is_smooth_proportional_and_monotonic(
     assert (np.abs(move.velocities) <= 1.8751 * np.abs(way) / duration + 1e-15).all()
 
 
+@pytest.mark.requirement('S-117')
 def test_insertion_hits_the_target_with_a_consistent_estimate() -> None:
     """The error is within the reported interval; the guide rests during the insertion."""
     robot = Robot()
@@ -92,6 +93,7 @@ def test_miss_in_depth_is_a_warning() -> None:
     assert re.search(r'y = (57\.[89]|58\.0)\d ± .* 2\.\d\d mm from the target', line)
 
 
+@pytest.mark.requirement('S-124')
 def test_late_and_lost_readings_are_tolerated() -> None:
     """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
     robot = Robot(replace(SETTINGS, look_time=0.5))
@@ -154,6 +156,7 @@ def creeps(robot: Robot) -> None:
     robot.moves = moves
 
 
+@pytest.mark.requirement('S-122', 'S-123', 'S-126', 'S-127', 'S-130', 'S-131', 'S-132', 'S-162')
 @pytest.mark.parametrize(
     ('fault', 'said', 'deepest'),
     [
@@ -234,6 +237,7 @@ def test_guide_waits_for_a_stalled_needle() -> None:
     assert_allclose(stalled, np.tile(stalled[-1], (len(stalled), 1)), atol=1e-6)
 
 
+@pytest.mark.requirement('S-119', 'S-139', 'S-140')
 @pytest.mark.parametrize(
     ('fault', 'said', 'deepest'),
     [
@@ -310,6 +314,7 @@ def test_single_implausible_reading_has_no_effect(continuous: bool) -> None:
     assert robot.miss < 4e-4
 
 
+@pytest.mark.requirement('S-141', 'S-142')
 @pytest.mark.parametrize('continuous', [False, True])
 def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> None:
     """It moves at 20 mm/s against its commands; the robot follows the second stop."""
@@ -348,12 +353,35 @@ def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> No
     assert_allclose(robot.at, before, atol=1e-9)
 
 
+@pytest.mark.requirement('S-187')
+@pytest.mark.parametrize('continuous', [False, True])
+def test_needle_moved_deeper_after_the_insertion_stops_the_system(continuous: bool) -> None:
+    """At five times its tolerance beyond the target; a withdrawn needle is no fault."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    robot.steer()
+    offset = -5e-3
+    robot.moves = lambda wanted: np.add(wanted, (offset, 0.0, 0.0))
+    robot.tick(10)
+    assert robot.loop.fault == ''
+    offset = 0.0
+    for _ in range(100):
+        offset += 1e-4
+        robot.tick()
+        if robot.loop.fault:
+            break
+    assert offset == pytest.approx(5.0 * SETTINGS.depth_tolerance, abs=2e-4)
+    assert robot.loop.phase is Phase.STOPPED
+    assert robot.loop.authority.reason == robot.loop.fault
+    assert 'after the insertion insertion is at 61.' in robot.loop.fault
+
+
 def test_slow_needle_is_no_fault() -> None:
     robot = Robot(replace(CONTINUOUS, speed=5e-3))
     robot.steer()
     assert robot.loop.phase is Phase.DONE
 
 
+@pytest.mark.requirement('S-121')
 def test_target_after_a_retraction_is_accepted() -> None:
     """From any guide position: the guide moves to zero first."""
     robot = Robot()
@@ -375,6 +403,7 @@ def test_settings_incompatible_with_continuous_are_rejected() -> None:
         ExecutiveSettings(continuous=True, rate=5.0)
 
 
+@pytest.mark.requirement('S-133')
 def test_duplicate_publishers_of_measurements_are_rejected() -> None:
     for counts in ((2, 1), (1, 2)):
         robot = Robot()
@@ -389,6 +418,7 @@ def test_duplicate_publishers_of_measurements_are_rejected() -> None:
         assert '2 nodes publish' in robot.loop.fault
 
 
+@pytest.mark.requirement('S-134')
 def test_clock_set_back_stops_the_insertion() -> None:
     robot = Robot()
     robot.tick(5)
@@ -431,6 +461,7 @@ def test_too_many_steps_are_rejected() -> None:
     assert 'it would take 600 steps of 0.1 mm, at most 200 are possible' in robot.aim()
 
 
+@pytest.mark.requirement('S-121')
 def test_needle_must_be_straight_at_the_start() -> None:
     """Outside tissue the guide moves to its zero first; in tissue it must be there."""
     robot = Robot()
@@ -462,6 +493,7 @@ def test_target_may_move_laterally_but_not_in_depth() -> None:
     assert robot.miss < 4e-4
 
 
+@pytest.mark.requirement('S-006', 'S-120')
 def test_stop_brings_needle_and_guide_to_rest() -> None:
     """Within 3 mm; afterwards the needle must be retracted before another insertion."""
     robot = Robot()
@@ -479,6 +511,7 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
     assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
 
 
+@pytest.mark.requirement('S-125')
 def test_noisy_readings_give_a_warning() -> None:
     """Five times the configured noise."""
     robot = Robot(prior=SteeringPrior(noise=8e-6))
@@ -490,6 +523,7 @@ def test_noisy_readings_give_a_warning() -> None:
     assert 'noise of the tip measurement is 0.0' in status.warning
 
 
+@pytest.mark.requirement('S-125')
 def test_averaged_measurement_rejects_outliers() -> None:
     """Many readings with two outliers; and no readings."""
     look = TipMeasurements()
@@ -510,6 +544,7 @@ def test_averaged_measurement_rejects_outliers() -> None:
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)
 
 
+@pytest.mark.requirement('S-136', 'S-142')
 @settings(max_examples=60, deadline=None)
 @given(
     said=st.lists(

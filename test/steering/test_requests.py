@@ -104,6 +104,7 @@ ONE_FAULT = st.tuples(
 )
 
 
+@pytest.mark.requirement('S-129')
 @settings(max_examples=60, deadline=None)
 @given(fault=ONE_FAULT, continuous=st.booleans())
 def test_single_lost_delayed_or_duplicated_message_is_tolerated(
@@ -141,6 +142,7 @@ def test_many_message_faults_end_at_the_target_or_in_a_stop(
     check_end(robot)
 
 
+@pytest.mark.requirement('S-126')
 @pytest.mark.parametrize('continuous', [False, True])
 @pytest.mark.parametrize(
     ('silent', 'line'),
@@ -172,6 +174,7 @@ def test_unresponsive_node_is_named_within_five_seconds(
         assert robot.seconds - begun < 5.0 + (silent == 'plant')
 
 
+@pytest.mark.requirement('S-128')
 @pytest.mark.parametrize('continuous', [False, True])
 def test_rejected_motion_stops_the_insertion_with_its_reason(continuous: bool) -> None:
     robot = Relayed({}, own=QUICK_CONTINUOUS if continuous else QUICK)
@@ -183,6 +186,7 @@ def test_rejected_motion_stops_the_insertion_with_its_reason(continuous: bool) -
     assert robot.at[0] == 0.0
 
 
+@pytest.mark.requirement('S-008')
 @pytest.mark.parametrize('continuous', [False, True])
 @pytest.mark.parametrize('depth', [0.004, 0.012, 0.021])
 def test_pause_by_the_user_may_last(continuous: bool, depth: float) -> None:
@@ -369,6 +373,7 @@ def accept(own: RequestLog, stamp: int, *joints: str) -> Acknowledgement | None:
     return answer
 
 
+@pytest.mark.requirement('S-051')
 def test_duplicate_request_is_answered_again_and_not_executed() -> None:
     own = log()
     assert accept(own, NOW - 5, 'insertion') is None
@@ -380,6 +385,7 @@ def test_duplicate_request_is_answered_again_and_not_executed() -> None:
     assert accept(own, 0, 'insertion') is None
 
 
+@pytest.mark.requirement('S-052')
 def test_an_older_request_for_the_same_joints_is_superseded() -> None:
     own = log()
     assert accept(own, NOW - 3, 'insertion') is None
@@ -397,6 +403,7 @@ def test_an_older_request_for_the_same_joints_is_superseded() -> None:
     assert own.check(JOINT_TRAJECTORY, back, back, '', ['guide_x']) is None
 
 
+@pytest.mark.requirement('S-047')
 @pytest.mark.parametrize(
     ('age', 'frame', 'reason'),
     [

@@ -199,6 +199,7 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
         controller.update((0.0, 0.0), 1)
 
 
+@pytest.mark.requirement('S-151')
 def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
     with pytest.raises(
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
@@ -208,6 +209,7 @@ def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
         MultiHypothesisLaw(MODEL, (8e-3, 0.0), replace(LIMITS, guide_limit=1e-4))
 
 
+@pytest.mark.requirement('S-150')
 def test_warning_when_the_target_leaves_the_reachable_set() -> None:
     """A stuck guide leaves the needle to its drift; the warning is before the end."""
     controller = MultiHypothesisLaw(MODEL, (0.0, 4e-3), LIMITS)
@@ -251,6 +253,7 @@ def faulty(change: dict[int, Any]) -> tuple[MultiHypothesisLaw, SteeredNeedle]:
     return controller, one
 
 
+@pytest.mark.requirement('S-145', 'S-147')
 @pytest.mark.parametrize(
     'change',
     [
@@ -267,6 +270,7 @@ def test_transient_faults_are_tolerated(change: dict[int, Any]) -> None:
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
 
 
+@pytest.mark.requirement('S-143', 'S-144', 'S-146', 'S-148')
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
@@ -286,6 +290,7 @@ def test_persistent_faults_raise_an_error(change: dict[int, Any], complaint: str
         faulty(change)
 
 
+@pytest.mark.requirement('S-149')
 @pytest.mark.parametrize('seed', range(6))
 def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
     """About the needle axis: the tip deviates laterally from the command."""

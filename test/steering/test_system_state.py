@@ -34,6 +34,7 @@ def positions(robot: Robot, ticks: int) -> np.ndarray[tuple[int, int], np.dtype[
     return np.array(robot.tracked[-ticks:])
 
 
+@pytest.mark.requirement('S-009')
 @STRATEGIES
 @pytest.mark.parametrize('depth', [0.004, 0.021, 0.043])
 def test_retraction_withdraws_needle_and_straightens_the_guide(
@@ -56,6 +57,7 @@ def test_retraction_withdraws_needle_and_straightens_the_guide(
     assert not robot.loop.fault.startswith('the')
 
 
+@pytest.mark.requirement('S-013')
 @STRATEGIES
 def test_deviation_during_a_retraction_does_not_stop_it(continuous: bool) -> None:
     """The controller withdraws the needle by itself, other than the motions of the node."""
@@ -70,6 +72,7 @@ def test_deviation_during_a_retraction_does_not_stop_it(continuous: bool) -> Non
     assert np.abs(path[-1, 1:]).max() <= SETTINGS.guide_tolerance
 
 
+@pytest.mark.requirement('S-009')
 @STRATEGIES
 @pytest.mark.parametrize('lost', [1, 2])
 def test_lost_withdrawal_is_repeated(continuous: bool, lost: int) -> None:
@@ -91,6 +94,7 @@ def test_lost_withdrawal_is_repeated(continuous: bool, lost: int) -> None:
     assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=SETTINGS.depth_tolerance)
 
 
+@pytest.mark.requirement('S-006', 'S-007', 'S-016')
 @STRATEGIES
 @pytest.mark.parametrize('depth', [0.004, 0.021, 0.043])
 def test_stop_of_another_node_ends_needle_and_guide(continuous: bool, depth: float) -> None:
@@ -116,6 +120,7 @@ def test_stop_of_another_node_ends_needle_and_guide(continuous: bool, depth: flo
     assert robot.loop.phase is Phase.STOPPED
 
 
+@pytest.mark.requirement('S-010', 'S-120')
 @STRATEGIES
 def test_fault_of_an_insertion_stops_the_system(continuous: bool) -> None:
     """The other nodes read the reason in the state."""
@@ -127,6 +132,7 @@ def test_fault_of_an_insertion_stops_the_system(continuous: bool) -> None:
     assert robot.loop.authority.reason == robot.loop.fault
 
 
+@pytest.mark.requirement('S-015')
 @STRATEGIES
 @pytest.mark.parametrize('silent', [False, True])
 def test_stop_does_not_advance_a_resting_needle(continuous: bool, silent: bool) -> None:
@@ -145,6 +151,7 @@ def test_stop_does_not_advance_a_resting_needle(continuous: bool, silent: bool) 
     assert path[:, 0].max() <= depth + 1e-9
 
 
+@pytest.mark.requirement('S-016')
 def test_lost_joint_states_do_not_advance_the_needle_beyond_its_motion() -> None:
     """The stop is at the last measured position and its braking distance."""
     robot = inserted(True, 0.021)
@@ -157,6 +164,7 @@ def test_lost_joint_states_do_not_advance_the_needle_beyond_its_motion() -> None
     assert path[-1, 0] <= min(stopped, seen + BRAKED) + 1e-9
 
 
+@pytest.mark.requirement('S-008')
 @STRATEGIES
 def test_retraction_is_paused_and_resumed(continuous: bool) -> None:
     robot = inserted(continuous, 0.04)
@@ -175,6 +183,7 @@ def test_retraction_is_paused_and_resumed(continuous: bool) -> None:
     )
 
 
+@pytest.mark.requirement('S-013')
 def test_insertion_after_a_retraction_hits_its_target() -> None:
     """A target is refused while the needle is withdrawn, and accepted afterwards."""
     robot = Robot(replace(SETTINGS, retract_depth=0.0))
@@ -193,6 +202,7 @@ def test_insertion_after_a_retraction_hits_its_target() -> None:
     assert robot.miss < 6e-4
 
 
+@pytest.mark.requirement('S-011')
 def test_stop_of_a_retraction_ends_it() -> None:
     robot = inserted(False, 0.04)
     assert robot.request(RETRACT)
@@ -210,6 +220,7 @@ def test_stop_of_a_retraction_ends_it() -> None:
     assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=SETTINGS.depth_tolerance)
 
 
+@pytest.mark.requirement('S-008')
 def test_pause_during_planning_holds_the_start() -> None:
     """A target is refused during a pause."""
     robot = Robot()

@@ -1,0 +1,200 @@
+"""Faults of the messages of a steered insertion, by message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, TypeAlias
+
+from benchmarks.steering_graph import GraphFault
+from benchmarks.steering_nodes import COMMAND, CONTROLLER, Posted, ROBOT, STEERING
+from needle_controller.steering.motion import JointMotion
+from needle_ros.contract import (
+    BASE_WRENCH,
+    DIAGNOSTICS,
+    GUIDE_X,
+    GUIDE_Z,
+    INSERTION,
+    JOINT_STATES,
+    JOINT_TRAJECTORY,
+    SYSTEM_STATE,
+    TARGET,
+    TIP_DEFLECTION,
+)
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+import numpy as np
+
+#: Lateral bias of the tip sensor [m].
+ASIDE: Final = 'x biased by 2 mm'
+OFFSET: Final = 2e-3
+
+#: Delays of messages [s].
+DELAYS: Final = {'late': 0.1, 'very late': 0.6}
+
+#: Maps the number of a message since the start of the fault, the message, and the first message
+#: of the fault to the received messages, each with its delay [s].
+Alter: TypeAlias = Callable[[int, Any, Any], Iterable[tuple[float, Any]]]
+
+
+def _change(alter: Callable[[Any], Any]) -> Alter:
+    return lambda _k, content, _first: ((0.0, alter(content)),)
+
+
+def _frozen(_k: int, content: Any, first: Any) -> Iterable[tuple[float, Any]]:
+    """Repeat the first message with new stamps."""
+    if isinstance(content, Reading | JointMotion):
+        first = first._replace(stamp=content.stamp)
+    return ((0.0, first),)
+
+
+_LOST: Final[dict[str, Alter]] = {
+    'lost': lambda _k, _content, _first: (),
+    'late': lambda _k, content, _first: ((DELAYS['late'], content),),
+    'very late': lambda _k, content, _first: ((DELAYS['very late'], content),),
+}
+_ANY: Final[dict[str, Alter]] = {
+    **_LOST,
+    'doubled': lambda _k, content, _first: ((0.0, content), (DELAYS['late'], content)),
+    'frozen': _frozen,
+}
+
+
+def _shifted(place: int, size: float) -> Alter:
+    """Add a number to a value of a measurement."""
+
+    def shift(reading: Reading) -> Reading:
+        values = list(reading.values[0])
+        values[place] += size
+        return reading._replace(values=(tuple(values), *reading.values[1:]))
+
+    return _change(shift)
+
+
+def _scaled(factor: float) -> Alter:
+    """Scale all values of a measurement."""
+    return _change(
+        lambda reading: reading._replace(
+            values=tuple(tuple(factor * one for one in column) for column in reading.values)
+        )
+    )
+
+
+def _permuted(order: Sequence[int], signs: Sequence[float]) -> Alter:
+    """Exchange the first values of a measurement."""
+
+    def permute(reading: Reading) -> Reading:
+        first = reading.values[0]
+        turned = [sign * first[k] for k, sign in zip(order, signs, strict=True)]
+        values = *turned, *first[len(turned) :]
+        return reading._replace(values=(values, *reading.values[1:]))
+
+    return _change(permute)
+
+
+def _trajectory(change: Callable[[np.ndarray[Any, Any], str], np.ndarray[Any, Any]]) -> Alter:
+    """Change the positions of each joint in a trajectory."""
+
+    def changed(move: JointMotion) -> JointMotion:
+        columns = [change(move.positions[:, k], joint) for k, joint in enumerate(move.joints)]
+        return move._replace(positions=np.column_stack(columns))
+
+    return _change(changed)
+
+
+def _exchanged(move: JointMotion) -> JointMotion:
+    other = {GUIDE_X: GUIDE_Z, GUIDE_Z: GUIDE_X}
+    return move._replace(joints=tuple(other.get(name, name) for name in move.joints))
+
+
+_FRAME: Final = _change(lambda reading: reading._replace(frame='elsewhere'))
+_NO_STAMP: Final = _change(lambda reading: reading._replace(stamp=0))
+_OLD: Final[Alter] = lambda _k, _content, first: ((0.0, first),)  # noqa: E731
+_AXES: Final = _permuted((2, 1, 0), (1.0, 1.0, -1.0))
+_MILLIMETERS: Final[dict[str, Alter]] = {'in mm': _scaled(1e3), 'in km': _scaled(1e-3)}
+
+#: Faults by message, or by message and receiver.
+MESSAGES: Final[dict[str, dict[str, Alter]]] = {
+    JOINT_STATES.name: {
+        **_ANY,
+        'frozen, old stamps': _OLD,
+        'depth biased by 2 mm': _shifted(0, 2e-3),
+        'guide biased by 1 mm': _shifted(1, 1e-3),
+        **_MILLIMETERS,
+        'opposite direction': _permuted((0,), (-1.0,)),
+        'guide axes exchanged': _permuted((0, 2, 1), (1.0, 1.0, 1.0)),
+        'no stamps': _NO_STAMP,
+    },
+    f'{JOINT_STATES.name} to {CONTROLLER}': _LOST,
+    f'{JOINT_STATES.name} to {STEERING}': _LOST,
+    TIP_DEFLECTION.name: {
+        **_ANY,
+        'frozen, old stamps': _OLD,
+        ASIDE: _shifted(0, OFFSET),
+        'depth biased by 2 mm': _shifted(1, 2e-3),
+        **_MILLIMETERS,
+        'other frame': _FRAME,
+        'axes exchanged': _AXES,
+        'no stamps': _NO_STAMP,
+    },
+    BASE_WRENCH.name: {
+        **_ANY,
+        'biased by 3 N': _shifted(2, 3.0),
+        'in mN': _scaled(1e3),
+        'other frame': _FRAME,
+        'axes exchanged': _AXES,
+    },
+    COMMAND: {
+        **_ANY,
+        'biased by 3 N or mm': lambda k, content, first: _shifted(0 if content.names else 1, 3.0)(
+            k, content, first
+        ),
+        'a thousandfold': _scaled(1e3),
+        'a thousandth': _scaled(1e-3),
+        'opposite direction': _scaled(-1.0),
+        'other frame': _FRAME,
+    },
+    JOINT_TRAJECTORY.name: {
+        **_ANY,
+        'depth biased by 2 mm': _trajectory(lambda p, name: p + 2e-3 * (name == INSERTION)),
+        'guide biased by 1 mm': _trajectory(lambda p, name: p + 1e-3 * (name == GUIDE_X)),
+        'in mm': _trajectory(lambda p, _name: 1e3 * p),
+        'in km': _trajectory(lambda p, _name: 1e-3 * p),
+        'opposite direction': _trajectory(lambda p, _name: -p),
+        'guide axes exchanged': _change(_exchanged),
+    },
+    f'{JOINT_TRAJECTORY.name} to {CONTROLLER}': _LOST,
+    f'{JOINT_TRAJECTORY.name} to {ROBOT}': _LOST,
+    DIAGNOSTICS.name: _ANY,
+    SYSTEM_STATE.name: _ANY,
+    TARGET.name: {
+        **_LOST,
+        'doubled': _ANY['doubled'],
+        'in mm': _change(lambda aim: (*aim[:2], tuple(1e3 * one for one in aim[2]))),
+        'in km': _change(lambda aim: (*aim[:2], tuple(1e-3 * one for one in aim[2]))),
+        'other frame': _change(lambda aim: (aim[0], 'elsewhere', aim[2])),
+        'depth and x exchanged': _change(
+            lambda aim: (*aim[:2], (aim[2][1], aim[2][0], aim[2][2]))
+        ),
+    },
+}
+
+
+class TopicFault(GraphFault):
+    """Fault of a message, or of a message to a receiver (`topic to receiver`)."""
+
+    def __init__(self, place: str, alter: Alter) -> None:
+        self._topic, _, self._receiver = place.partition(' to ')
+        self._alter = alter
+        #: Number of messages since the start of the fault, and first message, by receiver.
+        self._counts: dict[str, int] = {}
+        self._first: dict[str, Any] = {}
+
+    def received(self, receiver: str, posted: Posted) -> Iterator[Posted]:
+        if posted.topic != self._topic or self._receiver not in ('', receiver):
+            yield posted
+            return
+        k = self._counts.get(receiver, 0)
+        self._counts[receiver] = k + 1
+        first = self._first.setdefault(receiver, posted.content)
+        for late, content in self._alter(k, posted.content, first):
+            yield Posted(posted.topic, content, round(late * NANOSECONDS))

@@ -1,0 +1,397 @@
+"""
+Effect of faults on a steered insertion: each message and node, each kind, each phase.
+
+A cell is a steered insertion in simulated time in which one message or one node has a fault from a
+phase of the insertion on, see `steering_graph`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import inf, isfinite
+import os
+from typing import Final, NamedTuple
+
+from benchmarks.measure import Bar
+from benchmarks.message_faults import ASIDE, DELAYS, MESSAGES, OFFSET, TopicFault
+from benchmarks.page import Answer, PageSection, Tick
+from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
+from benchmarks.steering_nodes import (
+    COMMAND,
+    GraphNode,
+    HARDWARE,
+    NODES,
+    RATE,
+    ROBOTS,
+    SPEED,
+)
+from needle_controller.steering.motion_control import BRAKING
+from needle_dynamics.arrays import FloatArray
+from needle_ros.contract import TARGET, TIP_DEFLECTION
+from needle_ros.event_log import Severity
+from needle_ros.process_pool import processes
+from needle_ros.status import SteeringPhase as Phase
+from needle_ros.system_state import STOP
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: Phases in which a fault begins. `braking` is after a stop by a user.
+REST, GUIDING, INSERTING, LOOKING, LAST, BRAKED = PHASES = (
+    'at rest', 'guiding', 'inserting', 'measuring', 'last measurement', 'braking',
+)  # fmt: skip
+
+#: Duration of a fault of messages that does not last until the end, while inserting [s].
+_BRIEF: Final = 0.5
+
+#: Target that is sent during an insertion [m].
+_CHANGED: Final = (AIM[0] + 3e-4, AIM[1], AIM[2])
+
+#: Position of the guide before an insertion, if its return is the phase [m].
+_ASIDE: Final = 1e-3
+
+#: Rest: largest change of a position within a time [m, s].
+_STILL, _AT_REST = 5e-5, 0.3
+
+#: Observation after a fault, and longest time to rest [s].
+_WATCHED, _LONGEST = 0.6, 20.0
+
+#: Largest distance of the tip from the target without a warning [m].
+_HIT: Final = 1e-3
+
+#: Motion after a stop: braking within 0.2 s from the highest speed, and two periods [m].
+BRAKING_DISTANCE: Final = SPEED * (0.5 * BRAKING + 2.0 / RATE)
+
+#: Outcomes of an insertion.
+OUTCOMES: Final = ('hit', 'warning', 'stopped', 'ended')
+MISSED, RESTLESS = 'miss without a warning', 'no rest'
+
+#: Faults of nodes, with their duration [s].
+NODE_FAULTS: Final = {
+    'stopped': inf, 'killed': inf, 'restarted': 0.5, 'paused for 0.3 s': 0.3,
+    'paused for 1.5 s': 1.5,
+}  # fmt: skip
+
+#: Faults by which a driver misreads position commands: it moves against every command, also
+#: against a stop.
+_MISREAD: Final = ('biased by 3 N or mm', 'a thousandfold', 'a thousandth', 'opposite direction')
+
+
+class SteeringCell(NamedTuple):
+    """A fault of a message or node (`place`), its phase and its duration [s]."""
+
+    robot: str
+    continuous: bool
+    place: str
+    fault: str
+    phase: str
+    lasts: float = inf
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringResult:
+    """
+    Outcome of a steered insertion with a fault.
+
+    Attributes
+    ----------
+    outcome : str
+        One of `OUTCOMES`: on the target, done with a warning, stopped, ended otherwise at rest;
+        `MISSED` or `RESTLESS`.
+    miss : float
+        Distance of the tip from its target at the end [m].
+    advance : float
+        Motion into the tissue after the stop [m].
+    deepest : float
+        Largest depth beyond the target depth [m].
+    travel : float
+        Distance that the guide travels from the start of the fault on [m].
+    load : float
+        Largest lateral force of the guide from then on [N].
+    safe : float
+        Time from the start of the fault to rest, if the insertion does not reach its target [s].
+
+    """
+
+    outcome: str
+    miss: float
+    advance: float
+    deepest: float
+    travel: float
+    load: float
+    safe: float
+
+
+def cells() -> list[SteeringCell]:
+    """Return all cells."""
+    found = []
+    for robot, continuous, phase in product(ROBOTS, (False, True), PHASES):
+        for place, faults in MESSAGES.items():
+            found += [SteeringCell(robot, continuous, place, fault, phase) for fault in faults]
+            if phase == INSERTING:
+                found += [
+                    SteeringCell(robot, continuous, place, fault, phase, _BRIEF)
+                    for fault in faults
+                ]
+        found += [
+            SteeringCell(robot, continuous, place, fault, phase, lasts)
+            for place, (fault, lasts) in product(NODES, NODE_FAULTS.items())
+        ]
+    return found
+
+
+def allowed(cell: SteeringCell) -> float:
+    """Return the largest motion into the tissue after a stop [m]; commands may be late."""
+    if cell.place != COMMAND:
+        return BRAKING_DISTANCE
+    if cell.robot == HARDWARE and cell.fault in _MISREAD:
+        return inf
+    return BRAKING_DISTANCE + SPEED * DELAYS.get(cell.fault, 0.0)
+
+
+def registers(cell: SteeringCell) -> bool:
+    """
+    Return whether a bias of the tip sensor is an offset of its frame.
+
+    It begins before the first measurement and lasts: target and tip are then in this frame.
+    """
+    first = cell.phase == REST or (cell.continuous and cell.phase in (GUIDING, LOOKING))
+    return (cell.place, cell.fault, cell.lasts) == (TIP_DEFLECTION.name, ASIDE, inf) and first
+
+
+def _reach(graph: SteeringGraph, phase: str) -> None:
+    """Run until a phase of the insertion begins."""
+    for _ in range(round(_AT_REST * RATE)):
+        graph.step()
+    if phase == REST:
+        return
+    graph.target()
+    before = graph.world
+    while True:
+        graph.step()
+        world, now = graph.world, graph.phase
+        moved = np.hypot(*np.subtract(world.guide, before.guide)) > _STILL
+        before = world
+        middle = graph.continuous or world.depth > 0.3 * AIM[1]
+        if {
+            GUIDING: now is Phase.GUIDING and moved and middle,
+            LOOKING: now is Phase.MEASURING and middle,
+            LAST: now is Phase.MEASURING and world.depth > AIM[1] - _HIT,
+        }.get(phase, now is Phase.INSERTING and world.depth > 0.5 * AIM[1]):
+            return
+        if now in (Phase.STOPPED, Phase.DONE):
+            raise RuntimeError(f'{phase} is not reached: {now}, {graph.steering.loop.fault}')
+
+
+class _Observer:
+    """Motion of needle and guide since the start of a fault."""
+
+    def __init__(self, graph: SteeringGraph) -> None:
+        self._graph, self._begin = graph, graph.now
+        self._before = graph.world
+        self._recent: deque[tuple[float, float, float]] = deque(maxlen=round(_AT_REST * RATE))
+        self.moved, self.stopped_at = graph.now, inf
+        self.advance = self.travel = self.load = 0.0
+        self.deepest = -inf
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the start of the fault [s]."""
+        return (self._graph.now - self._begin) / NANOSECONDS
+
+    @property
+    def safe(self) -> float:
+        """Time from the start of the fault to the last motion [s]."""
+        return (self.moved - self._begin) / NANOSECONDS
+
+    def stop(self) -> None:
+        """Measure the motion from now on: the fault is detected."""
+        if not isfinite(self.stopped_at):
+            self.stopped_at = self._before.depth
+
+    def update(self) -> None:
+        """Process a step of the graph."""
+        world: World = self._graph.world
+        self.travel += float(np.hypot(*np.subtract(world.guide, self._before.guide)))
+        self.load = max(self.load, world.load)
+        self.deepest = max(self.deepest, world.depth - AIM[1])
+        self.advance = max(self.advance, world.depth - self.stopped_at)
+        self._before = world
+        self._recent.append((world.depth, *world.guide))
+        if np.ptp(self._recent, axis=0).max() > _STILL:
+            self.moved = self._graph.now
+
+    @property
+    def rests(self) -> bool:
+        """Whether needle and guide have rested for a while."""
+        return (self._graph.now - self.moved) / NANOSECONDS >= _AT_REST
+
+
+def _begin_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
+    """Begin the fault, and the request of the user in its phase."""
+    if cell.place in MESSAGES:
+        graph.fault = TopicFault(cell.place, MESSAGES[cell.place][cell.fault])
+    else:
+        node = graph.nodes[cell.place]
+        if cell.fault == 'stopped':
+            node.stop(graph.now)
+        elif cell.fault.startswith('paused'):
+            node.paused = True
+        else:
+            node.runs = False
+    if cell.phase == BRAKED:
+        running = [one for one in reversed(graph.nodes.values()) if one.runs and not one.paused]
+        running[0].request(STOP, graph.now)
+    elif cell.phase == REST or cell.place == TARGET.name:
+        graph.target(AIM if cell.phase == REST else _CHANGED)
+
+
+def _end_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
+    graph.fault = GraphFault()
+    node: GraphNode | None = graph.nodes.get(cell.place)
+    if node is not None and node.paused:
+        node.resume(graph.now)
+    elif node is not None:
+        node.start()
+
+
+def measure(cell: SteeringCell) -> SteeringResult:
+    """Simulate an insertion with a fault."""
+    guide = _ASIDE if cell.continuous and cell.phase == GUIDING else 0.0
+    graph = SteeringGraph(cell.robot, continuous=cell.continuous, guide=guide)
+    _reach(graph, cell.phase)
+    seen = _Observer(graph)
+    _begin_fault(graph, cell)
+    if cell.phase == BRAKED:
+        seen.stop()
+    ended = False
+    while seen.elapsed < _LONGEST:
+        if not ended and seen.elapsed >= cell.lasts:
+            ended = True
+            _end_fault(graph, cell)
+        graph.step()
+        seen.update()
+        if graph.reason:
+            seen.stop()
+        least = _WATCHED + (cell.lasts if isfinite(cell.lasts) else 0.0)
+        if seen.rests and seen.elapsed > least and not _is_busy(graph):
+            break
+    return _result(graph, seen, np.array([OFFSET, 0.0, 0.0]) * registers(cell))
+
+
+def _is_busy(graph: SteeringGraph) -> bool:
+    """Whether an insertion is under way, or a target waits for its answer."""
+    loop, phase = graph.steering.loop, graph.phase
+    waits = graph.pending is not None and not graph.pending.done
+    return waits or (phase is not None and (loop.steers or loop.busy))
+
+
+def _result(graph: SteeringGraph, seen: _Observer, offset: FloatArray) -> SteeringResult:
+    """Return the result; ``offset`` is the position of the world in the frame of the target."""
+    loop = graph.steering.loop
+    aim = AIM
+    if loop.law is not None:
+        x, z = np.asarray(loop.law.target).tolist()
+        aim = x, AIM[1], z
+    miss = float(np.linalg.norm(np.subtract(graph.world.tip, aim) + offset))
+    if not seen.rests or _is_busy(graph):
+        outcome = RESTLESS
+    elif graph.reason:
+        outcome = 'stopped'
+    elif graph.phase is not Phase.DONE:
+        outcome = 'ended'
+    elif graph.severity() is not Severity.INFO:
+        outcome = 'warning'
+    else:
+        outcome = 'hit' if miss <= _HIT else MISSED
+    return SteeringResult(
+        outcome, miss, seen.advance, seen.deepest, seen.travel, seen.load,
+        0.0 if outcome in ('hit', 'warning') else inf if outcome == RESTLESS else seen.safe,
+    )  # fmt: skip
+
+
+# Page.
+
+
+def measure_all(chosen: Sequence[SteeringCell], workers: int) -> list[SteeringResult]:
+    """Measure cells in a number of processes."""
+    with processes(workers) as pool:
+        return list(pool.map(measure, chosen))
+
+
+def compare(tick: Tick, fault: str = '') -> Answer:
+    """Measure all cells, or a single fault; an empty page without cells of this fault."""
+    chosen = [cell for cell in cells() if fault in ('', cell.fault)]
+    if not chosen:
+        return [], []
+    tick('steered insertions')
+    found = measure_all(chosen, os.cpu_count() or 1)
+    sections = [_section(place, chosen, found) for place in dict.fromkeys(c.place for c in chosen)]
+    bars = [
+        Bar(
+            'steered: misses of more than 1 mm without a warning',
+            float(sum(one.outcome == MISSED for one in found)),
+            0.0,
+        ),
+        Bar('steered: cells without rest', float(sum(o.outcome == RESTLESS for o in found)), 0.0),
+        Bar(
+            'steered: cells that move into the tissue after a stop by more than the braking '
+            'distance',
+            float(sum(o.advance > allowed(c) for c, o in zip(chosen, found, strict=True))),
+            0.0,
+        ),
+    ]
+    if not fault:
+        bars.insert(0, Bar('steered: cells', float(len(chosen)), 2000.0, at_least=True))
+    return sections, bars
+
+
+def _section(
+    place: str, chosen: Sequence[SteeringCell], found: Sequence[SteeringResult]
+) -> PageSection:
+    """Return the table of a message or node: one row per fault, over all phases and robots."""
+    rows = []
+    for fault in dict.fromkeys(cell.fault for cell in chosen if cell.place == place):
+        own = [
+            one
+            for cell, one in zip(chosen, found, strict=True)
+            if (cell.place, cell.fault) == (place, fault)
+        ]
+        rows.append(
+            (
+                fault,
+                *(str(sum(one.outcome == outcome for one in own)) for outcome in OUTCOMES),
+                f'{1e3 * max(one.advance for one in own):.2f}',
+                f'{1e3 * max(one.deepest for one in own):.2f}',
+                f'{1e3 * max(one.travel for one in own):.1f}',
+                f'{max(one.load for one in own):.1f}',
+                f'{max(one.safe for one in own):.2f}',
+            )
+        )
+    kind = 'node ' if place in NODES else ''
+    notes = ''
+    if place == TIP_DEFLECTION.name:
+        notes = (
+            'A bias along x that begins before the first measurement and lasts is an offset of '
+            'the frame of the sensor, in which target and tip are then given: the miss of these '
+            'cells is measured in this frame. It is not detected.'
+        )
+    if place == COMMAND:
+        notes = (
+            'A driver that misreads its position commands (biased, in another unit or direction) '
+            'moves against every command: no stop of the controller ends this motion. These '
+            'cells are in the table, but not in the bar of the motion after a stop. Of late '
+            'commands, the bar is larger by the motion within the delay.'
+        )
+    return PageSection(
+        f'Steered: {kind}`{place}`',
+        (
+            'fault', *OUTCOMES, 'motion into the tissue after a stop [mm]',
+            'beyond the target depth [mm]', 'guide travel [mm]', 'lateral load [N]',
+            'time to safe [s]',
+        ),
+        rows,
+        notes,
+    )  # fmt: skip

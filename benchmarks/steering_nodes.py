@@ -1,0 +1,461 @@
+"""
+Nodes of a steered insertion in simulated time: robot, axial supervisor and steering executive.
+
+They are the objects behind the ROS nodes. Every node can be stopped, killed, restarted and paused;
+the world (needle, base and guide) moves on without its node.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+from needle_controller import (
+    Controller,
+    ControllerSettings,
+    ExecutiveSettings,
+    ForceCommand,
+    HardwareSettings,
+    Robot,
+    SafetyLimits,
+    SteeringExecutive,
+    SteeringPrior,
+)
+from needle_controller.reference.setpoint import ReferenceLimits
+from needle_controller.steering.motion import JointMotion
+from needle_controller.supervisor import Supervisor
+from needle_controller.waiting_request import JointPath
+from needle_dynamics import STEERING_PRESETS
+from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
+from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
+from needle_ros.contract import (
+    BASE,
+    BASE_WRENCH,
+    DIAGNOSTICS,
+    ENTRY,
+    INSERTION,
+    JOINT_STATES,
+    JOINT_TRAJECTORY,
+    SYSTEM_STATE,
+    TARGET,
+    TIP_DEFLECTION,
+    WRENCH_COMMAND,
+)
+from needle_ros.errors import ParameterError
+from needle_ros.requests import RequestLog, Verdict
+from needle_ros.system_state import Authority, Mode
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+
+#: Rate of samples [Hz], and start time [ns].
+RATE: Final = 50.0
+EPOCH: Final = 1_700_000_000 * NANOSECONDS
+PERIOD: Final = round(NANOSECONDS / RATE)
+
+#: Kinds of robots: force commands on the topics of the contract without an adapter, or position
+#: commands in mm, away from the tissue, through the adapter of the controller.
+CONTRACT, HARDWARE = 'contract', 'hardware'
+ROBOTS: Final = (CONTRACT, HARDWARE)
+
+#: Topic of the commands of either robot.
+COMMAND: Final = WRENCH_COMMAND.name
+
+#: Nodes.
+ROBOT, CONTROLLER, STEERING, USER = 'robot', 'controller', 'steering', 'user'
+NODES: Final = (ROBOT, CONTROLLER, STEERING)
+
+#: Receivers of each topic.
+ROUTES: Final = {
+    BASE_WRENCH.name: (CONTROLLER,),
+    TIP_DEFLECTION.name: (CONTROLLER, STEERING),
+    JOINT_STATES.name: (CONTROLLER, STEERING),
+    COMMAND: (ROBOT,),
+    JOINT_TRAJECTORY.name: (CONTROLLER, ROBOT),
+    DIAGNOSTICS.name: (STEERING, USER),
+    SYSTEM_STATE.name: NODES,
+    TARGET.name: (STEERING,),
+}
+
+#: Messages that a paused node keeps.
+_KEPT: Final = dict.fromkeys((BASE_WRENCH.name, TIP_DEFLECTION.name, JOINT_STATES.name), 50)
+_KEPT_ELSE: Final = 10
+
+#: Joints of the guide.
+_GUIDE: Final = frozenset(GUIDE_JOINTS)
+
+NEEDLE, STEERING_CONSTANTS, _ = STEERING_PRESETS['bending_35mm']
+
+#: Speed of the insertion [m/s], and settings of the steering executive.
+SPEED: Final = 0.02
+SETTINGS: Final = ExecutiveSettings(
+    step_length=0.01, speed=SPEED, guide_speed=0.04, acceleration=0.4, look_time=0.2,
+    settle_time=0.04, patience=2.0,
+)  # fmt: skip
+
+#: Robot with position commands: its joint points out of the tissue, in mm, with an offset.
+_SLIDE: Final = HardwareSettings(
+    joint='slide', sign=-1.0, scale=1e-3, zero=120.0, command='position', speed=0.05,
+    command_type='joint_state', command_topic='slide_command', state_topic='slide_states',
+)  # fmt: skip
+
+#: True needle: softer tissue than the nominal needle, a tilted guide and a bevel.
+_WORLD: Final = {
+    'steered': True,
+    'model.preset': 'bending_35mm',
+    'model.tissue_stiffness': 0.8 * NEEDLE.tissue_stiffness,
+    'steering.bevel_load': [0.15],
+    'rate': RATE,
+    'depth': 1e-3,
+    'tip.noise': 1e-4,
+    'guide.speed_limit': 0.1,
+    'step': 1e-3,
+}
+
+
+class Posted(NamedTuple):
+    """A message in transmission; it arrives `late` [ns] after it was sent."""
+
+    topic: str
+    content: Any
+    late: int = 0
+
+
+class NodeNetwork(ABC):
+    """World and time of nodes that are connected by messages; see `SteeringGraph`."""
+
+    def __init__(self, robot: str, *, continuous: bool) -> None:
+        self.robot, self.continuous = robot, continuous
+        self.now = EPOCH
+        self.run = PlantRun({**_WORLD, 'mode': 'robot' if robot == HARDWARE else 'simulation'})
+        self.nodes: dict[str, GraphNode] = {}
+
+    def steady(self) -> float:
+        """Return the time of a steady clock [s]."""
+        return (self.now - EPOCH) / NANOSECONDS
+
+    @property
+    def guide(self) -> dict[str, float]:
+        """Positions of the joints of the guide [m, rad]."""
+        plant: Any = self.run.plant
+        return {name: plant.report.joint[name] for name in GUIDE_JOINTS}
+
+    @abstractmethod
+    def post(self, topic: str, content: Any, sender: str) -> None:
+        """Send a message to all receivers of its topic."""
+
+
+class GraphNode(ABC):
+    """
+    A node: its messages, its part of the system state, and its answers to requests.
+
+    ``runs`` is whether it takes messages; a paused node keeps them until it is resumed.
+    """
+
+    def __init__(self, graph: NodeNetwork, name: str) -> None:
+        self.graph, self.name = graph, name
+        self.runs, self.paused = True, False
+        self.kept: deque[Posted] = deque()
+        self.start()
+
+    def start(self) -> None:
+        """Start, or restart without memory; the latched states of other nodes are received."""
+        self.runs, self.paused = True, False
+        self.authority = Authority(f'/{self.name}', lambda: self.graph.now)
+        for other in self.graph.nodes.values():
+            if other is not self and other.runs:
+                self.authority.receive(other.authority.state)
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Create the object behind the node, and activate it."""
+
+    @abstractmethod
+    def take(self, topic: str, content: Any, now: int) -> None:
+        """Process a message."""
+
+    @abstractmethod
+    def obey(self, now: int, /) -> None:
+        """Follow the state of the system."""
+
+    @abstractmethod
+    def stop(self, now: int, /) -> None:
+        """Deactivate."""
+
+    @property
+    @abstractmethod
+    def requests(self) -> RequestLog:
+        """Requests and their answers."""
+
+    @abstractmethod
+    def watch(self, now: int) -> None:
+        """Check for missing inputs."""
+
+    @abstractmethod
+    def request(self, word: str, now: int) -> None:
+        """Execute a request of a user."""
+
+    def receive(self, posted: Posted, now: int) -> None:
+        """Take a message, or keep it while paused."""
+        if self.paused:
+            self.kept.append(posted)
+        elif self.runs and posted.topic == SYSTEM_STATE.name:
+            self.authority.receive(posted.content)
+            if self.authority.changed:
+                self.obey(now)
+        elif self.runs:
+            self.take(posted.topic, posted.content, now)
+
+    def resume(self, now: int) -> None:
+        """Continue after a pause with the newest messages of each topic."""
+        self.paused, kept = False, list(self.kept)
+        self.kept.clear()
+        for k, posted in enumerate(kept):
+            after = sum(one.topic == posted.topic for one in kept[k + 1 :])
+            if after < _KEPT.get(posted.topic, _KEPT_ELSE):
+                self.receive(posted, now)
+
+    def publish(self, *, again: bool = False) -> None:
+        """Publish the system state and the answers to requests, if they are new or ``again``."""
+        if self.authority.changed or again:
+            self.authority.changed = False
+            self.graph.post(SYSTEM_STATE.name, self.authority.state, self.name)
+        if self.requests.due() or again:
+            content = self.name, self.requests.status()
+            self.graph.post(DIAGNOSTICS.name, content, self.name)
+
+
+class SimulatedRobot(GraphNode):
+    """Driver of the robot and the sensors, as `PlantNode`."""
+
+    def _begin(self) -> None:
+        graph, self._mode = self.graph, Mode.RUNNING
+        self._moved = GUIDE_JOINTS
+        self._log = RequestLog({JOINT_TRAJECTORY: self._moved}, steady=graph.steady)
+        graph.run.begin()
+        graph.run.commands.count_commanders(1)
+        self.obey(graph.now)
+
+    @property
+    def requests(self) -> RequestLog:
+        return self._log
+
+    def measure(self, measured: Iterable[tuple[str, int, Sequence[float]]], now: int) -> None:
+        """Publish the measurements of a sample."""
+        if not self.runs or self.paused:
+            return
+        for name, _, values in measured:
+            if name in ROUTES:
+                self.graph.post(name, _reading(name, now, values), self.name)
+
+    def take(self, topic: str, content: Any, now: int) -> None:
+        run = self.graph.run
+        if topic == JOINT_TRAJECTORY.name:
+            self._follow(content, now)
+        elif self.graph.robot == HARDWARE:
+            ((position,), *_) = content.values
+            depth = _SLIDE.sign * _SLIDE.scale * (position - _SLIDE.zero)
+            own = content._replace(names=(INSERTION,), values=((depth,), (), ()))
+            run.command_joints(own, now)
+        else:
+            _, force, _, torque, _, _ = content.values[0]
+            run.commands.offer(content.stamp, content.frame, force, torque, now)
+
+    def _follow(self, move: JointMotion, now: int) -> None:
+        """Follow the guide in a trajectory."""
+        own = [k for k, name in enumerate(move.joints) if name in self._moved]
+        joints = [move.joints[k] for k in own]
+        stopped, log, topic = self.authority.reason, self._log, JOINT_TRAJECTORY
+        if not own or log.check(topic, move.stamp, now, '', joints) is not None:
+            return
+        if stopped:
+            log.answer(topic, move.stamp, Verdict.SUPERSEDED, f'stopped: {stopped}')
+            return
+        verdict, reason = Verdict.ACCEPTED, ''
+        content = {
+            'joints': joints, 'times': move.times.tolist(),
+            'positions': move.positions[:, own].tolist(), 'efforts': [[]] * len(move.times),
+        }  # fmt: skip
+        try:
+            self.graph.run.perform(Event(TRAJECTORY, content))
+        except ParameterError as error:
+            verdict, reason = Verdict.REJECTED, str(error)
+        log.answer(topic, move.stamp, verdict, reason, joints)
+
+    def request(self, word: str, now: int) -> None:
+        self.authority.request(word)
+        self.obey(now)
+
+    def watch(self, now: int) -> None:
+        self.obey(now)
+
+    def obey(self, _now: int) -> None:
+        mode, before = self.authority.mode, self._mode
+        self._mode = mode
+        if mode is Mode.STOPPED and mode is not before:
+            self._halt()
+        self.graph.run.commands.stopped = mode is Mode.STOPPED and self.graph.robot == CONTRACT
+
+    def stop(self, _now: int) -> None:
+        self._halt()
+        self.runs = False
+
+    def _halt(self) -> None:
+        """Stop the guide, and the needle; a foreign driver is stopped by the controller only."""
+        if self.graph.robot == CONTRACT:
+            self.graph.run.halt()
+            return
+        at = [*self.graph.guide.values()]
+        rest = {'joints': GUIDE_JOINTS, 'times': [0.05], 'positions': [at], 'efforts': [[]]}
+        self.graph.run.perform(Event(TRAJECTORY, rest))
+
+
+class SimulatedController(GraphNode):
+    """Axial supervisor, as the node of the same name."""
+
+    def _begin(self) -> None:
+        graph, controller = self.graph, deepcopy(_controller())
+        self._supervisor = supervisor = Supervisor(graph.steady)
+        supervisor.authority = self.authority
+        self._adapter: Robot | None = None
+        if graph.robot == HARDWARE:
+            self._adapter = Robot(_SLIDE)
+            self._adapter.configure(controller)
+        supervisor.receive(targets=False)
+        supervisor.configure(controller, SafetyLimits(), None, self._adapter)
+        supervisor.activate(graph.now, _SOURCES)
+        self._inputs: dict[str, Callable[[Reading, int], ForceCommand | None]] = {
+            JOINT_STATES.name: supervisor.encoders,
+            BASE_WRENCH.name: supervisor.wrench,
+            TIP_DEFLECTION.name: supervisor.tip,
+        }
+
+    @property
+    def requests(self) -> RequestLog:
+        return self._supervisor.requests
+
+    @property
+    def fault(self) -> str:
+        """Reason why no force is commanded, '' if there is none."""
+        return self._supervisor.fault or ''
+
+    def take(self, topic: str, content: Any, now: int) -> None:
+        supervisor = self._supervisor
+        if topic == JOINT_TRAJECTORY.name:
+            if {*content.joints} <= _GUIDE:
+                return
+            positions, velocities = content.positions.tolist(), content.velocities.tolist()
+            path = JointPath(content.joints, content.times.tolist(), positions, velocities)
+            self._act(supervisor.trajectory(content.stamp, '', path, now))
+            return
+        if topic == JOINT_STATES.name and self._adapter is not None:
+            content = _of_slide(content)
+        self._act(self._inputs[topic](content, now))
+
+    def obey(self, now: int) -> None:
+        self._act(self._supervisor.obey(now))
+
+    def request(self, word: str, now: int) -> None:
+        self._act(self._supervisor.request(word, now)[2])
+
+    def watch(self, now: int) -> None:
+        self._act(self._supervisor.watch(now, _SOURCES))
+
+    def stop(self, now: int) -> None:
+        self._act(self._supervisor.deactivate(now))
+        self.runs = False
+
+    def _act(self, answer: ForceCommand | None) -> None:
+        """Send a command."""
+        if answer is None:
+            return
+        supervisor = self._supervisor
+        command = Reading(answer.stamp, BASE, (), ((0.0, answer.force, 0.0, 0.0, 0.0, 0.0),))
+        if self._adapter is not None:
+            stopped = supervisor.safety.stop is not None
+            positions = self._adapter.command(answer, supervisor.bending.load, stopped=stopped)
+            if positions is None:
+                return
+            command = Reading(answer.stamp, '', (_SLIDE.joint,), (tuple(positions), (), ()))
+        self.graph.post(COMMAND, command, self.name)
+
+
+class SimulatedSteering(GraphNode):
+    """Steering executive, as the node of the same name."""
+
+    def _begin(self) -> None:
+        settings = replace(SETTINGS, continuous=self.graph.continuous)
+        self.loop = SteeringExecutive(
+            NEEDLE, STEERING_CONSTANTS, SteeringPrior(), settings, steady=self.graph.steady
+        )
+        self.loop.authority = self.authority
+
+    @property
+    def requests(self) -> RequestLog:
+        return self.loop.requests
+
+    def take(self, topic: str, content: Any, now: int) -> None:
+        loop = self.loop
+        if topic == JOINT_STATES.name:
+            self._act(loop.joints(content, now))
+        elif topic == TIP_DEFLECTION.name:
+            self._act(loop.tip(content, now))
+        elif topic == TARGET.name:
+            stamp, frame, point = content
+            self._act(loop.target(stamp, frame, point, now))
+        else:
+            node, status = content
+            if status.takes:
+                self._act(loop.hear(node, status, now))
+
+    def obey(self, now: int) -> None:
+        self._act(self.loop.obey(now))
+
+    def request(self, word: str, now: int) -> None:
+        self._act(self.loop.request(word, now)[2])
+
+    def watch(self, now: int) -> None:
+        self.obey(now)
+        self._act(self.loop.watch(now))
+
+    def stop(self, now: int) -> None:
+        self._act(self.loop.halt('the node was deactivated', now))
+        self.runs = False
+
+    def _act(self, move: JointMotion | None) -> None:
+        """Send a motion."""
+        if move is not None:
+            self.graph.post(JOINT_TRAJECTORY.name, move, self.name)
+
+
+#: Publishers of commands and measurements, as counted by the controller.
+_SOURCES: Final = dict.fromkeys((COMMAND, JOINT_STATES.name, BASE_WRENCH.name), 1)
+
+
+@lru_cache(maxsize=1)
+def _controller() -> Controller:
+    """Return a controller at rest, to be copied: the check of its stability takes time."""
+    limits = ReferenceLimits(speed=2.0 * SPEED, acceleration=1.0)
+    return Controller(NEEDLE, settings=ControllerSettings(rate=RATE), limits=limits)
+
+
+def _reading(name: str, stamp: int, values: Sequence[float]) -> Reading:
+    """Return a measurement as a message."""
+    if name != JOINT_STATES.name:
+        frame = ENTRY if name == TIP_DEFLECTION.name else BASE
+        return Reading(stamp, frame, (), (tuple(values),))
+    names = (INSERTION, *GUIDE_JOINTS)
+    count = len(names)
+    columns = tuple(tuple(values[k : k + count]) for k in range(0, 3 * count, count))
+    return Reading(stamp, '', names, columns)
+
+
+def _of_slide(reading: Reading) -> Reading:
+    """Return the joint states of the robot with position commands, without velocities."""
+    position = reading.values[0][0] / (_SLIDE.sign * _SLIDE.scale) + _SLIDE.zero
+    return Reading(reading.stamp, '', (_SLIDE.joint,), ((position,), (), ()))
