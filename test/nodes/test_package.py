@@ -145,7 +145,7 @@ def test_rosdep_resolves_every_dependency() -> None:
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the tracked files of this tree, in a colcon workspace."""
     folder = tmp_path_factory.mktemp('workspace') / 'src/needle_insertion'
-    folders = ('config', 'description', 'launch', 'resource', 'scripts', 'test')
+    folders = ('config', 'description', 'launch', 'resource', 'scripts', 'test', 'tools')
     for name in (*OWN, *folders):
         shutil.copytree(ROOT / name, folder / name)
     for name in (
