@@ -19,9 +19,9 @@ from benchmarks.steering_nodes import (
     Posted,
     RATE,
     ROBOT,
+    RobotNode,
     ROUTES,
     SimulatedController,
-    SimulatedRobot,
     SimulatedSteering,
     STEERING,
     USER,
@@ -85,7 +85,7 @@ class SteeringGraph(NodeNetwork):
         self.fault = GraphFault()
         self.pending: PendingRequest | None = None
         self._target: tuple[int, str, tuple[float, float, float]] = 0, '', AIM
-        self._robot = SimulatedRobot(self, ROBOT)
+        self._robot = RobotNode(self, ROBOT)
         self.controller = SimulatedController(self, CONTROLLER)
         self.steering = SimulatedSteering(self, STEERING)
         self.nodes = {one.name: one for one in (self._robot, self.controller, self.steering)}

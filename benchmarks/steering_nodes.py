@@ -230,7 +230,7 @@ class GraphNode(ABC):
             self.graph.post(DIAGNOSTICS.name, content, self.name)
 
 
-class SimulatedRobot(GraphNode):
+class RobotNode(GraphNode):
     """Driver of the robot and the sensors, as `PlantNode`."""
 
     def _begin(self) -> None:
