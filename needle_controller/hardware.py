@@ -207,7 +207,7 @@ class Robot:
         self._base: Admittance | None = None
         #: Insertion depth to command for a check [m], NaN for no command; None without a check.
         self.probe: float | None = None
-        #: Last measured force on the needle, along x, y and z of `needle_base` [N].
+        #: Last measured force on the needle, along x, y and z of ``needle_base`` [N].
         self.felt = 0.0, 0.0, 0.0
         self.begin()
 
