@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 import os
 from pathlib import Path
@@ -104,11 +104,7 @@ def resident_memory(process: int) -> int:
 
 
 def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
-    """
-    Run plant, controller and recorder for a duration [s], and measure their memory.
-
-    The first tenth, at most a minute, is warm-up.
-    """
+    """Run plant, controller and recorder for a duration [s], and measure their memory."""
     names = ('plant', 'controller', 'recorder')
     rows: list[tuple[float, list[int]]] = []
     with Graph(folder / 'logs') as graph:
@@ -128,6 +124,20 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
                 watch.aim()
             rows.append((now, [resident_memory(one.process.pid) for one in started]))
             watch.spin(0.1)
+    return memory_growth(names, rows, duration, GROWTH)
+
+
+def memory_growth(
+    names: Sequence[str],
+    rows: Sequence[tuple[float, Sequence[int]]],
+    duration: float,
+    limit: float,
+) -> Answer:
+    """
+    Evaluate rows of a time [s] and the resident memory of each node [bytes].
+
+    The first tenth of the duration [s], at most a minute, is warm-up; `limit` is in MB.
+    """
     warm = min(_WARM_UP, 0.1 * duration)
     memory = np.array([values for at, values in rows if at >= warm or at == rows[-1][0]]) / 1e6
     tenth = max(1, len(memory) // 10)
@@ -148,4 +158,4 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     )
     worst = int(np.argmax(growth))
     figure = f'growth of memory in {duration:g} s, largest: {names[worst]}'
-    return [section], [Bar(figure, float(growth[worst]), GROWTH, 'MB')]
+    return [section], [Bar(figure, float(growth[worst]), limit, 'MB')]

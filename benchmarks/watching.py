@@ -44,8 +44,8 @@ _BROWSERS: Final = ('chromium', 'chromium-browser', 'google-chrome')
 
 
 @contextmanager
-def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
-    """Show the page within a ``with`` statement; yield process id of `needle watch` and port."""
+def page(graph: Graph, folder: str, count: int = 1) -> Iterator[tuple[int, int]]:
+    """Show pages within a ``with`` statement; yield process id of `needle watch` and port."""
     browser = next(filter(None, map(shutil.which, _BROWSERS)), None)
     if browser is None:
         raise JobError(f'none of {", ".join(_BROWSERS)} is installed')
@@ -63,13 +63,16 @@ def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
         options = ('--headless=new', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',
                    '--no-first-run', '--disable-background-networking',
                    '--remote-debugging-port=0', '--window-size=1400,1000')  # fmt: skip
-        shown: subprocess.Popen[str] = subprocess.Popen(
-            [browser, *options, f'--user-data-dir={folder}', line.removeprefix('page: ').strip()],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        )
-        running.append(shown)
+        # One browser per page: a browser slows down the pages that it hides.
+        for k in range(count):
+            profile = f'--user-data-dir={folder}_{k}'
+            shown: subprocess.Popen[str] = subprocess.Popen(
+                [browser, *options, profile, line.removeprefix('page: ').strip()],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+            running.append(shown)
         yield watch.pid, int(line.strip().rstrip('/').rpartition(':')[2])
     finally:
         for process in reversed(running):
@@ -77,10 +80,10 @@ def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
             process.wait(30.0)
 
 
-def connected(port: int) -> bool:
-    """Return whether a port of this machine has an established connection."""
+def connections(port: int) -> int:
+    """Return the number of established connections to a port of this machine."""
     rows = (line.split() for line in Path('/proc/net/tcp').read_text('ascii').splitlines()[1:])
-    return any(row[1].endswith(f':{port:04X}') and row[3] == '01' for row in rows)
+    return sum(row[1].endswith(f':{port:04X}') and row[3] == '01' for row in rows)
 
 
 def measure() -> dict[str, list[float]]:
@@ -123,7 +126,7 @@ def measure() -> dict[str, list[float]]:
         for k in range(ROUNDS):
             take('alone', {})
             with page(graph, f'{name}/browser_{k}') as (watch, port):
-                graph.spin_until(partial(connected, port), 'the page')
+                graph.spin_until(partial(connections, port), 'the page')
                 take('with a page', {'needle watch': watch})
             sys.stderr.write(f'round {k + 1} of {ROUNDS}\n')
     return found
