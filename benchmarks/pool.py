@@ -31,7 +31,7 @@ _BUSY: Final = 2
 
 #: Short insertions, with a trivial controller.
 _STUDY: Final[dict[str, Any]] = {
-    'protocol': 'steering',
+    'scenario': 'steering',
     'seed': 3,
     'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
     'population': {'bending_length': {'uniform': [0.8, 1.2]}},

@@ -79,7 +79,7 @@ _STEERING: Final[dict[str, object]] = {
     'speed': 0.05,
     'guide_speed': 0.05,
     'acceleration': 0.4,
-    'look_time': 0.15,
+    'measurement_time': 0.15,
     'settle_time': 0.02,
 }
 _CONTROLLER: Final[dict[str, object]] = {

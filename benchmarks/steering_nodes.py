@@ -93,7 +93,7 @@ NEEDLE, STEERING_CONSTANTS, _ = STEERING_PRESETS['bending_35mm']
 #: Speed of the insertion [m/s], and settings of the steering executive.
 SPEED: Final = 0.02
 SETTINGS: Final = ExecutiveSettings(
-    step_length=0.01, speed=SPEED, guide_speed=0.04, acceleration=0.4, look_time=0.2,
+    step_length=0.01, speed=SPEED, guide_speed=0.04, acceleration=0.4, measurement_time=0.2,
     settle_time=0.04, patience=2.0,
 )  # fmt: skip
 

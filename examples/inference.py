@@ -50,7 +50,7 @@ NEEDLES, TRIALS, DRAWS = 20_000, 1000, 1000
 
 def population(count: int, seed: int) -> dict[str, FloatArray]:
     """Draw needles as `needle study` does."""
-    study = {'protocol': 'steering', 'samples': count, 'seed': seed, 'population': POPULATION}
+    study = {'scenario': 'steering', 'samples': count, 'seed': seed, 'population': POPULATION}
     return made(study).draw(range(count))
 
 

@@ -148,7 +148,7 @@ class Commissioning:
         return ControllerOutput(force=force, setpoint=Setpoint(self._depth), refusal=refusal)
 
     def _row(self, measured: Measurement) -> tuple[float, ...]:
-        return measured.time, measured.depth, measured.velocity, *self.robot.felt
+        return measured.time, measured.depth, measured.velocity, *self.robot.reaction
 
     def _add(self, measured: Measurement) -> None:
         """Add a measurement; the joint must not move against or beyond the command."""
@@ -204,9 +204,9 @@ class Commissioning:
         # Largest change of the force, and its axis.
         change = max(rows[:, 3:], key=np.linalg.norm)
         axis = int(np.argmax(np.abs(change)))
-        pull, felt = change[axis], 'no force measured'
+        pull, reaction = change[axis], 'no force measured'
         if abs(pull) > max(self._noise[3 + axis], _FELT):
-            felt = f'force {pull:+.2f} N'
+            reaction = f'force {pull:+.2f} N'
             if axis != 1 or pull > 0.0:
                 index, sign = own.axes()[axis]
                 wanted = ('-' if sign * pull > 0.0 else '') + AXES[index]
@@ -217,7 +217,7 @@ class Commissioning:
                     + (other if axis == 1 else '')
                 )
         self.phase = CommissioningPhase.PASSED
-        self.result = f'moved {1e3 * moved:+.2f} mm, {1e3 * lag:.0f} ms late, {felt}'
+        self.result = f'moved {1e3 * moved:+.2f} mm, {1e3 * lag:.0f} ms late, {reaction}'
 
     def _by_position(self) -> Generator[float, Measurement, float]:
         """Command a ramp; return the delay of the robot [s]."""

@@ -147,7 +147,7 @@ class ControllerNode(ModelNode):
         self._driver: Driver | None = None
         self._no_driver: NeedleError | None = None
         self._hardware = HardwareSettings()
-        self._looks, self._missing = 0, ''
+        self._checks, self._missing = 0, ''
         self._connect()
         self._reference = self.publisher(contract.REFERENCE)
         self._tracking_error = self.publisher(contract.TRACKING_ERROR)
@@ -174,8 +174,8 @@ class ControllerNode(ModelNode):
             self._no_driver = error
         self._topics = topics = self._driver.topics if self._driver is not None else CONTRACT
         offer_lease(self, topics.commander)
-        commanders = Publishers(self, topics.commander, self._look)
-        measurers = Publishers(self, topics.measurer, self._look)
+        commanders = Publishers(self, topics.commander, self._check_inputs)
+        measurers = Publishers(self, topics.measurer, self._check_inputs)
         #: Counters of the publishers of commands and measurements, by name in the contract.
         self._sources = {
             contract.WRENCH_COMMAND.name: (topics.command, commanders),
@@ -187,11 +187,13 @@ class ControllerNode(ModelNode):
         take_state = self._passing(self._supervisor.encoders)
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
-            self._driver.listen(take_state, take_wrench, self._look)
+            self._driver.listen(take_state, take_wrench, self._check_inputs)
         else:
-            self.listen(topics.state, take_state, self._look)
-            self.listen(topics.wrench, take_wrench, self._look)
-        self.listen(contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._look)
+            self.listen(topics.state, take_state, self._check_inputs)
+            self.listen(topics.wrench, take_wrench, self._check_inputs)
+        self.listen(
+            contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs
+        )
 
     # Transitions.
 
@@ -273,9 +275,9 @@ class ControllerNode(ModelNode):
     def activate(self) -> None:
         """Start to answer measurements and to check for missing inputs."""
         self._supervisor.activate(self.now(), self._who_publishes())
-        self._looks, self._missing = 0, ''
+        self._checks, self._missing = 0, ''
         self._watchdog = self.create_timer(
-            self._supervisor.watch_period, self._look, clock=self._steady
+            self._supervisor.watch_period, self._check_inputs, clock=self._steady
         )
 
     def about(self) -> str:
@@ -350,17 +352,17 @@ class ControllerNode(ModelNode):
         """Count the publishers of commands and measurements; active or not."""
         return {name: sources.count(topic) for name, (topic, sources) in self._sources.items()}
 
-    def _look(self, _came: int = 0) -> None:
+    def _check_inputs(self, _came: int = 0) -> None:
         """Check for missing inputs and for duplicate publishers."""
         if self.is_active:
             self._act(self._supervisor.watch(self.now(), self._who_publishes()))
             if self._driver is not None and self._supervisor.waits:
-                self._look_for(self._driver)
+                self._check_driver(self._driver)
 
-    def _look_for(self, driver: Driver) -> None:
+    def _check_driver(self, driver: Driver) -> None:
         """Log why no joint states are received, each reason once, after discovery."""
-        self._looks += 1
-        missing = driver.missing() if self._looks > _PATIENCE else ''
+        self._checks += 1
+        missing = driver.missing() if self._checks > _PATIENCE else ''
         if missing != self._missing:
             self._missing = missing
             self._supervisor.events.add(Severity.WARNING, missing)

@@ -208,7 +208,7 @@ class Robot:
         #: Insertion depth to command for a check [m], NaN for no command; None without a check.
         self.probe: float | None = None
         #: Last measured force on the needle, along x, y and z of ``needle_base`` [N].
-        self.felt = 0.0, 0.0, 0.0
+        self.reaction = 0.0, 0.0, 0.0
         self.begin()
 
     def begin(self) -> None:
@@ -375,7 +375,7 @@ class Robot:
         turned = tuple(
             sign * one * numbers[begin + axis] for begin in (0, 3) for axis, one in self._axes
         )
-        self.felt = turned[0], turned[1], turned[2]
+        self.reaction = turned[0], turned[1], turned[2]
         return reading._replace(values=(turned,))
 
     # To the robot.

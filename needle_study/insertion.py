@@ -53,7 +53,7 @@ _AT_ONCE: Final = 16  #: open-loop insertions per batch, whose samples are all i
 #: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
 
-FIGURES: Final[Mapping[str, Metric]] = {
+METRICS: Final[Mapping[str, Metric]] = {
     'error': Metric('m', 'distance of the needle from the target depth at the end'),
     'hit': Metric('', 'the needle ends within the tolerance of the target depth'),
     'overshoot': Metric('m', 'largest overshoot of the target depth'),
@@ -113,7 +113,7 @@ class _Course(NamedTuple):
     forces: FloatArray
     noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2)
     goal: FloatArray  #: reference [m], shape (k + 1,); NaN without a reference
-    #: As in `FIGURES`.
+    #: As in `METRICS`.
     stopped: float
     left: float
 
@@ -133,7 +133,7 @@ class _Course(NamedTuple):
         return self.model.tip_deflections(self.states)
 
 
-class InsertionProtocol:
+class InsertionScenario:
     """
     Insert needles that differ from the nominal model to a depth.
 
@@ -142,7 +142,7 @@ class InsertionProtocol:
     fields of `InsertionStudy`. Raises `ParameterError` if a setting is not valid.
     """
 
-    figures = FIGURES
+    metrics = METRICS
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
@@ -185,7 +185,7 @@ class InsertionProtocol:
                 f'{samples:.3g}: see rate, wait, speed and push'
             )
         deepest, most = p.length, NeedleModel(p).modes.reach * p.length
-        self.quantities: Mapping[str, Variable] = {
+        self.variables: Mapping[str, Variable] = {
             'target': Variable(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
             'depth': Variable(
                 max(0.1 * p.length, p.minimum_depth), 'm', 'insertion depth at the start',
@@ -246,11 +246,11 @@ class InsertionProtocol:
         return law
 
     def run(
-        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """Compute the metrics of sampled needles, as `Scenario.run`."""
         rows = [
-            self._row({name: float(values[k]) for name, values in drawn.items()})
+            self._row({name: float(values[k]) for name, values in samples.items()})
             for k in range(len(streams))
         ]
         found = [
@@ -260,13 +260,13 @@ class InsertionProtocol:
                 rows[first : first + _AT_ONCE], streams[first : first + _AT_ONCE]
             )
         ]
-        return {name: np.array([one[name] for one in found]) for name in FIGURES}
+        return {name: np.array([one[name] for one in found]) for name in METRICS}
 
     def replay(
-        self, drawn: Mapping[str, float], rng: np.random.Generator
+        self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield joints, tip and commands at each sample up to a stop, and the target."""
-        ((row, course),) = self._courses([self._row(drawn)], [rng])
+        ((row, course),) = self._courses([self._row(sample)], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
         m = course.model.coordinates
         depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
@@ -282,8 +282,8 @@ class InsertionProtocol:
                 force = (0.0, float(course.commands[k]), 0.0)
                 yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
 
-    def _row(self, drawn: Mapping[str, float]) -> dict[str, float]:
-        return {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+    def _row(self, sample: Mapping[str, float]) -> dict[str, float]:
+        return {name: sample.get(name, one.default) for name, one in self.variables.items()}
 
     def _truth(self, row: Mapping[str, float]) -> NeedleParameters:
         p, stiffness = self._needle, row['tissue_stiffness']

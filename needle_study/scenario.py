@@ -43,16 +43,16 @@ class MeasuredRun(NamedTuple):
 class Scenario(Interface):
     """Interface of a scenario, which is simulated with each sample."""
 
-    quantities: Mapping[str, Variable]  #: variables of a sample
-    figures: Mapping[str, Metric]  #: metrics, the primary metric first
+    variables: Mapping[str, Variable]  #: variables of a sample
+    metrics: Mapping[str, Metric]  #: metrics, the primary metric first
 
     def run(
-        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
 
     def replay(
-        self, drawn: Mapping[str, float], rng: np.random.Generator
+        self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Simulate one sample again; yield measurements and commands in time order per topic."""
 
@@ -61,19 +61,19 @@ class Scenario(Interface):
 
 
 def _steering(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.steering import SteeringProtocol
+    from needle_study.steering import SteeringScenario
 
-    return SteeringProtocol(settings)
+    return SteeringScenario(settings)
 
 
 def _insertion(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.insertion import InsertionProtocol
+    from needle_study.insertion import InsertionScenario
 
-    return InsertionProtocol(settings)
+    return InsertionScenario(settings)
 
 
 #: Constructor of each scenario from the settings of a study.
-PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
+SCENARIOS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
     'steering': _steering,
     'insertion': _insertion,
 }

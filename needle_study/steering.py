@@ -52,20 +52,20 @@ _MOST: Final = 1000  #: most steps of an insertion
 _TOGETHER: Final = 256  #: needles per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
-FIGURES: Final[Mapping[str, Metric]] = {
+METRICS: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
     'hit': Metric('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
     'tip_x': Metric('m', 'final tip position, in the frame of the sensor'),
     'tip_z': Metric('m', 'final tip position, in the frame of the sensor'),
-    'way': Metric('m', 'distance traveled by the guide'),
+    'guide_travel': Metric('m', 'distance traveled by the guide'),
     'turns': Metric('1', 'number of needle rotations'),
     'load': Metric('N', 'largest lateral force on the guide after its motions'),
     'refused': Metric('', 'the target was rejected as outside the reachable set'),
     'stopped': Metric('', 'the law stopped the insertion before the target depth'),
     'warned': Metric('', 'a warning before the target depth: target outside the reachable set'),
-    'said_x': Metric('m', 'expected final tip position of the law'),
-    'said_z': Metric('m', 'expected final tip position of the law'),
-    'held': Metric('', 'the tip is in the 95 % ellipse of the law'),
+    'expected_x': Metric('m', 'expected final tip position of the law'),
+    'expected_z': Metric('m', 'expected final tip position of the law'),
+    'covered': Metric('', 'the tip is in the 95 % ellipse of the law'),
 }
 
 
@@ -77,7 +77,7 @@ class SteeringStudy(SteeringLimits):
     step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
 
 
-class SteeringProtocol:
+class SteeringScenario:
     """
     Steer needles that differ from the nominal model to a target.
 
@@ -85,7 +85,7 @@ class SteeringProtocol:
     ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises `ParameterError`.
     """
 
-    figures = FIGURES
+    metrics = METRICS
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
@@ -129,7 +129,7 @@ class SteeringProtocol:
         self._depths = step_depths(numbers.depth, numbers.step)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
-        self.quantities: Mapping[str, Variable] = {
+        self.variables: Mapping[str, Variable] = {
             'target_x': Variable(0.0, 'm', 'lateral position of the target'),
             'target_z': Variable(0.0, 'm', 'lateral position of the target'),
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
@@ -143,7 +143,7 @@ class SteeringProtocol:
             'frame_x': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
-            'look_noise': Variable(
+            'tip_noise': Variable(
                 self._prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
             ),
             'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
@@ -155,15 +155,15 @@ class SteeringProtocol:
         return SteeringModel(self._needle, self._steering, self._depths, self._prior)
 
     def run(
-        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """Compute the metrics of sampled needles, as `Scenario.run`."""
         count = len(streams)
         each = {
-            name: drawn.get(name, np.full(count, one.default))
-            for name, one in self.quantities.items()
+            name: samples.get(name, np.full(count, one.default))
+            for name, one in self.variables.items()
         }
-        found = {name: np.full(count, nan) for name in FIGURES}
+        found = {name: np.full(count, nan) for name in METRICS}
         for first in range(0, count, _TOGETHER):
             some = slice(first, first + _TOGETHER)
             self._insert(
@@ -232,14 +232,14 @@ class SteeringProtocol:
         )
         frames = np.array([truth.frame for truth in truths])
         found['tip_x'][:], found['tip_z'][:] = (tips[:, -1, [0, 2]] + frames * depth).T
-        for name in ('way', 'turns'):
+        for name in ('guide_travel', 'turns'):
             found[name][:] = 0.0
 
     def replay(
-        self, drawn: Mapping[str, float], rng: np.random.Generator
+        self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
-        row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+        row = {name: sample.get(name, one.default) for name, one in self.variables.items()}
         tilt = row['tilt_x'], row['tilt_z']
         still, messages = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
@@ -275,24 +275,24 @@ class SteeringProtocol:
 
         def sensor(tip: FloatArray) -> FloatArray | None:
             noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
-            return None if lost else np.asarray(tip + row['look_noise'] * noise)
+            return None if lost else np.asarray(tip + row['tip_noise'] * noise)
 
-        figures, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
+        metrics, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
         try:
             done = simulate_steering(law, plant, sensor, watch)
         except SteeringFaultError:
-            return {**figures, 'stopped': 1.0}
+            return {**metrics, 'stopped': 1.0}
         tip = plant.tip
-        figures |= {
-            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.travel,
+        metrics |= {
+            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'guide_travel': done.travel,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
         estimate = law.expected()
         if estimate is not None:
-            figures |= {
-                'said_x': float(estimate.mean[0]),
-                'said_z': float(estimate.mean[1]),
-                'held': float(estimate.contains(tip)),
+            metrics |= {
+                'expected_x': float(estimate.mean[0]),
+                'expected_z': float(estimate.mean[1]),
+                'covered': float(estimate.contains(tip)),
                 'warned': float(bool(done.warning)),
             }
-        return figures
+        return metrics

@@ -14,14 +14,14 @@ from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_study.distribution import Distribution, distribution
 from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import PROTOCOLS, Scenario
+from needle_study.scenario import Scenario, SCENARIOS
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 #: Keys of a study file.
-_KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
+_KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 
@@ -41,7 +41,7 @@ _BELOW: Final = 1.0 - 2.0**-53
 class Study:
     """A study, as read from a file."""
 
-    protocol: Scenario
+    scenario: Scenario
     samples: int
     seed: int
     design: str  #: one of `DESIGNS`
@@ -100,7 +100,7 @@ class Study:
         return {
             'sample': np.arange(first, first + count, dtype=np.float64),
             **drawn,
-            **self.protocol.run(drawn, streams),
+            **self.scenario.run(drawn, streams),
         }
 
 
@@ -128,14 +128,14 @@ def made(document: Any) -> Study:
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)
-    kind = one_of('protocol', document.get('protocol'), PROTOCOLS)
+    kind = one_of('scenario', document.get('scenario'), SCENARIOS)
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
     design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
     if design == 'latin' and samples > _MOST_LATIN:
         raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
-    protocol = PROTOCOLS[kind](settings)
-    known = protocol.quantities
+    scenario = SCENARIOS[kind](settings)
+    known = scenario.variables
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.
     population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
@@ -148,7 +148,7 @@ def made(document: Any) -> Study:
                 f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
             )
     return Study(
-        protocol=protocol,
+        scenario=scenario,
         samples=samples,
         seed=seed,
         design=design,

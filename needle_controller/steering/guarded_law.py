@@ -55,7 +55,7 @@ class GuardedLaw:
         Number of plans so far: the number of the present depth.
     expected : TipEstimate or None
         Expected position of the tip at the target depth; a new one after each plan.
-    seen : AveragedTipMeasurement or None
+    measured : AveragedTipMeasurement or None
         The last measurement.
 
     """
@@ -72,7 +72,7 @@ class GuardedLaw:
         self._noise, self._settings, self._events = noise, settings, events
         self.step = 0
         self.expected: TipEstimate | None = None
-        self.seen: AveragedTipMeasurement | None = None
+        self.measured: AveragedTipMeasurement | None = None
         #: Largest deviation of a reading of the tip so far [m].
         self._scatter = 0.0
         #: Depth of the tip less the insertion depth, at the first measurement [m].
@@ -94,33 +94,33 @@ class GuardedLaw:
             self.law.aim(target)
         self._warned = False
 
-    def update(self, look: TipMeasurements, at: int, depth: float | None = None) -> None:
+    def update(self, readings: TipMeasurements, at: int, depth: float | None = None) -> None:
         """Pass a measurement at a depth number to the law; it may have no readings."""
-        self.seen = seen = look.average(self._noise)
-        if seen is None:
+        self.measured = measured = readings.average(self._noise)
+        if measured is None:
             self._check_sensor(None)
             with _guarded():
                 self.law.update(None, at)
             return
-        self._check_slip(seen, float(self.depths[at]) if depth is None else depth)
-        x, _, z = seen.tip.tolist()
+        self._check_slip(measured, float(self.depths[at]) if depth is None else depth)
+        x, _, z = measured.tip.tolist()
         self._check_sensor((x, z))
-        self._scatter = max(self._scatter, seen.error * sqrt(seen.readings))
-        noise = max(seen.error, self._scatter / sqrt(seen.readings))
+        self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
+        noise = max(measured.error, self._scatter / sqrt(measured.readings))
         with _guarded():
-            self.law.update(seen.tip[[0, 2]], at, noise)
+            self.law.update(measured.tip[[0, 2]], at, noise)
 
-    def _check_slip(self, seen: AveragedTipMeasurement, depth: float) -> None:
+    def _check_slip(self, measured: AveragedTipMeasurement, depth: float) -> None:
         """Compare the depth of the tip with the insertion depth [m]."""
-        ahead = float(seen.tip[1]) - depth
+        ahead = float(measured.tip[1]) - depth
         if self._ahead is None:
             self._ahead = ahead
         slipped = ahead - self._ahead
         if abs(slipped) <= self._settings.slip_tolerance:
             return
-        if seen.frozen:
+        if measured.frozen:
             raise SteeringFaultError(
-                f'the tip sensor is frozen: {seen.readings} identical readings'
+                f'the tip sensor is frozen: {measured.readings} identical readings'
             )
         raise SteeringFaultError(
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
@@ -172,11 +172,11 @@ class GuardedLaw:
 
     def outcome(self) -> tuple[str, Severity]:
         """Describe the tip at the end; a warning if it is not within 1 mm of the target."""
-        there, seen = self.expected, self.seen
-        if seen is None:
+        there, measured = self.expected, self.measured
+        if measured is None:
             return 'the needle is at the target depth; its tip is not measured', Severity.WARNING
         # The law estimates x and z from all measurements.
-        tip, half = seen.tip.copy(), np.full(3, NORMAL * max(seen.error, self._noise))
+        tip, half = measured.tip.copy(), np.full(3, NORMAL * max(measured.error, self._noise))
         if there is not None:
             tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
         x, z = np.asarray(self.law.target)

@@ -46,7 +46,7 @@ class InsertionStrategy(ABC):
         self.phase = Phase.GUIDING
         #: Stamp [ns] and insertion depth [m] at the start of rest.
         self._rest: tuple[int, float] | None = None
-        self._look: TipMeasurements | None = None
+        self._measured: TipMeasurements | None = None
         #: Stamps between which readings belong to a measurement at rest [ns].
         self._span = 0, 0
 
@@ -73,7 +73,7 @@ class InsertionStrategy(ABC):
         if self.phase is not Phase.MEASURING:
             return self._motions.resume(now)
         self.phase = Phase.INSERTING if self.law.step else Phase.GUIDING
-        self._look, self._motions.due = None, now
+        self._measured, self._motions.due = None, now
         return None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
@@ -101,33 +101,33 @@ class InsertionStrategy(ABC):
             self._rest = stamp, depth
         elif stamp - self._rest[0] >= self._settings.settle_time * NANOSECONDS:
             self.phase = Phase.MEASURING
-            self._look = TipMeasurements()
-            self._span = stamp, stamp + round(self._settings.look_time * NANOSECONDS)
+            self._measured = TipMeasurements()
+            self._span = stamp, stamp + round(self._settings.measurement_time * NANOSECONDS)
         return None
 
     def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
         """Process a reading of the tip, x, y, z [m]."""
-        if self._look is None:
+        if self._measured is None:
             return None
         since, until = self._span
         if since < stamp <= until:
-            self._look.take(tip)
+            self._measured.take(tip)
         return self._end_measurement(now) if stamp >= until else None
 
     def watch(self, now: int) -> JointMotion | None:
         """End a measurement whose last readings do not arrive."""
         timeout = self._settings.measurement_timeout
-        if self._look is not None and now > self._span[1] + timeout * NANOSECONDS:
+        if self._measured is not None and now > self._span[1] + timeout * NANOSECONDS:
             return self._end_measurement(now)
         return None
 
     def _end_measurement(self, now: int) -> JointMotion | None:
         """End a measurement of the tip, and begin the next step."""
-        look, self._look = self._look, None
-        if look is None:
+        measured, self._measured = self._measured, None
+        if measured is None:
             return None
         k = self.law.step
-        self.law.update(look, k, float(self._motions.at[0]))
+        self.law.update(measured, k, float(self._motions.at[0]))
         to = self.law.plan()
         if k == self.law.steps:
             self.phase = Phase.DONE

@@ -59,16 +59,16 @@ def describe(
             expected_tip=tuple(guarded.expected.mean.tolist()),
             expected_tip_half_width=tuple(half.tolist()),
         )
-    warning, seen = law.warning if active else '', guarded.seen
-    if seen is not None:
+    warning, measured = law.warning if active else '', guarded.measured
+    if measured is not None:
         status = replace(
             status,
-            last_measurement_readings=seen.readings,
-            last_measurement_error=seen.error,
+            last_measurement_readings=measured.readings,
+            last_measurement_error=measured.error,
         )
-        if not warning and seen.error > _SCATTERED * noise:
+        if not warning and measured.error > _SCATTERED * noise:
             warning = (
-                f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
+                f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
                 f'configured {1e3 * noise:.2f} mm (prior.noise)'
             )
     return status, warning

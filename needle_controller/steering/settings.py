@@ -49,7 +49,7 @@ class ExecutiveSettings(SteeringLimits):
         high=50.0,
     )
     settle_time: float = constant(0.1, 's', 'time at rest before a tip measurement')
-    look_time: float = constant(
+    measurement_time: float = constant(
         0.5, 's', 'duration of a tip measurement, whose readings are averaged', open_low=True
     )
     depth_tolerance: float = constant(

@@ -34,7 +34,7 @@ _DEPTH, _FORCE = 0.02, 3.0
 _MODES: Final = 'modes'
 _ONLY: Final = {
     _MODES: ('preset', 'force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
-    'steering': ('needle', 'to', 'speed', 'way', 'seed'),
+    'steering': ('needle', 'to', 'speed', 'motion', 'seed'),
 }
 
 

@@ -43,7 +43,7 @@ def add_steering(parser: argparse.ArgumentParser) -> None:
         '--speed', type=float, metavar='m/s', help=f'insertion velocity (default {SPEED:g})'
     )
     group.add_argument(
-        '--way',
+        '--motion',
         type=Path,
         metavar='FILE',
         help='table (.csv, .mat) with the columns depth and any of '
@@ -77,7 +77,7 @@ def _single(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def read_way(path: Path) -> dict[str, FloatArray]:
+def read_motion(path: Path) -> dict[str, FloatArray]:
     """Read guide, tilt and roll by depth from a table: ``depth`` and at least one of `COLUMNS`."""
     # Imported here, as the report below: the modal model does not need these 0.5 s.
     from needle_identification import RecordingError
@@ -91,12 +91,12 @@ def read_way(path: Path) -> dict[str, FloatArray]:
             f'{path} must have the columns depth and any of {", ".join(COLUMNS)}; it has '
             f'{", ".join(read.columns)}'
         )
-    way = {name: column_values(read, name, column, []) for name, column in found.items()}
-    if not all(np.isfinite(values).all() for values in way.values()):
+    motion = {name: column_values(read, name, column, []) for name, column in found.items()}
+    if not all(np.isfinite(values).all() for values in motion.values()):
         raise RecordingError(f'{path} has values that are not numbers')
-    if len(way['depth']) < 1 or not (np.diff(way['depth']) > 0.0).all():
+    if len(motion['depth']) < 1 or not (np.diff(motion['depth']) > 0.0).all():
         raise RecordingError(f'{path}: depth must increase from row to row')
-    return way
+    return motion
 
 
 def run_steering(options: argparse.Namespace) -> int:
@@ -119,13 +119,13 @@ def run_steering(options: argparse.Namespace) -> int:
             f'--to must be beyond --depth, {start:g} m, with at most {_MOST} samples of '
             f'--interval, got {to!r} m and {interval!r} s'
         )
-    way = read_way(options.way) if options.way is not None else {}
+    motion = read_motion(options.motion) if options.motion is not None else {}
     one = Insertion(needle, steering, depth=start, seed=options.seed or 0)
     recorder = report.InsertionRecord(one)
     while one.depth < to:
         # The first interval accelerates to the speed, the last ends at the target depth.
         ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
-        at = {key: float(np.interp(ahead, way['depth'], way[key])) for key in way}
+        at = {key: float(np.interp(ahead, motion['depth'], motion[key])) for key in motion}
         duration = interval
         if ahead == to:
             duration = max(2.0 * (to - one.depth) / (one.velocity + speed), 1e-9)

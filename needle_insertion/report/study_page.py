@@ -51,11 +51,11 @@ _WORST: Final = 10  #: number of worst samples in the list
 def write_study(results: Results, path: Path) -> None:
     """Write the page of a study whose table is complete."""
     study, table = results.study, results.table
-    figures, drawn = study.protocol.figures, list(study.population)
-    main = next(iter(figures))
+    metrics, drawn = study.scenario.metrics, list(study.population)
+    main = next(iter(metrics))
     values = column(table, main, _MOST)
     probabilities, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
-    for name, one in figures.items():
+    for name, one in metrics.items():
         if not one.unit:
             probabilities[name] = probability(batches(table, name))
             continue
@@ -70,8 +70,8 @@ def write_study(results: Results, path: Path) -> None:
     most = {name: column(table, name, _MOST) for name in order[:2]}
     bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
     of_bad = {name: picked(table, name, bad) for name in listed}
-    units = {name: study.protocol.quantities[name].unit for name in drawn}
-    units[main] = figures[main].unit
+    units = {name: study.scenario.variables[name].unit for name in drawn}
+    units[main] = metrics[main].unit
     limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
     sections = [
         _section(
@@ -79,7 +79,7 @@ def write_study(results: Results, path: Path) -> None:
             ('95 % intervals by the method of Wilson.', _MISSING),
             ('metric', 'probability', '95 % interval', 'samples', 'meaning'),
             [
-                (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
+                (name, *_rounded(one, '%'), str(one.samples), metrics[name].meaning)
                 for name, one in probabilities.items()
                 if np.isfinite(one.value)
             ],
@@ -89,7 +89,7 @@ def write_study(results: Results, path: Path) -> None:
             ('With distribution-free 95 % intervals.', _MISSING, *limited),
             ('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
             quantiles,
-            pictures=(_distribution(main, figures[main], values),),
+            pictures=(_distribution(main, metrics[main], values),),
         ),
     ]
     if drawn:
@@ -104,11 +104,11 @@ def write_study(results: Results, path: Path) -> None:
                 ),
                 ('variable', main, 'meaning'),
                 [
-                    (name, _share(shares[name]), study.protocol.quantities[name].meaning)
+                    (name, _share(shares[name]), study.scenario.variables[name].meaning)
                     for name in order
                 ],
                 'Shares of the variance',
-                _map(main, figures[main], values, most, study),
+                _map(main, metrics[main], values, most, study),
             )
         )
     sections.append(
@@ -233,7 +233,7 @@ def _map(
         place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
         inside &= (of >= low) & (of <= high)
         cells = count * cells + place
-        unit = study.protocol.quantities[one].unit
+        unit = study.scenario.variables[one].unit
         heads.append(_head(one, unit))
         edges.append(_shown(unit)[1] * at)
     cells[~inside] = last = count * count

@@ -52,7 +52,7 @@ STEERING: Final[dict[str, object]] = {
     'speed': SPEED,
     'guide_speed': 0.02,
     'settle_time': 0.05,
-    'look_time': 0.25,
+    'measurement_time': 0.25,
     'prior.noise': 6e-5,
 }
 

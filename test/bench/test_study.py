@@ -15,7 +15,7 @@ import yaml
 
 #: Few short insertions, with a fast controller.
 SMALL = {
-    'protocol': 'steering',
+    'scenario': 'steering',
     'samples': 1,
     'seed': 3,
     'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},

@@ -39,7 +39,7 @@ def by_study(truth: GroundTruth, seed: int) -> FloatArray:
         values |= {f'{name}_{axis}': getattr(truth, name)[k] for k, axis in enumerate('xz')}
     values |= {'target_x': TARGET[0], 'target_z': TARGET[2]}
     study = made({
-        'protocol': 'steering', 'samples': 1, 'seed': seed,
+        'scenario': 'steering', 'samples': 1, 'seed': seed,
         'settings': {'depth': TARGET[1], 'prior': asdict(PRIOR)},
         'population': {name: float(value) for name, value in values.items()},
     })  # fmt: skip

@@ -72,7 +72,7 @@ def test_own_law_steers_in_the_command(capsys: pytest.CaptureFixture[str]) -> No
 def test_own_law_steers_in_a_study() -> None:
     """Bit-identical to the same needles inserted alone."""
     study = made({
-        'protocol': 'steering', 'samples': 8, 'seed': 3, 'settings': {'law': OWN},
+        'scenario': 'steering', 'samples': 8, 'seed': 3, 'settings': {'law': OWN},
         'population': {'target_x': {'uniform': [-0.002, 0.002]}, 'tilt_z': {'normal': [0, 0.01]}},
     })  # fmt: skip
     found = study.rows(0, 8)

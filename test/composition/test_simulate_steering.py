@@ -29,7 +29,7 @@ def test_identification_recovers_the_constants(
     way.write_text(WAY)
     steering = ['--model', 'steering', '--set', 'bevel_load=0.4', '--set', 'cutting_force=0.8']
     found, _ = said(
-        capsys, *steering, '--way', str(way), '-o', str(run), '-o', str(picture), '--json'
+        capsys, *steering, '--motion', str(way), '-o', str(run), '-o', str(picture), '--json'
     )
     # Rounding, over two hundred intervals.
     assert found['depth at the end [m]'] == pytest.approx(0.1, abs=1e-12)
@@ -79,7 +79,7 @@ def test_membranes_start_depth_and_seed_take_effect(capsys: pytest.CaptureFixtur
         (['--model', 'steering', '--seed', '-1'], 'seed must be an integer >= 0, got -1'),
         (['--model', 'steering', '--set', 'modes=3'], "unknown parameter 'modes'; valid: area"),
         (['--model', 'steering', '-o', 'bag'], 'must be .csv or .png'),
-        (['--model', 'steering', '--way', 'none.csv'], 'none.csv cannot be read'),
+        (['--model', 'steering', '--motion', 'none.csv'], 'none.csv cannot be read'),
     ],
 )
 def test_invalid_input_is_named(
@@ -101,5 +101,5 @@ def test_invalid_guide_tables_are_named(
 ) -> None:
     way = tmp_path / 'way.csv'
     way.write_text(text)
-    words = ['--model', 'steering', '--way', str(way)]
+    words = ['--model', 'steering', '--motion', str(way)]
     assert complaint in said(capsys, *words, status=2)[1]

@@ -38,7 +38,7 @@ import yaml
 
 #: Small study: few needles, few steps.
 SMALL: dict[str, Any] = {
-    'protocol': 'steering',
+    'scenario': 'steering',
     'samples': 40,
     'seed': 3,
     'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
@@ -144,7 +144,7 @@ def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
     names = ('target_x', 'target_z', 'tilt_x')
     population = {name: {'uniform': [0.0, 0.5]} for name in names}
     drawn = made(
-        {'protocol': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
+        {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
          'population': population}
     ).draw(range(samples))  # fmt: skip
     strata = np.array([np.floor(drawn[name] / 0.5 * samples) for name in names])
@@ -336,7 +336,7 @@ def test_maps_include_samples_at_their_edges() -> None:
     study, rng = made(SMALL), np.random.default_rng(3)
     over = {name: rng.integers(0, 2, 4000).astype(float) for name in ('tilt_z', 'skin')}
     values = over['tilt_z'] + 2.0 * over['skin']
-    [picture] = page._map('miss', study.protocol.figures['miss'], values, over, study)
+    [picture] = page._map('miss', study.scenario.metrics['miss'], values, over, study)
     cells = picture.figure.axes[0].collections[0].get_array()
     seen = np.ma.masked_invalid(cells).compressed()
     assert sorted(seen) == pytest.approx([0.0, 1e3, 2e3, 3e3])
@@ -348,8 +348,8 @@ def test_quantiles_at_zero_and_one_are_finite(monkeypatch: pytest.MonkeyPatch) -
     for part in (0.0, 1.0):
         monkeypatch.setattr(Study, '_parts', lambda *_, at=part: np.full((3, 5), at))
         for name, values in study.draw(range(3)).items():
-            quantity = study.protocol.quantities[name]
-            assert ((values >= quantity.low) & (values <= quantity.high)).all()
+            variable = study.scenario.variables[name]
+            assert ((values >= variable.low) & (values <= variable.high)).all()
 
 
 def test_a_study_is_locked_by_one_process(
@@ -452,7 +452,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'protocol': 'fishing'}, "protocol must be one of steering, insertion, got"),
+        ({'scenario': 'fishing'}, "scenario must be one of steering, insertion, got"),
         ({'sample': 3}, "unknown parameter 'sample'"),
         ({'samples': 0}, 'samples must be a whole number from 1 to'),
         ({'seed': True}, 'seed must be a whole number from 0'),
@@ -471,7 +471,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'population': {'skin': {'gamma': [1, 1.0e+90]}}}, 'gamma must have mean > 0, standard'),
         ({'population': {'tilt_x': 10**400}}, 'tilt_x must be a number or one of'),
         ({'population': {'tilt_x': {'normal': [0, 10**400]}}}, 'takes finite numbers up to 1e+1'),
-        ({'population': {'look_noise': {'lognormal': [1, 1000]}}}, 'look_noise must be finite'),
+        ({'population': {'tip_noise': {'lognormal': [1, 1000]}}}, 'tip_noise must be finite'),
         ({'correlations': [['skin', 'tilt_z', 1]]}, 'value between -1 and 1'),
         ({'correlations': [['skin', 'tilt_z', 0.5], ['tilt_z', 'skin', 0.1]]}, 'skin twice'),
         ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
@@ -495,7 +495,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'settings': {'prior': {'nose': 1}}}, "unknown parameter 'settings.prior.nose'"),
         ({'settings': 1}, 'settings must be names with values, got 1'),
         ({'population': [1]}, 'population must be names with values, got [1]'),
-        ({'protocol': ['steering']}, 'protocol must be one of steering, insertion, got'),
+        ({'scenario': ['steering']}, 'scenario must be one of steering, insertion, got'),
         ({'design': ['sobol']}, 'design must be one of sobol, random, latin, got'),
     ],
 )  # fmt: skip

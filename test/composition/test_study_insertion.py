@@ -21,7 +21,7 @@ from needle_identification import message_counts, read_topic
 from needle_insertion.cli import main
 from needle_ros.process_pool import processes
 from needle_study.engine import compute, Results
-from needle_study.insertion import CONTROLLERS, FIGURES
+from needle_study.insertion import CONTROLLERS, METRICS
 from needle_study.study import made
 from needle_study.summary import column
 import numpy as np
@@ -47,7 +47,7 @@ POPULATION: dict[str, Any] = {
     'late': {'choice': [0, 2]},
 }
 SMALL: dict[str, Any] = {
-    'protocol': 'insertion',
+    'scenario': 'insertion',
     'samples': 24,
     'seed': 5,
     'settings': {'wait': 0.5},
@@ -57,10 +57,10 @@ SMALL: dict[str, Any] = {
 
 def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, float]:
     """Return the metrics of one sample with given values."""
-    protocol = made({**SMALL, 'settings': settings or {}, 'population': {}}).protocol
+    scenario = made({**SMALL, 'settings': settings or {}, 'population': {}}).scenario
     rows = {name: np.array([value]) for name, value in drawn.items()}
-    found = protocol.run(rows, [np.random.default_rng(1)])
-    assert list(found) == list(FIGURES)
+    found = scenario.run(rows, [np.random.default_rng(1)])
+    assert list(found) == list(METRICS)
     return {name: float(values[0]) for name, values in found.items()}
 
 
@@ -204,10 +204,10 @@ def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, 
     study = made({**SMALL, 'settings': settings, 'population': {}})
     drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
     rows = {name: np.array([value]) for name, value in drawn.items()}
-    found = study.protocol.run(rows, [study.rng(0, 1)])
+    found = study.scenario.run(rows, [study.rng(0, 1)])
     guard = Guard(SafetyLimits(**limits), (PHANTOM.minimum_depth, PHANTOM.length))
     said: list[bool] = []
-    for topic, _, values in study.protocol.replay(drawn, study.rng(0, 1)):
+    for topic, _, values in study.scenario.replay(drawn, study.rng(0, 1)):
         if topic.name == 'joint_states':
             measured = Measurement(time=0.0, depth=values[0], velocity=values[2])
             beyond = [guard.encoders(measured)]
@@ -241,7 +241,7 @@ def test_replayed_bag_matches_the_table(
     counts = message_counts(bag)
     assert set(counts) == {'/joint_states', '/tip_deflection', '/wrench_command', '/target'}
     assert counts['/joint_states'] == counts['/tip_deflection'] == counts['/wrench_command'] + 1
-    row = {name: column(table, name)[number] for name in (*FIGURES, 'target')}
+    row = {name: column(table, name)[number] for name in (*METRICS, 'target')}
     ((_, target),) = read_topic(bag, '/target')
     assert target.point.y == row['target']
     tips = np.array([[m.point.y, m.point.z] for _, m in read_topic(bag, '/tip_deflection')])

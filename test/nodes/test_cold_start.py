@@ -42,7 +42,7 @@ STEERING = {
     'speed': 0.05,
     'guide_speed': 0.05,
     'acceleration': 0.4,
-    'look_time': 0.15,
+    'measurement_time': 0.15,
     'settle_time': 0.02,
     'measurement_timeout': 5.0,
 }

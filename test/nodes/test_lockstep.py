@@ -346,7 +346,7 @@ def steer(
             return sample.time < end
 
         nodes: dict[str, dict[str, Any]] = {
-            'steering': {**common, 'speed': 0.02, 'look_time': 0.2, **(steering or {})},
+            'steering': {**common, 'speed': 0.02, 'measurement_time': 0.2, **(steering or {})},
             'controller': {
                 **common, 'rate': RATE, 'steered': True, 'deflection_feedback': 'none',
                 'reference.speed': 0.02, 'reference.acceleration': 0.5,

@@ -200,7 +200,7 @@ def test_tip_is_steered_to_a_target(ros_graph: RosGraph, tmp_path: Path) -> None
         tmp_path / 'run',
         ['target 1mm 31mm -0.5mm', 'wait', 'status', 'retract', 'wait'],
         '--steering',
-        '-p', 'steering.look_time=0.3',
+        '-p', 'steering.measurement_time=0.3',
         '-p', 'steering.patience=60',
         '-p', 'steering.measurement_timeout=5',
     )  # fmt: skip

@@ -96,7 +96,7 @@ def test_miss_in_depth_is_a_warning() -> None:
 @pytest.mark.requirement('S-124')
 def test_late_and_lost_readings_are_tolerated() -> None:
     """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
-    robot = Robot(replace(SETTINGS, look_time=0.5))
+    robot = Robot(replace(SETTINGS, measurement_time=0.5))
     robot.late = 66_000_000
     lost = np.random.default_rng(5)
     robot.sees = lambda tip: tip if robot.now // PERIOD % 4 == 0 and lost.random() > 0.05 else None
@@ -562,7 +562,13 @@ def test_motions_stay_within_limits_for_any_input(
 ) -> None:
     """Each motion ends within guide limit and target depth, never NaN."""
     robot = Robot(
-        replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0, continuous=continuous)
+        replace(
+            SETTINGS,
+            measurement_time=0.05,
+            step_length=0.02,
+            settle_time=0.0,
+            continuous=continuous,
+        )
     )
     moves: list[JointMotion] = []
     follow = robot.follow

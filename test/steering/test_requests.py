@@ -35,10 +35,10 @@ from support.steered_robot import CONTINUOUS, NEEDLE, PERIOD, Robot, SECOND, SET
 from support.steered_robot import TARGET as POINT
 
 #: Quick: a tenth of the readings and of the ticks.
-QUICK = replace(SETTINGS, look_time=0.1, settle_time=0.02, step_length=0.015, speed=0.03,
+QUICK = replace(SETTINGS, measurement_time=0.1, settle_time=0.02, step_length=0.015, speed=0.03,
                 guide_speed=0.05, acceleration=0.5)  # fmt: skip
 QUICK_CONTINUOUS = replace(CONTINUOUS, step_length=0.015, speed=0.02, guide_speed=0.05,
-                           acceleration=0.5, look_time=0.1)  # fmt: skip
+                           acceleration=0.5, measurement_time=0.1)  # fmt: skip
 
 #: Approximate number of messages of an insertion by topic: sampled topics have many.
 FEW = {'joint_trajectory': 40, 'diagnostics': 60, 'joint_states': 800, 'tip_deflection': 800}

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
-SETTINGS = ExecutiveSettings(look_time=0.2)
+SETTINGS = ExecutiveSettings(measurement_time=0.2)
 #: Period of the robot and its tracker [ns].
 PERIOD = 10_000_000
 SECOND = 100 * PERIOD
