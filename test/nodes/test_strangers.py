@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from typing import Any
+
 from benchmarks.strangers import ASKER, Bystander, LIAR, NEXT, PUSHER
+from geometry_msgs.msg import WrenchStamped
+from needle_dynamics.plant_node import PlantNode
+from needle_ros.base_node import COMMAND, profile
+from needle_ros.contract import COMMANDER, WRENCH_COMMAND
+from needle_ros.publishers_node import Publishers
 from needle_ros.status import ControllerStatus, NodeStatus, PlantStatus
 import pytest
+from rclpy.event_handler import SubscriptionEventCallbacks
+from std_msgs.msg import Empty
 from support.ros_graph import RosGraph
 
 #: Attempts of each node.
@@ -61,3 +72,45 @@ def test_command_flood_does_not_move_the_needle(ros_graph: RosGraph) -> None:
     assert moved < 1e-3
     bystander.goes_to(NEXT)
     assert bystander.stops == {0}
+
+
+#: Offers the lease of a commander, and publishes no commands.
+LEASE = """
+import rclpy, time
+from needle_ros.base_node import profile
+from needle_ros.contract import COMMANDER
+from std_msgs.msg import Empty
+rclpy.init()
+lease = rclpy.create_node('lease').create_publisher(Empty, COMMANDER.name, profile(COMMANDER.qos))
+time.sleep(120)
+"""
+
+
+@pytest.mark.requirement('S-221')
+def test_lease_without_commands_hides_no_commander(ros_graph: RosGraph) -> None:
+    """When it expires, the commanders in other processes still count."""
+    probe, expired, changes = ros_graph.node('probe'), list[int](), list[Any]()
+    for _ in range(2):
+        probe.create_publisher(WrenchStamped, WRENCH_COMMAND.name, COMMAND)
+    probe.create_subscription(
+        Empty,
+        COMMANDER.name,
+        lambda _message: None,
+        profile(COMMANDER.qos),
+        event_callbacks=SubscriptionEventCallbacks(
+            liveliness=lambda event: expired.append(event.not_alive_count)
+        ),
+    )
+    plant = ros_graph.add(PlantNode, parameters={'rate': 200.0})
+    commanders = Publishers(plant, COMMANDER, lambda: changes.append(None))
+    ros_graph.spin_until(lambda: commanders.count(WRENCH_COMMAND) == 2, 'the commanders')
+    other = subprocess.Popen([sys.executable, '-c', LEASE], env=ros_graph.environment)
+    try:
+        ros_graph.spin_until(lambda: changes and expired, 'the lease')
+    finally:
+        other.kill()
+        other.wait()
+    ros_graph.spin_until(lambda: expired[-1] == 1 and len(changes) > 1, 'its end')
+    assert probe.count_publishers(COMMANDER.name) == 1
+    assert commanders.count(WRENCH_COMMAND) == 2
+    ros_graph.spin_until(lambda: plant.diagnose().status.commanders == 2, 'the report')
