@@ -89,7 +89,11 @@ time.sleep(120)
 @pytest.mark.requirement('S-221')
 def test_lease_without_commands_hides_no_commander(ros_graph: RosGraph) -> None:
     """When it expires, the commanders in other processes still count."""
-    probe, expired, changes = ros_graph.node('probe'), list[int](), list[Any]()
+    probe, changes, expired = ros_graph.node('probe'), list[None](), list[int]()
+
+    def on_liveliness(event: Any) -> None:
+        expired.append(event.not_alive_count)
+
     for _ in range(2):
         probe.create_publisher(WrenchStamped, WRENCH_COMMAND.name, COMMAND)
     probe.create_subscription(
@@ -97,9 +101,7 @@ def test_lease_without_commands_hides_no_commander(ros_graph: RosGraph) -> None:
         COMMANDER.name,
         lambda _message: None,
         profile(COMMANDER.qos),
-        event_callbacks=SubscriptionEventCallbacks(
-            liveliness=lambda event: expired.append(event.not_alive_count)
-        ),
+        event_callbacks=SubscriptionEventCallbacks(liveliness=on_liveliness),
     )
     plant = ros_graph.add(PlantNode, parameters={'rate': 200.0})
     commanders = Publishers(plant, COMMANDER, lambda: changes.append(None))
