@@ -51,6 +51,9 @@ STDERR, LIMIT = pytest.StashKey[int](), pytest.StashKey[float]()
 # Python processes started by tests print the stacks of their threads on SIGABRT.
 os.environ['PYTHONFAULTHANDLER'] = '1'
 
+# Deprecated: rcl warns about it on standard error, and ignores other settings.
+os.environ.pop('ROS_LOCALHOST_ONLY', None)
+
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
