@@ -20,7 +20,8 @@ from tools.safety_file import RESULTS
 settings.register_profile('tests', deadline=None)
 settings.load_profile('tests')
 
-#: Files whose tests share expensive fixtures: each file runs in one process.
+#: Files whose tests share expensive fixtures, or need most of a machine: each file runs in one
+#: process.
 WHOLE = {
     'test/bench/test_graph.py',
     'test/bench/test_calibration.py',
@@ -28,6 +29,7 @@ WHOLE = {
     'test/composition/test_experiment.py',
     'test/composition/test_reproduce.py',
     'test/nodes/test_package.py',
+    'test/nodes/test_strangers.py',
     'test/test_layouts.py',
 }
 
