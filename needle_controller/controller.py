@@ -13,6 +13,7 @@ from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDyna
 from needle_controller.laws.law import Law, SampledLoop
 from needle_controller.laws.pid import Pid, PidGains
 from needle_controller.reference.generator import ReferenceGenerator
+from needle_controller.reference.hold import ReferenceHold
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.safety.displacement_monitor import DisplacementMonitor
 from needle_controller.stability import check_stability, Limit, MARGIN
@@ -217,6 +218,7 @@ class Controller:
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
+        self._hold = ReferenceHold(self.guide, self.period, self.delay)
         longest = settings.measurement_timeout + self.period
         self._displacement = DisplacementMonitor(settings.jump, longest)
         self._last_depth: float | None = None
@@ -379,7 +381,9 @@ class Controller:
         self._insertion.unwind()
         self._rotation.unwind()
 
-    def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
+    def command(
+        self, measured: Measurement, load: float = 0.0, age: float = 0.0
+    ) -> ControllerOutput:
         """
         Return the command that answers a measurement.
 
@@ -387,6 +391,8 @@ class Controller:
         ----------
         measured, load
             As for `Commander.command`.
+        age : float
+            Age of the measurement [s].
 
         Returns
         -------
@@ -418,18 +424,19 @@ class Controller:
             return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
             )
-        now = self.guide.at(measured.time, measured.depth)
+        loop, depth, velocity = self._insertion, measured.depth, measured.velocity
+        sample = measured.time, depth, velocity, measured.force
+        if self._hold.measure(sample, age, loop.law.axis.coulomb):
+            (loop.unwind if self._hold.missing else loop.stop)()
+        now = self.guide.at(measured.time, depth, velocity)
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
         torque = 0.0
         if self.settings.rotation:
             angle, rest = measured.angle, Setpoint(0.0)
             torque = self._rotation.command(angle, measured.angular_velocity, rest)
-        return ControllerOutput(
-            force=self._insertion.command(measured.depth, measured.velocity, ahead, load),
-            torque=torque,
-            setpoint=now,
-            notice=notice,
-        )
+        force = loop.command(depth, velocity, ahead, load)
+        self._hold.command(now, depth, force, loop.limit)
+        return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
 
     def _returned(self, measured: Measurement) -> str | None:
         """Clear the target if the needle moved during a fault; return a message then."""

@@ -356,7 +356,7 @@ class Supervisor(StateMachine[ForceCommand]):
             except NeedleError as error:
                 self._warn('observer', f'observer: {error}')
             self._warn('doubt', self.bending.warning)
-        return self._answer(controller, stamp, measured)
+        return self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
 
     def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
@@ -366,14 +366,14 @@ class Supervisor(StateMachine[ForceCommand]):
         return self._command(ForceCommand(stamp))
 
     def _answer(
-        self, controller: Controller, stamp: int, measured: Measurement
+        self, controller: Controller, stamp: int, measured: Measurement, age: float
     ) -> ForceCommand | None:
         safety = self.safety
         if safety.stop is not None:
             return self._command(ForceCommand(stamp))
         if safety.duplicate_publishers is not None:
             return self._release_for(safety.duplicate_publishers, stamp)
-        command = controller.command(measured, self.bending.load)
+        command = controller.command(measured, self.bending.load, age)
         if command.fault is not None:
             return self._release_for(command.fault, stamp)
         if command.refusal is not None or not command.is_finite():
@@ -386,12 +386,11 @@ class Supervisor(StateMachine[ForceCommand]):
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         force, depth = self._last.force, measured.depth
-        lost = self._following.update(stamp, depth, aim.position, force, measured.force)
+        lost = self._following.update(stamp, depth, aim.velocity, force, measured.force)
         stopped = self._stop_for(safety.guard.tracking(error[0]) or self._following.fault, stamp)
         if stopped is not None:
             return stopped
-        if lost != controller.guide.waits:
-            controller.guide.wait(lost)
+        controller.guide.waits = lost
         if lost:
             controller.unwind()
             self._log_fault(
@@ -454,7 +453,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._waiting.discard(self.fault or 'no force is commanded')
         if self.controller is not None:
             self._following.forget()
-            self.controller.guide.wait(False)
+            self.controller.guide.waits = False
             self.controller.release()
         return self._command(ForceCommand(stamp))
 

@@ -57,20 +57,21 @@ def run_loop(  # noqa: C901
     ``state``, shape (2 (2 + n),), takes the final state; ``law`` has the fields of `LawConstants`,
     ``limit`` is the largest force. For each of k commands ``setpoints``, shape (k, 3), has
     position, velocity and acceleration; ``goal``, shape (k + 1,), the reference at the times of
-    the measurements. ``pending``, shape (delay,), are commands without effect so far, updated, of
-    which the law compensates the newest ``known``. ``noise``, shape (k, 3) or (0, 3), has errors
-    of the measured position and velocity, and additional force. ``added``, shape (m, 3), has
-    insertion depths above which Coulomb friction [N] and viscous friction [N s/m] are added, until
-    the next row. ``longest`` is the longest step [s].
+    the measurements. While the force is at its limit towards the last setpoint the reference
+    waits, as in `ReferenceHold`. ``pending``, shape (delay,), are commands without effect so far,
+    updated, of which the law compensates the newest ``known``. ``noise``, shape (k, 3) or (0, 3),
+    has errors of the measured position and velocity, and additional force. ``added``, shape
+    (m, 3), has insertion depths above which Coulomb friction [N] and viscous friction [N s/m] are
+    added, until the next row. ``longest`` is the longest step [s].
 
     Outputs, the first three unused if empty: at the measurements ``depths``, shape (k + 1,), and
     ``states``, shape (k + 1, 2 (2 + n)); ``commands``, shape (k,); ``errors``, shape (3,), goal
-    minus insertion depth: last, largest in modulus, and mean square [m^2].
+    without waits minus insertion depth: last, largest in modulus, and mean square [m^2].
     """
     memory, none = np.zeros(MEMORY), np.empty((0, 3))
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
-    largest, squares, acts = 0.0, 0.0, 0.0
+    largest, squares, acts, waited = 0.0, 0.0, 0.0, 0
     for k in range(count + 1):
         depth, velocity = c.length - state[0], -state[m]
         if depths.shape[0] > 0:
@@ -89,9 +90,12 @@ def run_loop(  # noqa: C901
         law_learn(law, memory, depth, velocity, acts)
         for i in range(delay - known, delay):
             depth, velocity = axis_step(law, depth, velocity, pending[i])
-        aim = setpoints[k]
+        aim = setpoints[k - waited]
         instant = (depth, velocity, aim[0], aim[1], aim[2])
         command = law_step(law, memory, instant, 0.0, limit)
+        to_go = setpoints[count - 1, 0] - goal[k - waited]
+        if abs(command) >= limit and command * to_go > 0.0:
+            waited += 1
         if commands.shape[0] > 0:
             commands[k] = command
         # Force of this period according to the law.

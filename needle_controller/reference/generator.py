@@ -31,9 +31,9 @@ class ReferenceGenerator:
         if kind not in REFERENCES:
             raise ParameterError(f'unknown reference {kind!r}; valid: {", ".join(REFERENCES)}')
         self._kind = REFERENCES[kind]
-        self._limits, self._depths = limits, depths
+        self.limits, self._depths = limits, depths
         self._motion: Reference | None = None
-        self._start = self._now = 0.0
+        self._start = self.now = 0.0
         #: Elapsed time of the path at the last change [s].
         self._passed = 0.0
         self.forget()
@@ -43,8 +43,8 @@ class ReferenceGenerator:
         #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
         self._path: Path | None = None
-        #: Whether it is paused, and whether it waits for a plant that does not follow.
-        self.paused = self.waits = False
+        #: Whether it is paused, waits for a plant that does not follow, or holds one setpoint.
+        self.paused = self.waits = self.held = False
         self.release()
 
     def release(self) -> None:
@@ -56,7 +56,7 @@ class ReferenceGenerator:
     def _mark(self) -> None:
         """Store the elapsed time of the path."""
         if isinstance(self._motion, Joined) and self._motion.path is self._path:
-            self._passed = max(self._now - self._start - self._motion.offset, self._passed)
+            self._passed = max(self.now - self._start - self._motion.offset, self._passed)
 
     @property
     def moves(self) -> bool:
@@ -77,40 +77,35 @@ class ReferenceGenerator:
         velocities: Sequence[float] | None = None,
     ) -> None:
         """Follow a path from now on, with times relative to now [s]; see `Path`."""
-        path = Path(times, positions, velocities, self._limits, self._depths)
+        path = Path(times, positions, velocities, self.limits, self._depths)
         self.target, self._path, self._passed = path.last, path, 0.0
         self._replan()
 
     def pause(self) -> None:
         """Brake to rest within the limits and hold the position."""
-        self._set_pause(True, self.waits)
+        if not self.paused:
+            self.paused, self._change = True, self._brake
 
     def resume(self) -> None:
         """Continue to the target, or along the path from the position of the pause."""
-        self._set_pause(False, self.waits)
-
-    def wait(self, waits: bool) -> None:
-        """Brake and hold while the plant does not follow (``waits``), or continue."""
-        self._set_pause(self.paused, waits)
-
-    def _set_pause(self, paused: bool, waits: bool) -> None:
-        before = self.paused or self.waits
-        self.paused, self.waits = paused, waits
-        if before != (paused or waits):
-            self._change = self._plan if before else self._brake
+        if self.paused:
+            self.paused, self._change = False, self._plan
 
     def _replan(self) -> None:
         # A new target does not end a pause.
-        if not (self.paused or self.waits):
+        if not self.paused:
             self._change = self._plan
 
-    def at(self, time: float, depth: float) -> Setpoint:
-        """Return the setpoint at a time [s]; a new motion starts at the needle's depth [m]."""
-        self._now = time
+    def at(self, time: float, depth: float, velocity: float = 0.0) -> Setpoint:
+        """Return the setpoint at a time [s]; a new motion starts at the needle [m, m/s]."""
+        if self.held or self.waits:
+            self._start += time - self.now
+        self.now, self.held = time, False
         if self._change is not None:
             # A step has no intermediate position.
             anew = self._motion is None or isinstance(self._motion, Step)
-            now = Setpoint(depth) if anew else self.ahead(time)
+            rate = min(max(velocity, -self.limits.speed), self.limits.speed)
+            now = Setpoint(depth, rate) if anew else self.ahead(time)
             self._mark()
             change, self._change = self._change, None
             self._motion, self._start = change(now), time
@@ -121,21 +116,21 @@ class ReferenceGenerator:
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
 
     def _plan(self, now: Setpoint) -> Reference:
-        if self.paused or self.waits:
+        if self.paused:
             return self._brake(now)
         if self._path is not None:
             if self._kind is not MinimumJerk:
                 now = Setpoint(now.position, now.velocity)
-            return Joined(now, self._path, self._passed, self._limits)
+            return Joined(now, self._path, self._passed, self.limits)
         target = now.position if self.target is None else self.target
         if self._kind is MinimumJerk:
-            return MinimumJerk(now, target, self._limits, self._depths)
-        return self._kind(now, target, self._limits)
+            return MinimumJerk(now, target, self.limits, self._depths)
+        return self._kind(now, target, self.limits)
 
     def _brake(self, now: Setpoint) -> Reference:
         """Stop within the acceleration limit, without passing the end of the motion."""
         stop = halt if self._kind is MinimumJerk else brake
-        motion: Reference = stop(now, self._limits, self._depths)
+        motion: Reference = stop(now, self.limits, self._depths)
         if self._path is not None:
             # Half of the braking time: the time of the path to the same position.
             self._passed += 0.5 * motion.duration

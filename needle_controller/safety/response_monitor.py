@@ -25,11 +25,10 @@ _STRONGER, _RESTING = 1.5, 4.0
 
 
 class _Mark(NamedTuple):
-    """Stamp [ns], insertion depth and reference depth [m] at the start of a lack of response."""
+    """Stamp [ns] and insertion depth [m] at the start of a lack of response."""
 
     stamp: int
     depth: float
-    aim: float
 
 
 class StallMonitor:
@@ -47,19 +46,18 @@ class StallMonitor:
     def forget(self) -> None:
         """Expect motion from the next measurement on."""
         self._stamp: int | None = None
-        self._depth = self._velocity = self._expected = self._aim = 0.0
+        self._depth = self._velocity = self._expected = 0.0
 
-    def update(self, stamp: int, depth: float, aim: float, force: float) -> str | None:
+    def update(self, stamp: int, depth: float, rate: float, force: float) -> str | None:
         """
         Process a measurement at a stamp [ns] and the force [N] that acted before it.
 
-        Takes insertion depth and reference depth [m].
+        Takes insertion depth [m] and velocity of the reference [m/s].
 
         Returns the fault, or None.
         """
         before, self._stamp = self._stamp, stamp
-        factor = _RESTING if aim == self._aim else _STRONGER
-        axis, self._aim = self.axis, aim
+        factor, axis = _RESTING if rate == 0.0 else _STRONGER, self.axis
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
         push = abs(force) - factor * axis.coulomb
         if not 0.0 < elapsed < _GAP or push <= 0.0 or self._expected * force < 0.0:
@@ -110,28 +108,29 @@ class ResponseMonitor:
         self._stall.forget()
 
     def update(
-        self, stamp: int, depth: float, aim: float, commanded: float, reported: float
+        self, stamp: int, depth: float, rate: float, commanded: float, reported: float
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
-        Takes insertion depth and reference depth [m], and the last commanded and the reported
-        force [N]; the latter is NaN if the robot reports none.
+        Takes insertion depth [m], velocity of the reference [m/s], also while it waits, and the
+        last commanded and the reported force [N]; the latter is NaN if the robot reports none.
         """
         applied = commanded if isnan(reported) else reported
-        self.fault = self._stall.update(stamp, depth, aim, applied)
+        self.fault = self._stall.update(stamp, depth, rate, applied)
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
             self.lost, self._mark = False, None
             return False
         if self._mark is None:
-            self._mark = _Mark(stamp, depth, aim)
+            self._mark = _Mark(stamp, depth)
         mark = self._mark
-        moved = abs(depth - mark.depth) > _NOTHING * abs(aim - mark.aim)
+        elapsed = min(stamp - mark.stamp, _PATIENCE) / NANOSECONDS
+        moved = abs(depth - mark.depth) > _NOTHING * abs(rate) * elapsed
         if self.lost and moved:
             self.lost, self._mark = False, None
         elif not self.lost and stamp - mark.stamp > _PATIENCE:
-            self.lost = not moved and aim != mark.aim
+            self.lost = not moved and rate != 0.0
             if not self.lost:
                 self._mark = None
         return self.lost

@@ -149,8 +149,8 @@ def test_forces_stay_within_their_limit() -> None:
     steering = controller(force_limit=2.0)
     steering.set_target(0.2)
     forces = [
-        steering.command(Measurement(time=i * 0.1, depth=0.02, velocity=0.0)).force
-        for i in range(99)
+        steering.command(Measurement(time=i * PERIOD, depth=0.02, velocity=0.0)).force
+        for i in range(999)
     ]
     assert max(forces) == 2.0
 

@@ -1,0 +1,146 @@
+"""The reference waits for the needle: stalls, commands without effect, force at its limit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import nan
+
+from benchmarks.stalls import insert, LIMIT, Stall, StalledLoop, TARGET, VICTIMS
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from needle_controller import Controller, Measurement, Setpoint
+from needle_controller.controller import LAWS
+from needle_dynamics import NeedleParameters
+import numpy as np
+import pytest
+
+RATE = 200.0
+PERIOD = 1e-3
+PHANTOM = NeedleParameters.preset('phantom')
+
+#: Overshoot of the velocity of the needle after stalls, relative to the limit of the reference:
+#: the law corrects distances of up to 0.1 mm, and the plant holds a force for up to 0.1 s.
+OVERSHOOT = 0.6
+
+stalls = st.lists(
+    st.builds(
+        Stall,
+        st.sampled_from(VICTIMS),
+        st.floats(0.05, 1.0),
+        st.one_of(st.floats(0.05, 0.3), st.floats(0.3, 5.0)),
+    ),
+    min_size=1,
+    max_size=5,
+)
+
+
+@pytest.mark.requirement('S-210', 'S-213', 'S-214', 'S-215')
+@pytest.mark.parametrize('kind', ['target', 'path'])
+@pytest.mark.parametrize('law', LAWS)
+@settings(max_examples=5)
+@given(stalls)
+@example([Stall('plant', 0.3, 0.09), Stall('commands', 0.3, 0.6), Stall('controller', 0.3, 0.12)])
+def test_velocities_after_stalls_are_within_limits(
+    law: str, kind: str, happens: Sequence[Stall]
+) -> None:
+    """Of the reference by its limit, of the needle with an overshoot; the target is reached."""
+    found = insert(law, kind, happens, rate=RATE)
+    assert found.reference <= LIMIT * (1.0 + 1e-9)
+    assert max(found.inward, found.outward) <= LIMIT * (1.0 + OVERSHOOT)
+    assert found.stop == ''
+    assert found.depth == pytest.approx(TARGET, abs=1e-4)
+
+
+@pytest.mark.requirement('S-209', 'S-211', 'S-220')
+@pytest.mark.parametrize('law', LAWS)
+def test_reference_waits_for_a_force_at_its_limit(law: str) -> None:
+    """Of a needle that slides slowly: no stop, and the distance remains small."""
+    loop = StalledLoop(law, RATE)
+    loop.target(TARGET)
+    for _ in range(200):
+        loop.step()
+    # At 15 N this is half of the velocity of the reference.
+    loop.change(viscous=3000.0)
+    begin = loop.depth
+    for _ in range(400):
+        loop.step()
+    assert loop.supervisor.authority.reason == ''
+    assert 5e-3 < loop.depth - begin < 15e-3
+    # The distance at which the law reaches the force limit: 15 N over the stiffness of PID.
+    assert abs(loop.references[-1][0] - loop.depth) < 15.0 / 6000.0 + 1e-4
+
+
+@pytest.mark.requirement('S-218', 'S-219')
+@pytest.mark.parametrize('law', LAWS)
+def test_blocked_needle_is_detected_while_the_reference_waits(law: str) -> None:
+    """By the monitor of the encoders, before the tracking error reaches its limit."""
+    loop = StalledLoop(law, RATE)
+    loop.target(TARGET)
+    for _ in range(200):
+        loop.step()
+    loop.change(coulomb=40.0)
+    for _ in range(400):
+        loop.step()
+    assert 'encoders do not move' in loop.supervisor.authority.reason
+    assert loop.references[-1][0] - loop.depth < 4e-3
+
+
+def drive(controller: Controller, samples: Sequence[tuple[float, float, float]]) -> list[float]:
+    """Return the reference depths for samples of time [s], depth [m] and reported force [N]."""
+    return [
+        controller.command(
+            Measurement(time=time, depth=depth, velocity=0.0, force=force)
+        ).setpoint.position
+        for time, depth, force in samples
+    ]
+
+
+@pytest.mark.requirement('S-212')
+@pytest.mark.parametrize('force', [0.0, nan], ids=['none', 'not reported'])
+@pytest.mark.parametrize('law', LAWS)
+def test_reference_waits_for_a_reported_force(law: str, force: float) -> None:
+    """From the first sample without it; forces that are not reported are assumed to act."""
+    controller = Controller(PHANTOM, law)
+    controller.set_target(TARGET)
+    follows: list[Setpoint] = []
+    time = 0.0
+    depth, last = 0.02, 0.0
+    for _ in range(300):
+        command = controller.command(
+            Measurement(time=time, depth=depth, velocity=command_velocity(follows), force=last)
+        )
+        follows.append(command.setpoint)
+        depth, last, time = command.setpoint.position, command.force, time + PERIOD
+    aims = drive(controller, [(time + k * PERIOD, depth, force) for k in range(50)])
+    moved = aims[-1] - depth
+    if force == 0.0:
+        assert moved == 0.0
+    else:
+        assert moved == pytest.approx(50.0 * LIMIT * PERIOD, rel=0.05)
+
+
+def command_velocity(follows: Sequence[tuple[float, ...]]) -> float:
+    """Return the velocity of the last setpoint [m/s]."""
+    return follows[-1][1] if follows else 0.0
+
+
+@pytest.mark.requirement('S-216', 'S-217')
+@pytest.mark.parametrize('late', [0.005, 0.05])
+def test_time_of_a_path_waits_for_the_needle(late: float) -> None:
+    """A path is continued where the needle rested, later by the stall; no part is skipped."""
+    controller = Controller(PHANTOM)
+    controller.follow([0.0, 4.0], [0.02, 0.05])
+    aims: list[Setpoint] = []
+    depth = 0.02
+    times = np.arange(0.0, 5.0, PERIOD)
+    # The needle follows exactly, except for a stall after 1 s in which it rests.
+    for time in (*times[:1000], *(times[1000:] + late)):
+        velocity = aims[-1].velocity if aims else 0.0
+        command = controller.command(Measurement(time=time, depth=depth, velocity=velocity))
+        aims.append(command.setpoint)
+        depth = command.setpoint.position
+    steps = np.diff([one.position for one in aims])
+    # A gap of some periods is no stall: the reference continues in time.
+    longest = LIMIT * (PERIOD if late > 0.01 else late + PERIOD)
+    assert np.abs(steps).max() <= longest * (1.0 + 1e-6)
+    assert aims[-1].position == 0.05
