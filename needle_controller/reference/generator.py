@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import copysign, sqrt
 
 from needle_controller.reference.path import brake, Joined, Path
 from needle_controller.reference.quintic import halt, MinimumJerk
@@ -104,8 +105,7 @@ class ReferenceGenerator:
         if self._change is not None:
             # A step has no intermediate position.
             anew = self._motion is None or isinstance(self._motion, Step)
-            rate = min(max(velocity, -self.limits.speed), self.limits.speed)
-            now = Setpoint(depth, rate) if anew else self.ahead(time)
+            now = self._beginning(depth, velocity) if anew else self.ahead(time)
             self._mark()
             change, self._change = self._change, None
             self._motion, self._start = change(now), time
@@ -114,6 +114,14 @@ class ReferenceGenerator:
     def ahead(self, time: float) -> Setpoint:
         """Return the setpoint at a later time [s] without changes; zero without a motion."""
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
+
+    def _beginning(self, depth: float, velocity: float) -> Setpoint:
+        """Return the state of the needle, at most as fast as it can still stop at the target."""
+        to_go = (depth if self.target is None else self.target) - depth
+        fastest = min(self.limits.speed, sqrt(2.0 * self.limits.acceleration * abs(to_go)))
+        return Setpoint(
+            depth, copysign(min(max(velocity * copysign(1.0, to_go), 0.0), fastest), to_go)
+        )
 
     def _plan(self, now: Setpoint) -> Reference:
         if self.paused:

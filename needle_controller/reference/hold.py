@@ -24,6 +24,8 @@ class ReferenceHold:
 
     def __init__(self, guide: ReferenceGenerator, period: float, delay: int) -> None:
         self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
+        #: Age of the last measurement, or time since the previous one if that is longer [s].
+        self._late = 0.0
         #: Last forces [N], the oldest acts; tracking error before a gap [m]; whether there is a
         #: gap, the robot has reported a force, and a commanded force is missing.
         self._forces = deque([0.0], maxlen=delay + 2)
@@ -36,6 +38,9 @@ class ReferenceHold:
         Returns whether the law must restart at the measurement.
         """
         guide, missing, (time, depth, velocity, reported) = self._guide, self.missing, sample
+        # Measurements that are always late or rare are no gap.
+        before, self._late = self._late, max(time - guide.now, age)
+        gap = self._late > max(self._gap, _PERIODS * before)
         self.missing, self._blind = guide.waits, False
         if guide.waits or not guide.moves:
             self._forces.append(0.0)
@@ -49,7 +54,7 @@ class ReferenceHold:
             if abs(self._error) > most:
                 guide.release()
             return True
-        restart = missing or max(time - guide.now, age) > self._gap
+        restart = missing or gap
         lag = abs(guide.ahead(time).position - depth - self._error)
         self._blind = restart and not missing and lag < most
         if restart:
