@@ -10,7 +10,8 @@ The displacement A cos(pi t / T)^6 rests at exhale for most of the time [Lujan19
 References
 ----------
 .. [Lujan1999] A. E. Lujan, E. W. Larsen, J. M. Balter, R. K. Ten Haken, "A method for
-   incorporating organ motion due to breathing into 3D dose calculations", Medical Physics 26, 1999.
+   incorporating organ motion due to breathing into 3D dose calculations", Medical Physics 26,
+   1999.
 
 """
 

@@ -14,9 +14,7 @@ import numpy as np
 
 
 class FaultyGuide(StiffnessField):
-    """
-    Beam whose guide moves by ``gain`` times the setpoint, in x and z, behind a play of ``gap`` [m].
-    """
+    """Beam whose guide follows ``gain`` times the setpoint in x and z, with a play ``gap`` [m]."""
 
     def __init__(
         self,

@@ -62,28 +62,16 @@ def _force(x: float, z: float, hard: float, limit: float, beyond: float) -> tupl
 
 
 @native
-def _assemble(
-    shape: FloatArray,
-    lengths: FloatArray,
-    bed: FloatArray,
-    crept: FloatArray,
-    stiffness: float,
-    tissue: float,
-    law: tuple[float, float, float, float],
-    cutting: bool,
-    band: FloatArray,
-    left: FloatArray,
+def _bend(
+    shape: FloatArray, lengths: FloatArray, stiffness: float, band: FloatArray, left: FloatArray
 ) -> None:
     """
-    Compute Hessian (lower band) and gradient of the energy of a shape (nodes, 4).
+    Add the bending energy to Hessian (lower band) and gradient for a shape (nodes, 4).
 
     The columns of ``shape`` are deflections in x and z, and slopes in x and z; the first node is
-    the guide, which is given. ``bed`` is the path and ``crept`` the relaxed distance at the Gauss
-    points, shape (elements, 2, 2).
+    the guide, which is given.
     """
-    hard, limit, beyond, relaxing = law
-    band[:], left[:] = 0.0, 0.0
-    row, bend = np.empty(4), np.empty((4, 4))
+    bend = np.empty((4, 4))
     for e in range(len(lengths)):
         h = lengths[e]
         one = stiffness / h**3
@@ -103,8 +91,30 @@ def _assemble(
                     left[to + plane] += bend[i, j] * value
                     if 0 <= of <= to:
                         band[to - of, of + plane] += bend[i, j]
-        if e == 0:
-            continue
+
+
+@native
+def _hold(
+    shape: FloatArray,
+    lengths: FloatArray,
+    bed: FloatArray,
+    crept: FloatArray,
+    tissue: float,
+    law: tuple[float, float, float, float],
+    cutting: bool,
+    band: FloatArray,
+    left: FloatArray,
+) -> None:
+    """
+    Add the forces of the tissue to Hessian (lower band) and gradient for a shape (nodes, 4).
+
+    ``bed`` is the path and ``crept`` the relaxed distance at the Gauss points,
+    shape (elements, 2, 2); the first element is in the air.
+    """
+    hard, limit, beyond, relaxing = law
+    row = np.empty(4)
+    for e in range(1, len(lengths)):
+        h = lengths[e]
         for g in range(2):
             t = _GAUSS[g]
             row[0] = 1.0 - 3.0 * t * t + 2.0 * t**3
@@ -119,8 +129,9 @@ def _assemble(
                 x += row[i] * shape[e + i // 2, 2 * (i % 2)]
                 z += row[i] * shape[e + i // 2, 2 * (i % 2) + 1]
             fx, fz, xx, xz, zz = _force(x, z, hard, limit, beyond)
-            vx, vz = x - crept[e, g, 0], z - crept[e, g, 1]
-            gx, gz, gxx, gxz, gzz = _force(vx, vz, hard, limit, beyond)
+            gx, gz, gxx, gxz, gzz = _force(
+                x - crept[e, g, 0], z - crept[e, g, 1], hard, limit, beyond
+            )
             k = 0.5 * h * tissue
             fx, fz = fx + relaxing * (gx - fx), fz + relaxing * (gz - fz)
             xx, xz = xx + relaxing * (gxx - xx), xz + relaxing * (gxz - xz)
@@ -151,7 +162,7 @@ class NonlinearTissue(World):
         self,
         constants: Constants,
         depths: FloatArray,
-        law: TissueLaw = TissueLaw(),  # noqa: B008
+        law: TissueLaw = TissueLaw(),
         size: float = 2.5e-3,
     ) -> None:
         super().__init__(constants, depths)
@@ -172,9 +183,11 @@ class NonlinearTissue(World):
         band, left = np.empty((8, count)), np.empty(count)
         load = c.load(self._lengths[1:].sum() - 0.5 * self._lengths[-1])
         for _ in range(_MOST):
-            _assemble(
-                self.shape, self._lengths, self._bed, self._crept, c.stiffness, c.tissue,
-                self._force, cutting, band, left,
+            band[:], left[:] = 0.0, 0.0
+            _bend(self.shape, self._lengths, c.stiffness, band, left)
+            _hold(
+                self.shape, self._lengths, self._bed, self._crept, c.tissue, self._force, cutting,
+                band, left,
             )  # fmt: skip
             left[-4:-2] -= load
             left[:2] += c.skin * (self.shape[1, :2] - c.entry)

@@ -3,8 +3,9 @@ Geometrically exact rod on a foundation along its recorded path, by shooting.
 
 An inextensible rod in space without twist: position r, tangent t, moment m and force n along the
 arc length s, with r' = t, t' = m x t / (E I), m' = -t x n, n' = k d. The distance d from the path
-is perpendicular to the rod, as there is no friction. Two components of m and all of n at the guide are found by Newton's
-method, so that the tip has no moment and only the load of the bevel, which turns with the tip.
+is perpendicular to the rod, as there is no friction. Two components of m and all of n at the guide
+are found by Newton's method, so that the tip has no moment and only the load of the bevel, which
+turns with the tip.
 """
 
 from __future__ import annotations
@@ -227,8 +228,9 @@ class ExactRod(World):
         load = np.array([x, 0.0, z])
         path = np.ascontiguousarray(self._path)
         good, end = _solve(
-            self._guess, self._start, shift, c.free + self._inserted, 2.0 * self._size, c.stiffness,
-            c.tissue if self._inserted > 0.0 else 0.0, self._skin, self._entry, path, cutting, load,
+            self._guess, self._start, shift, c.free + self._inserted, 2.0 * self._size,
+            c.stiffness, c.tissue if self._inserted > 0.0 else 0.0, self._skin, self._entry, path,
+            cutting, load,
         )  # fmt: skip
         if not good:
             raise ArithmeticError('the shape of the rod does not converge')

@@ -113,7 +113,7 @@ class Bursts:
     """
 
     def __init__(
-        self, of: Sensor, rng: np.random.Generator, begin: float = 0.15, end: float = 0.5
+        self, of: Sensor, rng: np.random.Generator, begin: float = 0.15, end: float = 0.6
     ) -> None:
         self._of, self._rng, self._begin, self._end = of, rng, begin, end
         self._lost = False
