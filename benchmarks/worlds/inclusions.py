@@ -11,6 +11,7 @@ times as stiff as the tissue around them; loads and sizes are assumptions.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final, NamedTuple
 
 from benchmarks.worlds.world import CELL, Constants, grown, LONGEST, World
@@ -54,6 +55,20 @@ def draw_obstacles(rng: np.random.Generator, constants: Constants) -> Obstacles:
         before = (depths - (at - _BULGE)) / _BULGE
         loads += np.where((before > 0.0) & (before <= 1.0), before, 0.0)[:, np.newaxis] * push
     return Obstacles(begins, ends, factors, loads)
+
+
+@cache
+def _polynomials(count: int) -> tuple[FloatArray, FloatArray]:
+    """
+    Return integrals of the products of second derivatives from -1 to 1, shape (count, count).
+
+    And values and derivatives at -1, shape (2, count).
+    """
+    unit = np.eye(count)
+    xi, weights = legendre.leggauss(count)
+    bent = legendre.legval(xi, legendre.legder(unit, 2)).T
+    ends = [legendre.legval(-1.0, one) for one in (unit, legendre.legder(unit))]
+    return bent.T @ (weights[:, np.newaxis] * bent), np.array(ends)
 
 
 class Inclusions(World):
@@ -115,11 +130,9 @@ class Inclusions(World):
         """Compute the shape; a needle that cuts ends on its path."""
         along, path = np.array(self._along), np.array(self._path)
         deep, count = along[-1], min(self._degree, 2 + len(along)) + 1
-        unit, scale = np.eye(count), 2.0 / deep
-        xi, weights = legendre.leggauss(count)
-        bent = legendre.legval(xi, legendre.legder(unit, 2)).T * scale**2
-        half = 0.5 * deep
-        stiff = self.constants.stiffness * half * bent.T @ (weights[:, np.newaxis] * bent)
+        scale = 2.0 / deep
+        bent, ends = _polynomials(count)
+        stiff = self.constants.stiffness * scale**3 * bent
         # Two Gauss points in each increment of the path, which is straight.
         part = 0.5 + 0.5 * _GAUSS
         widths = np.diff(along)
@@ -135,9 +148,7 @@ class Inclusions(World):
         strength = (0.5 * np.repeat(widths, 2) * self._ground(at))[:, np.newaxis]
         stiff += rows.T @ (strength * rows)
         loads = rows.T @ (strength * (bed + later))
-        begin = np.array(
-            [legendre.legval(-1.0, one) for one in (unit, scale * legendre.legder(unit))]
-        )
+        begin = ends * np.array([[1.0], [scale]])
         outside = self._outside
         inside = outside[2:, 2:].copy()
         inside[0, 0] += self.constants.skin
