@@ -11,7 +11,7 @@ import zlib
 from benchmarks.steering import nominal, PATH_NOISE, TRUE
 from benchmarks.worlds.bevel import BevelNeedle, bicycle_curvature, CURVATURE, LEAD
 from benchmarks.worlds.breathing import BreathingTissue, draw_breath
-from benchmarks.worlds.faulty_guide import FaultyGuide
+from benchmarks.worlds.faulty_guide import FaultyGuide, TURN
 from benchmarks.worlds.inclusions import draw_obstacles, Inclusions
 from benchmarks.worlds.nonlinear_tissue import HARDENING, NonlinearTissue, YIELDING
 from benchmarks.worlds.pointing import PointingNeedle
@@ -22,7 +22,6 @@ from benchmarks.worlds.sensors import (
     Distorted,
     Sensor,
     TRACKER,
-    Turned,
     ULTRASOUND,
     WhiteNoise,
 )
@@ -85,7 +84,7 @@ def _beam(_rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
 
 def _gained(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
     x, z = rng.uniform(0.8, 1.2, 2)
-    return FaultyGuide(c, depths, gain=(x, z))
+    return FaultyGuide(c, depths, gap=5e-4, gain=(x, z))
 
 
 def _own(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
@@ -128,7 +127,7 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
         lambda rng, c, depths: BreathingTissue(c, depths, draw_breath(rng, gated=False))
     ),
     'faulty guide': Scenario(_gained),
-    'turned sensor': Scenario(_beam, lambda rng: Turned(WhiteNoise(rng))),
+    'turned sensor': Scenario(lambda _, c, depths: FaultyGuide(c, depths, turn=TURN)),
     'distorted sensor': Scenario(_beam, lambda rng: Distorted(WhiteNoise(rng), rng)),
     'colored 0.3 mm': Scenario(
         _beam, lambda rng: Colored(WhiteNoise(rng, ULTRASOUND), rng, 3e-4), ULTRASOUND

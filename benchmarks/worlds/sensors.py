@@ -1,5 +1,5 @@
 """
-Tip sensors with errors beyond white noise: turned, distorted, colored, and lost in bursts.
+Tip sensors with errors beyond white noise: distorted, colored, and lost in bursts.
 
 A sensor is called once at each depth with the position of the tip, and returns an averaged tip
 measurement, or None.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import cos, exp, pi, sin, sqrt
+from math import exp, pi, sqrt
 from typing import Final, TypeAlias
 
 from needle_dynamics import FloatArray
@@ -26,9 +26,6 @@ ULTRASOUND: Final = 3e-4 / sqrt(12.0)
 #: Time from one measurement to the next [s].
 _INTERVAL: Final = 1.7
 
-#: Rotation of a frame with a registration error [rad] (docs/steering.md).
-TURN: Final = 0.17
-
 
 @dataclass(slots=True, eq=False)
 class WhiteNoise:
@@ -39,18 +36,6 @@ class WhiteNoise:
 
     def __call__(self, tip: FloatArray) -> FloatArray | None:
         return tip + self.noise * self.rng.standard_normal(2)
-
-
-@dataclass(slots=True, eq=False)
-class Turned:
-    """Sensor whose frame is turned about the direction of insertion by an angle [rad]."""
-
-    of: Sensor
-    angle: float = TURN
-
-    def __call__(self, tip: FloatArray) -> FloatArray | None:
-        c, s = cos(self.angle), sin(self.angle)
-        return self.of(np.array([[c, -s], [s, c]]) @ tip)
 
 
 class Distorted:
