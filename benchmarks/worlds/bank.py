@@ -17,6 +17,7 @@ from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics import FloatArray
+from needle_dynamics.arrays import IntArray
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -69,7 +70,7 @@ class BankModel(SteeringModel):
         self.covariances = covariances
 
 
-def _only(responses: HypothesisResponses, kept: FloatArray) -> HypothesisResponses:
+def _only(responses: HypothesisResponses, kept: IntArray) -> HypothesisResponses:
     """Return the responses of some hypotheses."""
     return HypothesisResponses(
         **{

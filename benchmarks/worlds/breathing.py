@@ -129,7 +129,7 @@ class BreathingTissue(World):
 
     @property
     def guide_load(self) -> FloatArray:
-        return self._force[np.newaxis]
+        return np.array([self._force])
 
     def guide(self, to: GuideSetpoint) -> None:
         self._guide = np.array(to[:2])

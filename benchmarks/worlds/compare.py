@@ -86,7 +86,8 @@ def _insert(case: Case, name: str) -> Insertion:
         law = build_law(LAWS[name], case.model(), case.target, case.limits(roll=rolled))
     except OutOfReachError as error:
         return Insertion(stopped=f'rejected: {error}')
-    world, chance, forecast = case.world(), nan, None
+    world, chance = case.world(), nan
+    forecast: bool | None = None
 
     def watch(plant: SteeringPlant) -> None:
         nonlocal chance, forecast

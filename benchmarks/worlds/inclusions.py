@@ -24,6 +24,9 @@ from scipy.linalg import cho_factor, cho_solve
 #: Number of inclusions and of membranes.
 _INCLUSIONS, _MEMBRANES = 2, 2
 
+#: Largest lateral load of an obstacle [N]: a third of a puncture of 3 N.
+_PUSH: Final = 1.0
+
 #: Gauss points of an interval from -1 to 1.
 _GAUSS: Final = np.array([-(3.0**-0.5), 3.0**-0.5])
 
@@ -40,18 +43,17 @@ class Obstacles(NamedTuple):
     loads: FloatArray  #: lateral load on the tip in each cell of length `CELL` [N], (k, 2)
 
 
-def draw_obstacles(rng: np.random.Generator, constants: Constants) -> Obstacles:
-    """Draw inclusions of 8 to 20 mm, and membranes that push with up to 0.3 E I / lambda^2."""
+def draw_obstacles(rng: np.random.Generator) -> Obstacles:
+    """Draw inclusions of 8 to 20 mm, and membranes; all of them push with up to 1 N."""
     begins = rng.uniform(0.01, 0.09, _INCLUSIONS)
     ends = begins + rng.uniform(8e-3, 0.02, _INCLUSIONS)
     factors = rng.uniform(2.0, 5.0, _INCLUSIONS)
     membranes = rng.uniform(0.015, 0.09, _MEMBRANES)
     depths = CELL * np.arange(round(LONGEST / CELL))
     loads = np.zeros((len(depths), 2))
-    size = constants.stiffness / constants.bending**2
     for at in (*begins, *membranes):
         angle = rng.uniform(0.0, 2.0 * np.pi)
-        push = rng.uniform(0.0, 0.3) * size * np.array([np.cos(angle), np.sin(angle)])
+        push = rng.uniform(0.0, _PUSH) * np.array([np.cos(angle), np.sin(angle)])
         before = (depths - (at - _BULGE)) / _BULGE
         loads += np.where((before > 0.0) & (before <= 1.0), before, 0.0)[:, np.newaxis] * push
     return Obstacles(begins, ends, factors, loads)
@@ -168,7 +170,7 @@ class Inclusions(World):
 
     @property
     def guide_load(self) -> FloatArray:
-        return self._force[np.newaxis]
+        return np.array([self._force])
 
     def guide(self, to: GuideSetpoint) -> None:
         self._at[0] = to[:2]

@@ -242,7 +242,7 @@ class ExactRod(World):
 
     @property
     def guide_load(self) -> FloatArray:
-        return self._guess[np.newaxis, [2, 4]]
+        return np.array([self._guess[[2, 4]]])
 
     def guide(self, to: GuideSetpoint) -> None:
         motion = np.array([to.x, -self.constants.free, to.z]) - self._start[:3]

@@ -103,7 +103,7 @@ def _own(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
 
 
 def _ultrasound(rng: np.random.Generator) -> Sensor:
-    size = np.exp(rng.uniform(np.log(2e-4), np.log(1.7e-3)))
+    size = float(np.exp(rng.uniform(np.log(2e-4), np.log(1.7e-3))))
     return Colored(WhiteNoise(rng, ULTRASOUND), rng, size)
 
 
@@ -119,7 +119,7 @@ SCENARIOS: Final[Mapping[str, Scenario]] = {
     'bicycle': Scenario(partial(_bevel, bicycle_curvature(), LEAD), curvature=bicycle_curvature()),
     'cuts where it points': Scenario(lambda _, c, depths: PointingNeedle(c, depths)),
     'stiffness field': Scenario(lambda rng, c, depths: StiffnessField(c, depths, draw_field(rng))),
-    'inclusions': Scenario(lambda rng, c, depths: Inclusions(c, depths, draw_obstacles(rng, c))),
+    'inclusions': Scenario(lambda rng, c, depths: Inclusions(c, depths, draw_obstacles(rng))),
     'breathing, gated': Scenario(
         lambda rng, c, depths: BreathingTissue(c, depths, draw_breath(rng, gated=True))
     ),
@@ -156,9 +156,9 @@ class Case:
             tissue=needle.tissue_stiffness,
             skin=steering.skin_stiffness,
             free=steering.free_length,
-            tilt=tuple(tilt),
-            bevel=tuple(bevel),
-            frame=tuple(frame),
+            tilt=_pair(tilt),
+            bevel=_pair(bevel),
+            frame=_pair(frame),
             wander=draw_wander(rng),
         )
         self.target = self._reached(rng)
@@ -196,6 +196,11 @@ class Case:
             world.guide(GuideSetpoint(*guide.tolist(), roll))
             world.insert()
         return world.tip
+
+
+def _pair(values: FloatArray) -> tuple[float, float]:
+    x, z = values.tolist()
+    return x, z
 
 
 @lru_cache(maxsize=64)

@@ -274,7 +274,7 @@ def test_uniform_field_and_no_obstacles_change_nothing() -> None:
 
 
 def test_obstacles_push_the_tip_aside() -> None:
-    obstacles = draw_obstacles(np.random.default_rng(2), NEEDLE)
+    obstacles = draw_obstacles(np.random.default_rng(2))
     off = inserted(Inclusions(NEEDLE, DEPTHS, obstacles)) - inserted(Inclusions(NEEDLE, DEPTHS))
     assert np.abs(off[-1, :2]).max() > 1e-4
     pushing = CELL * np.flatnonzero(obstacles.loads.any(axis=1))[0]
