@@ -160,37 +160,34 @@ def _steer(
 
 
 def _runs(laws: Sequence[str]) -> list[tuple[str, str, ReplaySettings]]:
-    """Return settings and laws; the prior is used by our law only, or by a law that is given."""
-    first = next(iter(SETTINGS))
+    """Return settings and laws; the other laws of the project do not use the prior."""
+    defaults = ReplaySettings()
     return [
         (name, law, settings)
         for name, settings in SETTINGS.items()
         for law in laws
-        if name == first or law not in LAWS[1:]
+        if law not in LAWS[1:] or settings.prior == defaults.prior
     ]
 
 
 def _steering_bars(rows: Sequence[Mapping[str, Any]], media: _Media) -> list[Bar]:
-    """Return the bars of our law with the settings of the node."""
+    """Return the bars of our law with the settings of the node, against the best of all others."""
     bars = []
-    first = next(iter(SETTINGS))
     for plant in PLANTS:
-        of = {
-            (one['law'], one['medium']): one
-            for one in rows
-            if one['plant'] == plant and one['settings'] == first
-        }
-        total = of[LAWS[0], 'all']
-        bars.append(Bar(f'stopped, {plant}', total['stopped'], 0.0))
-        bars.append(Bar(f'mean, {plant}', total['mean'], 0.45, 'mm'))
-        for medium in media:
-            best = min(of[law, medium]['mean'] for law in LAWS[1:])
-            ours = of[LAWS[0], medium]
-            bars.append(Bar(f'mean over the best, {plant}, {medium}', ours['mean'] / best, 1.1))
-            held = ours['coverage']
-            held = 0.0 if held is None else 100.0 * held
-            bars.append(Bar(f'coverage, {plant}, {medium}', held, 90.0, '%', at_least=True))
-            bars.append(Bar(f'coverage, {plant}, {medium}', held, 98.0, '%'))
+        own = [one for one in rows if one['plant'] == plant]
+        defaults = [one for one in own if one['settings'] == next(iter(SETTINGS))]
+        ours = {one['medium']: one for one in defaults if one['law'] == LAWS[0]}
+        bars.append(Bar(f'stopped, {plant}', ours['all']['stopped'], 0.0))
+        bars.append(Bar(f'mean, {plant}', ours['all']['mean'], 0.45, 'mm'))
+        for name in media:
+            others = [one for one in own if one['medium'] == name and one['law'] in LAWS[1:]]
+            best = min(one['mean'] for one in others)
+            case = f'{plant}, {name}'
+            bars.append(Bar(f'mean over the best, {case}', ours[name]['mean'] / best, 1.1))
+            # All have stopped: no prediction holds.
+            held = 100.0 * (ours[name]['coverage'] or 0.0)
+            bars.append(Bar(f'coverage, {case}', held, 90.0, '%', at_least=True))
+            bars.append(Bar(f'coverage, {case}', held, 98.0, '%'))
     return bars
 
 

@@ -63,6 +63,7 @@ class ReplaySettings:
 #: Settings by name.
 SETTINGS: Final[Mapping[str, ReplaySettings]] = {
     'node defaults': ReplaySettings(),
+    'skin 20 mm': ReplaySettings(skin=0.02),
     'path_noise 3e-3': ReplaySettings(prior=SteeringPrior(path_noise=3e-3)),
 }
 
