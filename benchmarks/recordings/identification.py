@@ -44,10 +44,15 @@ def predict(
     held_out: Sequence[SteeringRecording],
     terms: tuple[str, ...],
     order: str,
+    near: FloatArray | None = None,
 ) -> list[Prediction]:
-    """Fit recordings of a medium, and predict others, with the offset of their first depths."""
+    """
+    Fit recordings of a medium, and predict others, with the offset of their first depths.
+
+    `near` is the start of the search, as of `Search.best`.
+    """
     search = Search(fitted, terms, order, None)
-    x, cost = search.best()
+    x, cost = search.best(near)
     free, [(length, skin)] = search.lengths(x)
     [(columns, left)] = search.design(x)
     constants = np.linalg.lstsq(columns, left)[0][: -2 * len(fitted)]
@@ -93,9 +98,14 @@ def identify_medium(recordings: Sequence[SteeringRecording]) -> dict[str, Any]:
         predict(part, other, half.terms, half.order)
         for part, other, half in zip(parts, reversed(parts), halves, strict=True)
     ]
+    near, _ = Search(recordings, whole.terms, whole.order, None).best()
     each = [
         predict(
-            [other for other in recordings if other is not one], [one], whole.terms, whole.order
+            [other for other in recordings if other is not one],
+            [one],
+            whole.terms,
+            whole.order,
+            near,
         )[0]
         for one in recordings
     ]
