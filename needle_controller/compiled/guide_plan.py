@@ -217,7 +217,11 @@ def _best(
             if cost < best:
                 best, at = cost, t
         whole += costs[plane, at]
-        found[plane] = candidates[plane, at]
+        # Between the candidates.
+        low, high = max(at - 1, 0), min(at + 1, candidates.shape[1] - 1)
+        low, high = candidates[plane, low], candidates[plane, high]
+        here = candidates[plane, at]
+        found[plane] = min(max(wanted, 0.5 * (low + here)), 0.5 * (here + high))
     return whole, complex(found[0], found[1])
 
 

@@ -168,7 +168,9 @@ class Plain:
         costs, follow = self.costs(ends, tried), self.follow()
         wanted = np.clip([[follow.real], [follow.imag]], -self.limit, self.limit)
         at = np.argmin(costs + 1e-3 * (tried - wanted) ** 2, axis=1)
-        return costs[[0, 1], at].sum(), complex(*tried[[0, 1], at])
+        borders = np.column_stack([tried[:, 0], 0.5 * (tried[:, 1:] + tried[:, :-1]), tried[:, -1]])
+        found = np.clip(wanted[:, 0], borders[[0, 1], at], borders[[0, 1], at + 1])
+        return costs[[0, 1], at].sum(), complex(*found)
 
     def follow(self) -> complex:
         """Return the position that brings the tip to the line over the next four steps."""
