@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+import re
 import resource
 from typing import Any
 
@@ -206,8 +207,9 @@ def test_encoder_loss_gives_zero_force_until_recovery(
 @pytest.mark.parametrize(
     ('kind', 'values', 'why'),
     [
-        ('freeze', {}, 'contradict each other'),
-        ('saturate', {'size': 0.021}, 'contradict each other'),
+        # Which monitor is first depends on the velocity at which the encoders freeze.
+        ('freeze', {}, 'contradict each other|encoders do not move'),
+        ('saturate', {'size': 0.021}, 'contradict each other|encoders do not move'),
         ('bias', {'size': 0.01}, 'insertion moved by'),
     ],
 )
@@ -219,7 +221,7 @@ def test_inconsistent_encoders_end_the_motion(
     loop.aim(0.1)
     loop.moves()
     loop.break_down(kind, 'joint_states', **values)
-    loop.until(lambda: why in loop.status.fault, why)
+    loop.until(lambda: re.search(why, f'{loop.status.fault} {loop.status.stop}'), why)
     loop.until(lambda: loop.speed == 0.0, 'rest')
 
 
