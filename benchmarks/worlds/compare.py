@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
 import json
-from math import inf, nan
+from math import nan
 import os
 from pathlib import Path
 import sys
@@ -33,7 +33,6 @@ import numpy as np
 #: Laws by name.
 LAWS: Final[Mapping[str, str]] = {
     'ours': 'multi_hypothesis',
-    'bank': 'benchmarks.worlds.bank:BankLaw',
     'springs': 'springs',
     'Broyden': 'broyden',
     'roll towards the target': 'roll_to_target',
@@ -41,7 +40,7 @@ LAWS: Final[Mapping[str, str]] = {
 }
 
 #: Laws that turn the needle where its bevel steers it.
-_ROLLED: Final = ('ours', 'bank', 'roll towards the target')
+_ROLLED: Final = ('ours', 'roll towards the target')
 
 #: Distance from the target that is a hit [m].
 _HIT: Final = 1e-3
@@ -210,13 +209,10 @@ def bars(table: Table) -> list[Bar]:
     for world, laws in table.items():
         if 'ours' not in laws:
             continue
-        ours, others = (
-            laws['ours'],
-            [one for law, one in laws.items() if law not in ('ours', 'bank')],
-        )
+        ours, others = laws['ours'], [one for law, one in laws.items() if law != 'ours']
         if others:
             for what in ('mean', 'most'):
-                least = min((getattr(one, what) for one in others), default=inf)
+                least = min(getattr(one, what) for one in others)
                 name = f'{world}: {"95 %" if what == "most" else what} over the best other law'
                 found.append(Bar(name, getattr(ours, what) / least, _RATIO))
         found.append(Bar(f'{world}: stopped', ours.stopped, 1.0, '%'))
@@ -230,8 +226,7 @@ def bars(table: Table) -> list[Bar]:
 def compare(tick: Tick, needles: int = 200) -> Answer:
     """Compare the laws in all scenarios, as a part of ``needle bench steering``."""
     count = min(needles, 200)
-    laws = [law for law in LAWS if law != 'bank']
-    table = measure(list(SCENARIOS), laws, count, os.cpu_count() or 1, tick)
+    table = measure(list(SCENARIOS), list(LAWS), count, os.cpu_count() or 1, tick)
     return [section(table, count)], bars(table)
 
 
