@@ -44,4 +44,4 @@ class FaultyGuide(StiffnessField):
     def guide(self, to: GuideSetpoint) -> None:
         wanted = self._gain @ to[:2]
         self.at = np.clip(self.at, wanted - 0.5 * self._gap, wanted + 0.5 * self._gap)
-        super().guide(GuideSetpoint(*self.at.tolist(), to.roll))
+        super().guide(GuideSetpoint(float(self.at[0]), float(self.at[1]), to.roll))

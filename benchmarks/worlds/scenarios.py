@@ -193,7 +193,7 @@ class Case:
             leg = k * _LEGS // self.steps
             change = np.clip(ends[leg] - guide, -limits.guide_step, limits.guide_step)
             guide, roll = guide + change, float(rolls[leg])
-            world.guide(GuideSetpoint(*guide.tolist(), roll))
+            world.guide(GuideSetpoint(float(guide[0]), float(guide[1]), roll))
             world.insert()
         return world.tip
 

@@ -50,7 +50,7 @@ _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 _DEVIATION, _MOTION = 1e-3, 2.5e-3
 
 #: Depths over which the tip is brought to the line, variance of the response of a hypothesis
-#: relative to its square, and least weight of a hypothesis in this setpoint.
+#: relative to its square, and least weight of a hypothesis in the plan.
 _AHEAD, _DOUBT, _LEAST_WEIGHT = 4, 0.05, 1e-4
 
 #: Distance from the target that counts as a hit [m].
@@ -242,9 +242,7 @@ def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -
         for j in range(near):
             for t in range(count):
                 middles[j, t], halves[j, t] = _guide_range(c, to[t], j)
-        for i in range(len(w)):
-            if w[i] < _LEAST_WEIGHT:
-                continue
+        for i in np.flatnonzero(w >= _LEAST_WEIGHT):
             mean, g = ends.means[i].imag if plane else ends.means[i].real, i % len(r.guide)
             need = c.target[plane] - mean
             shift, anywhere = r.guide[g, last, k], c.limit * r.later_guide[g, k + 1 + near]
@@ -295,9 +293,8 @@ def _follow(c: Steering, w: FloatArray) -> complex:
     m, guide, need, gain = c.mean.shape[1], c.guide.copy(), 0j, _MOTION
     row = np.empty(m, np.complex128)
     guide[k:] = now
-    for i in range(len(w)):
-        if w[i] < _LEAST_WEIGHT:
-            continue
+    for one in np.flatnonzero(w >= _LEAST_WEIGHT):
+        i = int(one)
         g, long, hard = i % len(r.guide), c.mean[i, m - 3].real, c.mean[i, m - 2].real
         for at in range(k + 1, min(k + _AHEAD, last) + 1):
             off = c.path[at] * complex(c.target[0], c.target[1]) - tip_mean(c, i, at, guide, row)

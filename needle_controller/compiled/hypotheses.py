@@ -150,9 +150,7 @@ def _guide_at_rest(c: Steering) -> ComplexArray:
 
 
 @compiled
-def tip_mean(
-    c: Steering, i: int, at: int, guide: ComplexArray, row: ComplexArray
-) -> complex:
+def tip_mean(c: Steering, i: int, at: int, guide: ComplexArray, row: ComplexArray) -> complex:
     """Return the mean of the tip at a depth in a hypothesis; ``row`` takes x, shape (m,)."""
     r, m = c.responses, len(row)
     g, mean = i % len(r.guide), 0j

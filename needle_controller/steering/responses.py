@@ -10,10 +10,10 @@ with positions :math:`b_j` of the guide in the steps, and unknown constants :mat
 and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
 between the depths. A and H depend on the bending length and on the stiffness of the skin, which
 form a grid of g points. A position between two points of the grid is described by two more unknown
-constants, with the difference of A between the points. A hypothesis is a point of the grid together
-with a path noise and a slow error of the sensor: a needle, tissue or sensor that differs from the
-model is explained by them. They widen the prediction, and path noise lets each measurement count
-more. The slow error is the last unknown constant. It changes from step to step.
+constants, with the difference of A between the points. A hypothesis is a point of the grid, a path
+noise and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
+explained by them. They widen the prediction, and path noise lets each measurement count more. The
+slow error is the last unknown constant. It changes from step to step.
 
 The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
 roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
@@ -109,9 +109,9 @@ class SteeringModel:
         Correlation of the slow error at the end of a step with that at its begin.
     push : float
         Nominal load of the bevel, along z at zero roll [N].
-    prior_covariance : ndarray, shape (h, 8 + n, 8 + n)
+    prior_covariance : ndarray, shape (h / g, 8 + n, 8 + n)
         Prior covariance of the causes, of the position between two points of the grid, and of
-        the slow error.
+        the slow error, by path noise and slow error; hypothesis i has that of number i // g.
     responses : HypothesisResponses
         Responses at the g points of the grid; hypothesis i has those of point i modulo g. Shifts
         of the tip at each depth: ``guide``, shape (g, n + 1, n), per position of the guide
@@ -170,14 +170,16 @@ class SteeringModel:
         unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
         shortest = with_lengths(needle, unit, float(lengths[0]))
         rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
-        found = []
+        arrays: list[FloatArray] = []
         for i, (length, skin) in enumerate(zip(grid_lengths, grid_skins, strict=True)):
             if progress is not None:
                 progress(i, len(grid_lengths))
             stiffness = float(skin) * needle.tissue_stiffness
             point = with_lengths(needle, replace(unit, skin_stiffness=stiffness), float(length))
-            found.append(_respond(steered(*point), unit, at, rows))
-        arrays = [np.array(each) for each in zip(*found, strict=True)]
+            found = _respond(steered(*point), unit, at, rows)
+            arrays = arrays or [np.empty((len(grid_lengths), *one.shape)) for one in found]
+            for of_all, one in zip(arrays, found, strict=True):
+                of_all[i] = one
         guide, _, bevel, *_ = arrays
         grid = guide.reshape(len(skins), len(lengths), *guide.shape[1:])
         between = [
@@ -186,18 +188,16 @@ class SteeringModel:
         arrays.append(np.array(between).reshape(2, *guide.shape))
         arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
         self.responses = HypothesisResponses(*arrays)
-        kinds = [(q * b.path_noise, drift) for drift in sorted({0.0, b.drift}) for q in _PATHS]
-        noises, self.drifts = (
-            np.repeat(one, len(grid_lengths)) for one in zip(*kinds, strict=True)
-        )
+        kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
         self.lengths, self.skins = (np.tile(one, len(kinds)) for one in (grid_lengths, grid_skins))
+        self.drifts = np.repeat(kinds[:, 1], len(grid_lengths))
         self.decay = np.exp(-np.diff(at) / _DRIFT_LENGTH)
         deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN, 0.0]
-        self.prior_covariance = np.tile(np.diag(np.array(deviations) ** 2), (len(noises), 1, 1))
-        self.prior_covariance[:, -1, -1] = self.drifts**2
+        self.prior_covariance = np.tile(np.diag(np.array(deviations) ** 2), (len(kinds), 1, 1))
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
-        variance = noises[:, np.newaxis, np.newaxis] / (2.0 * b.path_noise_length)
-        self.prior_covariance[:, 4:-3, 4:-3] = variance * np.exp(-apart)
+        for covariance, (noise, drift) in zip(self.prior_covariance, kinds, strict=True):
+            covariance[4:-3, 4:-3] = noise / (2.0 * b.path_noise_length) * np.exp(-apart)
+            covariance[-1, -1] = drift**2
 
     @property
     def steps(self) -> int:

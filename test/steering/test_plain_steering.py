@@ -48,12 +48,14 @@ class Plain:
         self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
         self.mean = np.zeros((len(model.lengths), m), complex)
         self.mean[:, 3] = 1j * model.push
-        self.covariance = model.prior_covariance.astype(complex)
+        repeats = len(self.mean) // len(model.prior_covariance)
+        self.covariance = np.repeat(model.prior_covariance.astype(complex), repeats, axis=0)
         # The hypotheses are repetitions of the grid.
         self.r = HypothesisResponses(
             **{
                 name: np.concatenate(
-                    [one] * (len(self.mean) // len(model.responses.guide)), axis=int(name == 'between')
+                    [one] * (len(self.mean) // len(model.responses.guide)),
+                    axis=int(name == 'between'),
                 )
                 for name, one in model.responses._asdict().items()
             }
@@ -168,7 +170,9 @@ class Plain:
         costs, follow = self.costs(ends, tried), self.follow()
         wanted = np.clip([[follow.real], [follow.imag]], -self.limit, self.limit)
         at = np.argmin(costs + 1e-3 * (tried - wanted) ** 2, axis=1)
-        borders = np.column_stack([tried[:, 0], 0.5 * (tried[:, 1:] + tried[:, :-1]), tried[:, -1]])
+        borders = np.column_stack(
+            [tried[:, 0], 0.5 * (tried[:, 1:] + tried[:, :-1]), tried[:, -1]]
+        )
         found = np.clip(wanted[:, 0], borders[[0, 1], at], borders[[0, 1], at + 1])
         return costs[[0, 1], at].sum(), complex(*found)
 

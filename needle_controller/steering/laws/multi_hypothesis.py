@@ -144,8 +144,8 @@ class MultiHypothesisLaw(SteeringLaw):
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
         from needle_dynamics.compiled.boxed import Boxed
 
-        count, size, _ = model.prior_covariance.shape
-        mean = np.zeros((count, size), dtype=np.complex128)
+        prior, count = model.prior_covariance, len(model.lengths)
+        mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
         mean[:, BEVEL] = 1j * model.push
         self._model = model
         self._now = Steering(
@@ -158,7 +158,7 @@ class MultiHypothesisLaw(SteeringLaw):
             ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
-            covariance=model.prior_covariance.astype(np.complex128),
+            covariance=np.repeat(prior.astype(np.complex128), count // len(prior), axis=0),
             logs=np.zeros(count),
             guide=np.zeros(model.steps, dtype=np.complex128),
             turned=np.full(model.steps + 1, complex(cos(roll), -sin(roll))),
