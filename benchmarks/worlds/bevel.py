@@ -19,7 +19,7 @@ from __future__ import annotations
 from math import cos, hypot, pi, sin, tan
 from typing import Final
 
-from benchmarks.worlds.world import CELL, Constants, grown, World
+from benchmarks.worlds.world import CELL, DrawnConstants, grown, IndependentNeedle
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -33,7 +33,7 @@ CURVATURE: Final = 4.5
 WHEELBASE, LEAD, ANGLE = 0.04, 0.023775, 0.198
 
 
-class BevelNeedle(World):
+class BevelNeedle(IndependentNeedle):
     """
     Tip on arcs of constant curvature [1/m], which turn with the roll of the tip.
 
@@ -44,7 +44,7 @@ class BevelNeedle(World):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         curvature: float = CURVATURE,
         lead: float = 0.0,

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from math import cos, pi
 from typing import Final
 
-from benchmarks.worlds.world import Constants, grown, LONGEST, World
+from benchmarks.worlds.world import DrawnConstants, grown, IndependentNeedle, LONGEST
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -68,7 +68,7 @@ def draw_breath(rng: np.random.Generator, *, gated: bool) -> Breath:
     )
 
 
-class BreathingTissue(World):
+class BreathingTissue(IndependentNeedle):
     """
     Beam in tissue that moves with breathing, by default at rest.
 
@@ -77,7 +77,7 @@ class BreathingTissue(World):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         breath: Breath | None = None,
         size: float = 1.25e-3,

@@ -49,7 +49,7 @@ _HIT: Final = 1e-3
 _RATIO: Final = 1.1
 
 
-class Insertion(NamedTuple):
+class ComparedInsertion(NamedTuple):
     """Result of an insertion; nan and None if it was stopped, or if the law has no such value."""
 
     miss: float = nan  #: distance of the tip from the target [m]
@@ -72,19 +72,19 @@ class Insertion(NamedTuple):
         return self.miss > _HIT and not self.warned
 
 
-def insert(name: str, laws: Sequence[str], seed: int) -> dict[str, Insertion]:
+def insert(name: str, laws: Sequence[str], seed: int) -> dict[str, ComparedInsertion]:
     """Insert the needle of a seed in a scenario under each law."""
     case = Case(name, seed)
     bent = bool(case.scenario.curvature)
     return {law: _insert(case, law) for law in laws if bent or law != 'roll towards the target'}
 
 
-def _insert(case: Case, name: str) -> Insertion:
+def _insert(case: Case, name: str) -> ComparedInsertion:
     rolled = bool(case.scenario.curvature) and name in _ROLLED
     try:
         law = build_law(LAWS[name], case.model(), case.target, case.limits(roll=rolled))
     except OutOfReachError as error:
-        return Insertion(stopped=f'rejected: {error}')
+        return ComparedInsertion(stopped=f'rejected: {error}')
     world, chance = case.world(), nan
     forecast: bool | None = None
 
@@ -98,9 +98,9 @@ def _insert(case: Case, name: str) -> Insertion:
     try:
         run = simulate_steering(law, cast(SteeringPlant, world), case.sensor(), watch)
     except SteeringFaultError as error:
-        return Insertion(stopped=str(error), chance=chance)
+        return ComparedInsertion(stopped=str(error), chance=chance)
     expected = law.expected()
-    return Insertion(
+    return ComparedInsertion(
         miss=float(np.hypot(*(world.tip - case.target))),
         travel=run.travel,
         load=run.load,
@@ -127,7 +127,7 @@ class Summary(NamedTuple):
     load: float  #: mean of the largest lateral load on the guide [N]
 
     @classmethod
-    def of(cls, found: Sequence[Insertion]) -> Summary:
+    def of(cls, found: Sequence[ComparedInsertion]) -> Summary:
         """Summarize insertions."""
         ended = [one for one in found if not one.stopped]
         stated = [one for one in found if np.isfinite(one.chance)]

@@ -11,7 +11,7 @@ from math import cos, sin
 from typing import Final
 
 from benchmarks.worlds.stiffness_field import StiffnessField
-from benchmarks.worlds.world import Constants
+from benchmarks.worlds.world import DrawnConstants
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -30,7 +30,7 @@ class FaultyGuide(StiffnessField):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         gap: float = 0.0,
         gain: tuple[float, float] = (1.0, 1.0),

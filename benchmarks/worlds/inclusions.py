@@ -14,7 +14,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Final, NamedTuple
 
-from benchmarks.worlds.world import CELL, Constants, grown, LONGEST, World
+from benchmarks.worlds.world import CELL, DrawnConstants, grown, IndependentNeedle, LONGEST
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -73,7 +73,7 @@ def _polynomials(count: int) -> tuple[FloatArray, FloatArray]:
     return bent.T @ (weights[:, np.newaxis] * bent), np.array(ends)
 
 
-class Inclusions(World):
+class Inclusions(IndependentNeedle):
     """
     Beam in tissue with obstacles, by default without.
 
@@ -82,7 +82,7 @@ class Inclusions(World):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         obstacles: Obstacles | None = None,
         degree: int = 14,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from math import exp, inf, sqrt
 from typing import Final
 
-from benchmarks.worlds.world import Constants, grown, native, World
+from benchmarks.worlds.world import DrawnConstants, grown, IndependentNeedle, native
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -151,7 +151,7 @@ def _hold(
                         band[to - of - 1, of + 1] += both * xz
 
 
-class NonlinearTissue(World):
+class NonlinearTissue(IndependentNeedle):
     """
     Beam in nonlinear tissue, by default linear.
 
@@ -160,7 +160,7 @@ class NonlinearTissue(World):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         law: TissueLaw = TissueLaw(),
         size: float = 2.5e-3,

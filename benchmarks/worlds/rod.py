@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import ceil, sqrt
 from typing import Final
 
-from benchmarks.worlds.world import Constants, grown, native, World
+from benchmarks.worlds.world import DrawnConstants, grown, IndependentNeedle, native
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -200,14 +200,16 @@ def _solve(
     return False, found
 
 
-class ExactRod(World):
+class ExactRod(IndependentNeedle):
     """
     Rod in space; the guide is at y = -L0, and the insertion depth is along the needle.
 
     ``size`` is the largest step along the rod and the longest increment of the path [m].
     """
 
-    def __init__(self, constants: Constants, depths: FloatArray, size: float = 2.5e-3) -> None:
+    def __init__(
+        self, constants: DrawnConstants, depths: FloatArray, size: float = 2.5e-3
+    ) -> None:
         super().__init__(constants, depths)
         self._size, self._inserted = size, 0.0
         x, z = constants.tilt

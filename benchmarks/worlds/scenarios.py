@@ -26,7 +26,7 @@ from benchmarks.worlds.sensors import (
     WhiteNoise,
 )
 from benchmarks.worlds.stiffness_field import draw_field, StiffnessField
-from benchmarks.worlds.world import Constants, draw_wander, World
+from benchmarks.worlds.world import draw_wander, DrawnConstants, IndependentNeedle
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.prior import SteeringPrior
@@ -53,14 +53,14 @@ _MOUNTED: Final = 0.1
 _RANGE, _LEGS = 0.8, 3
 
 #: Builders of the needle: random numbers, constants and depths.
-Build = Callable[[np.random.Generator, Constants, FloatArray], World]
+Build = Callable[[np.random.Generator, DrawnConstants, FloatArray], IndependentNeedle]
 
 #: Builders of the sensor: random numbers.
 Sense = Callable[[np.random.Generator], Sensor]
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class WorldScenario:
     """A simulated needle with its guide and its sensor."""
 
     build: Build
@@ -72,22 +72,22 @@ class Scenario:
 
 
 def _bevel(
-    curvature: float, lead: float, rng: np.random.Generator, c: Constants, depths: FloatArray
-) -> World:
+    curvature: float, lead: float, rng: np.random.Generator, c: DrawnConstants, depths: FloatArray
+) -> IndependentNeedle:
     bend = curvature * (1.0 + SPREAD * rng.uniform(-1.0, 1.0))
     return BevelNeedle(c, depths, bend, lead, roll=_MOUNTED * rng.standard_normal())
 
 
-def _beam(_rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
+def _beam(_rng: np.random.Generator, c: DrawnConstants, depths: FloatArray) -> IndependentNeedle:
     return StiffnessField(c, depths)
 
 
-def _gained(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
+def _gained(rng: np.random.Generator, c: DrawnConstants, depths: FloatArray) -> IndependentNeedle:
     x, z = rng.uniform(0.8, 1.2, 2)
     return FaultyGuide(c, depths, gap=5e-4, gain=(x, z))
 
 
-def _own(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
+def _own(rng: np.random.Generator, c: DrawnConstants, depths: FloatArray) -> IndependentNeedle:
     """Return the needle of the project's own model."""
     needle, steering = nominal(MEDIA[1])
     steering = replace(
@@ -99,7 +99,7 @@ def _own(rng: np.random.Generator, c: Constants, depths: FloatArray) -> World:
     needle = replace(needle, tissue_stiffness=c.tissue)
     seed, roll = int(rng.integers(2**31)), float(np.arctan2(*c.bevel))
     one = SteeredNeedle(needle, steering, tilt=c.tilt, roll=roll, seed=seed)
-    return cast(World, SteeringPlant(one, depths, c.frame))
+    return cast(IndependentNeedle, SteeringPlant(one, depths, c.frame))
 
 
 def _ultrasound(rng: np.random.Generator) -> Sensor:
@@ -107,33 +107,39 @@ def _ultrasound(rng: np.random.Generator) -> Sensor:
     return Colored(WhiteNoise(rng, ULTRASOUND), rng, size)
 
 
-SCENARIOS: Final[Mapping[str, Scenario]] = {
-    'own': Scenario(_own),
-    'beam': Scenario(_beam),
-    'skin not in the model': Scenario(_beam, skin=False),
-    'hardening': Scenario(lambda _, c, depths: NonlinearTissue(c, depths, HARDENING)),
-    'yielding': Scenario(lambda _, c, depths: NonlinearTissue(c, depths, YIELDING)),
-    'rod': Scenario(lambda _, c, depths: ExactRod(c, depths)),
-    'rod, guide 12 mm': Scenario(lambda _, c, depths: ExactRod(c, depths), guide=12e-3),
-    'unicycle': Scenario(partial(_bevel, CURVATURE, 0.0), curvature=CURVATURE),
-    'bicycle': Scenario(partial(_bevel, bicycle_curvature(), LEAD), curvature=bicycle_curvature()),
-    'cuts where it points': Scenario(lambda _, c, depths: PointingNeedle(c, depths)),
-    'stiffness field': Scenario(lambda rng, c, depths: StiffnessField(c, depths, draw_field(rng))),
-    'inclusions': Scenario(lambda rng, c, depths: Inclusions(c, depths, draw_obstacles(rng))),
-    'breathing, gated': Scenario(
+SCENARIOS: Final[Mapping[str, WorldScenario]] = {
+    'own': WorldScenario(_own),
+    'beam': WorldScenario(_beam),
+    'skin not in the model': WorldScenario(_beam, skin=False),
+    'hardening': WorldScenario(lambda _, c, depths: NonlinearTissue(c, depths, HARDENING)),
+    'yielding': WorldScenario(lambda _, c, depths: NonlinearTissue(c, depths, YIELDING)),
+    'rod': WorldScenario(lambda _, c, depths: ExactRod(c, depths)),
+    'rod, guide 12 mm': WorldScenario(lambda _, c, depths: ExactRod(c, depths), guide=12e-3),
+    'unicycle': WorldScenario(partial(_bevel, CURVATURE, 0.0), curvature=CURVATURE),
+    'bicycle': WorldScenario(
+        partial(_bevel, bicycle_curvature(), LEAD), curvature=bicycle_curvature()
+    ),
+    'cuts where it points': WorldScenario(lambda _, c, depths: PointingNeedle(c, depths)),
+    'stiffness field': WorldScenario(
+        lambda rng, c, depths: StiffnessField(c, depths, draw_field(rng))
+    ),
+    'inclusions': WorldScenario(lambda rng, c, depths: Inclusions(c, depths, draw_obstacles(rng))),
+    'breathing, gated': WorldScenario(
         lambda rng, c, depths: BreathingTissue(c, depths, draw_breath(rng, gated=True))
     ),
-    'breathing': Scenario(
+    'breathing': WorldScenario(
         lambda rng, c, depths: BreathingTissue(c, depths, draw_breath(rng, gated=False))
     ),
-    'faulty guide': Scenario(_gained),
-    'turned sensor': Scenario(lambda _, c, depths: FaultyGuide(c, depths, turn=TURN)),
-    'distorted sensor': Scenario(_beam, lambda rng: Distorted(WhiteNoise(rng), rng)),
-    'colored 0.3 mm': Scenario(
+    'faulty guide': WorldScenario(_gained),
+    'turned sensor': WorldScenario(lambda _, c, depths: FaultyGuide(c, depths, turn=TURN)),
+    'distorted sensor': WorldScenario(_beam, lambda rng: Distorted(WhiteNoise(rng), rng)),
+    'colored 0.3 mm': WorldScenario(
         _beam, lambda rng: Colored(WhiteNoise(rng, ULTRASOUND), rng, 3e-4), ULTRASOUND
     ),
-    'colored 0.2 to 1.7 mm': Scenario(_beam, _ultrasound, ULTRASOUND),
-    'bursts': Scenario(_beam, lambda rng: Bursts(WhiteNoise(rng, ULTRASOUND), rng), ULTRASOUND),
+    'colored 0.2 to 1.7 mm': WorldScenario(_beam, _ultrasound, ULTRASOUND),
+    'bursts': WorldScenario(
+        _beam, lambda rng: Bursts(WhiteNoise(rng, ULTRASOUND), rng), ULTRASOUND
+    ),
 }
 
 
@@ -151,7 +157,7 @@ class Case:
         tilt, frame, bevel = (
             size * rng.standard_normal(2) for size in (TRUE.tilt, TRUE.frame, TRUE.bevel)
         )
-        self._constants = Constants(
+        self._constants = DrawnConstants(
             stiffness=needle.bending_stiffness,
             tissue=needle.tissue_stiffness,
             skin=steering.skin_stiffness,
@@ -163,7 +169,7 @@ class Case:
         )
         self.target = self._reached(rng)
 
-    def world(self) -> World:
+    def world(self) -> IndependentNeedle:
         """Return the needle before its insertion."""
         return self.scenario.build(np.random.default_rng(self._key), self._constants, self.depths)
 

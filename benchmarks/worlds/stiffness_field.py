@@ -7,7 +7,7 @@ path that its tip cut. In a uniform field it is the linear beam on a Winkler fou
 
 from __future__ import annotations
 
-from benchmarks.worlds.world import Constants, LONGEST, World
+from benchmarks.worlds.world import DrawnConstants, IndependentNeedle, LONGEST
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray
 import numpy as np
@@ -35,7 +35,7 @@ def draw_field(
     return np.asarray(1.0 + deviation * (2.0 * ndtr(normal) - 1.0))
 
 
-class StiffnessField(World):
+class StiffnessField(IndependentNeedle):
     """
     Beam in tissue with relative stiffnesses in each millimeter, by default 1.
 
@@ -44,7 +44,7 @@ class StiffnessField(World):
 
     def __init__(
         self,
-        constants: Constants,
+        constants: DrawnConstants,
         depths: FloatArray,
         field: FloatArray | None = None,
         size: float = 1e-3,

@@ -32,7 +32,7 @@ def native(function: _Function) -> _Function:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Constants:
+class DrawnConstants:
     """Constants of one needle in one tissue."""
 
     stiffness: float = 0.0256  #: bending stiffness E I of the needle [N m^2]
@@ -80,7 +80,7 @@ def draw_wander(rng: np.random.Generator) -> FloatArray:
     return np.asarray(sqrt(_WANDER / (2.0 * _WANDER_LENGTH)) * found)
 
 
-class World(ABC):
+class IndependentNeedle(ABC):
     """
     Simulated needle that is inserted in steps, with the members that `simulate_steering` uses.
 
@@ -89,7 +89,7 @@ class World(ABC):
     [m], shape (n + 1,), which is 0; ``step`` is the number of its present depth.
     """
 
-    def __init__(self, constants: Constants, depths: FloatArray) -> None:
+    def __init__(self, constants: DrawnConstants, depths: FloatArray) -> None:
         self.constants, self.depths, self.step = constants, depths, 0
 
     @property

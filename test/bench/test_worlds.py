@@ -15,7 +15,7 @@ from benchmarks.worlds.rod import ExactRod
 from benchmarks.worlds.scenarios import Case, SCENARIOS
 from benchmarks.worlds.sensors import Bursts, Colored, Distorted, WhiteNoise
 from benchmarks.worlds.stiffness_field import draw_field, StiffnessField
-from benchmarks.worlds.world import CELL, Constants, World
+from benchmarks.worlds.world import CELL, DrawnConstants, IndependentNeedle
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
@@ -31,13 +31,13 @@ DEPTHS = 5e-3 * np.arange(21.0)
 
 #: A bending length of 25 mm, the stiffest tissue, where errors of discretization are largest.
 TISSUE = 4.0 * 0.0256 / 0.025**4
-NEEDLE = Constants(tissue=TISSUE, skin=0.02 * TISSUE, tilt=(0.02, -0.01), bevel=(0.06, 0.08))
+NEEDLE = DrawnConstants(tissue=TISSUE, skin=0.02 * TISSUE, tilt=(0.02, -0.01), bevel=(0.06, 0.08))
 
-Make = Callable[[Constants], World]
+Make = Callable[[DrawnConstants], IndependentNeedle]
 
 #: Needles in tissue that is linear, or nearly so at small deflections, by name, with the size of
 #: their elements as a parameter.
-BEAMS: dict[str, Callable[..., World]] = {
+BEAMS: dict[str, Callable[..., IndependentNeedle]] = {
     'differences': lambda c, size=1e-3: StiffnessField(c, DEPTHS, size=size),
     'polynomial': lambda c, size=1.25e-3: Inclusions(c, DEPTHS, degree=18, size=size),
     'elements': lambda c, size=2.5e-3: NonlinearTissue(c, DEPTHS, size=size),
@@ -56,7 +56,9 @@ GUIDED: dict[str, Make] = {
 }
 
 
-def inserted(world: World | SteeringPlant, size: float = 1e-3, turn: float = 0.0) -> FloatArray:
+def inserted(
+    world: IndependentNeedle | SteeringPlant, size: float = 1e-3, turn: float = 0.0
+) -> FloatArray:
     """Insert with motions of the guide; return tip [m] and load on the guide [N] at each step."""
     found = []
     for k in range(len(world.depths) - 1):
@@ -68,7 +70,7 @@ def inserted(world: World | SteeringPlant, size: float = 1e-3, turn: float = 0.0
     return np.array(found)
 
 
-def own(c: Constants) -> SteeringPlant:
+def own(c: DrawnConstants) -> SteeringPlant:
     """Return the needle of the project's model, with its elements of 0.5 mm."""
     needle = replace(NEEDLES['phantom'], tissue_stiffness=c.tissue)
     steering = SteeringParameters(
@@ -81,7 +83,7 @@ def own(c: Constants) -> SteeringPlant:
     return SteeringPlant(SteeredNeedle(needle, steering, tilt=c.tilt, roll=roll), DEPTHS)
 
 
-def scaled(c: Constants, factor: float) -> Constants:
+def scaled(c: DrawnConstants, factor: float) -> DrawnConstants:
     """Return constants with a tenth, or another factor, of all that bends the needle."""
     (x, z), (bx, bz) = c.tilt, c.bevel
     return replace(c, tilt=(factor * x, factor * z), bevel=(factor * bx, factor * bz))
@@ -131,7 +133,7 @@ def test_mirror_and_rotation_symmetry(name: str) -> None:
 
 @pytest.mark.parametrize('name', GUIDED)
 def test_straight_needle_stays_straight(name: str) -> None:
-    world = GUIDED[name](Constants(tissue=TISSUE, skin=0.02 * TISSUE))
+    world = GUIDED[name](DrawnConstants(tissue=TISSUE, skin=0.02 * TISSUE))
     assert np.abs(inserted(world, 0.0)).max() < 1e-12
 
 
@@ -163,7 +165,7 @@ def test_rod_differs_with_the_cube_of_the_deflection() -> None:
 def test_rod_before_the_skin_is_an_elastica() -> None:
     """Compare with a planar elastica, integrated from its tip by SciPy."""
     stiffness, length, load = 0.0256, 0.1, 3.0
-    rod = ExactRod(Constants(tissue=TISSUE, free=length, bevel=(0.0, load)), DEPTHS, 2e-3)
+    rod = ExactRod(DrawnConstants(tissue=TISSUE, free=length, bevel=(0.0, load)), DEPTHS, 2e-3)
 
     def back(angle: float) -> FloatArray:
         """Return y, z, angle and moment at the guide for an angle of the tip."""
@@ -212,7 +214,7 @@ def test_energy_is_conserved_by_elastic_tissue_only() -> None:
 
 
 def test_unicycle_moves_on_a_circle() -> None:
-    c = Constants(tissue=TISSUE)
+    c = DrawnConstants(tissue=TISSUE)
     needle = BevelNeedle(c, DEPTHS, CURVATURE, roll=0.3)
     for _ in DEPTHS[1:]:
         needle.insert()
@@ -224,7 +226,7 @@ def test_unicycle_moves_on_a_circle() -> None:
 
 def test_bicycle_is_that_of_the_literature() -> None:
     """Compare with the independent model, also with a turn, and with the figures of its source."""
-    c = Constants(tissue=TISSUE)
+    c = DrawnConstants(tissue=TISSUE)
     needle = BevelNeedle(c, DEPTHS, bicycle_curvature(), LEAD, windup=0.0)
     for k in range(len(DEPTHS) - 1):
         needle.guide(GuideSetpoint(0.0, 0.0, 0.5 * k))
@@ -235,7 +237,7 @@ def test_bicycle_is_that_of_the_literature() -> None:
 
 
 def test_tip_lags_by_the_windup() -> None:
-    needle = BevelNeedle(Constants(tissue=TISSUE), DEPTHS)
+    needle = BevelNeedle(DrawnConstants(tissue=TISSUE), DEPTHS)
     for _ in DEPTHS[1:]:
         needle.insert()
     needle.guide(GuideSetpoint(0.0, 0.0, 1.0))
@@ -248,7 +250,7 @@ def test_tip_lags_by_the_windup() -> None:
 
 def test_pointing_needle_follows_its_tip() -> None:
     """In tissue too soft to bend it, the needle follows the direction of the guide."""
-    c = Constants(tissue=1.0, tilt=(0.02, 0.0))
+    c = DrawnConstants(tissue=1.0, tilt=(0.02, 0.0))
     world = PointingNeedle(c, DEPTHS)
     found = inserted(world, 0.0)
     np.testing.assert_allclose(found[-1, :2], [0.02 * 0.14, 0.0], atol=1e-9)
@@ -284,7 +286,7 @@ def test_obstacles_push_the_tip_aside() -> None:
 
 
 def test_breathing_returns_at_exhale() -> None:
-    c = Constants(tissue=TISSUE, skin=0.02 * TISSUE)
+    c = DrawnConstants(tissue=TISSUE, skin=0.02 * TISSUE)
     breath = Breath(amplitude=(6e-3, -3e-3), gated=True)
     world = BreathingTissue(c, DEPTHS, breath)
     inserted(world, 0.0)
@@ -354,10 +356,10 @@ def test_comparison_does_not_depend_on_the_number_of_jobs() -> None:
 
 def test_summary_counts_stops_and_silent_misses() -> None:
     found = [
-        compare.Insertion(miss=0.5e-3, travel=1e-2, load=1.0, held=True, chance=1.0),
-        compare.Insertion(miss=2e-3, travel=1e-2, load=3.0, held=False, chance=1.0),
-        compare.Insertion(miss=3e-3, travel=1e-2, load=2.0, held=False, warned=True),
-        compare.Insertion(stopped='the tip sensor is frozen', chance=0.8),
+        compare.ComparedInsertion(miss=0.5e-3, travel=1e-2, load=1.0, held=True, chance=1.0),
+        compare.ComparedInsertion(miss=2e-3, travel=1e-2, load=3.0, held=False, chance=1.0),
+        compare.ComparedInsertion(miss=3e-3, travel=1e-2, load=2.0, held=False, warned=True),
+        compare.ComparedInsertion(stopped='the tip sensor is frozen', chance=0.8),
     ]
     one = compare.Summary.of(found)
     assert (one.hit, one.stopped, one.silent) == (25.0, 25.0, 25.0)
