@@ -29,7 +29,7 @@ MODULES = {
     'control': ('control',),
     'steering-model': ('steering_model',),
     'steering-fit': ('steering_fit',),
-    'steering': ('steering',),
+    'steering': ('steering', 'worlds.compare'),
     'laws': ('laws',),
     'safety': ('safety', 'steering_faults'),
     'commissioning': ('commissioning',),

@@ -157,6 +157,8 @@ class MeanPlan(MultiHypothesisLaw):
         # The final position of an unconstrained guide is the final tip position without guide.
         (means, _, w), limit = self.reach, self._now.limit
         shifts = self._model.responses.guide[:, -1, self.step :]
+        # The hypotheses are repetitions of the grid.
+        shifts = np.tile(shifts, (len(w) // len(shifts), 1))
         rows = np.sqrt(w)[:, np.newaxis] * shifts
         rows = np.vstack([rows, 0.1 * np.eye(shifts.shape[1])])
         found = []

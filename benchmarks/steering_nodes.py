@@ -92,6 +92,9 @@ NEEDLE, STEERING_CONSTANTS, _ = STEERING_PRESETS['bending_35mm']
 
 #: Speed of the insertion [m/s], and settings of the steering executive.
 SPEED: Final = 0.02
+#: Four steps are too few to identify a skin.
+PRIOR: Final = SteeringPrior(skin=0.0)
+
 SETTINGS: Final = ExecutiveSettings(
     step_length=0.01, speed=SPEED, guide_speed=0.04, acceleration=0.4, measurement_time=0.2,
     settle_time=0.04, patience=2.0,
@@ -391,7 +394,7 @@ class SimulatedSteering(GraphNode):
     def _begin(self) -> None:
         settings = replace(SETTINGS, continuous=self.graph.continuous)
         self.loop = SteeringExecutive(
-            NEEDLE, STEERING_CONSTANTS, SteeringPrior(), settings, steady=self.graph.steady
+            NEEDLE, STEERING_CONSTANTS, PRIOR, settings, steady=self.graph.steady
         )
         self.loop.authority = self.authority
 

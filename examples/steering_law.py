@@ -21,7 +21,8 @@ class NominalLaw:
         limits: SteeringLimits,
         roll: float,
     ) -> None:
-        nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - 1.0))
+        skin = model.steering.skin_stiffness / model.needle.tissue_stiffness
+        nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - skin))
         self.responses, self.depths = model.responses.guide[nominal], model.depths
         self.limits = limits
         self.guide = np.zeros((len(self.depths) - 1, 2))

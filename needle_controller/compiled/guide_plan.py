@@ -14,12 +14,12 @@ from needle_controller.compiled.hypotheses import (
     Steering,
     STEP,
     tip_distribution,
+    tip_mean,
     TURNS,
     weights,
 )
 from needle_dynamics.arrays import ComplexArray, ComplexVector, FloatArray, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
-from needle_dynamics.compiled.matrices import backward, cholesky, forward
 import numpy as np
 
 if TYPE_CHECKING:
@@ -45,9 +45,13 @@ _OVERLOAD: Final = 1.0
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
 _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 
-#: Cost of the distance from the plan for the mean, and of motion in that plan [shift of the tip
-#: per shift of the guide, squared].
-_DEVIATION, _MOTION = 1e-5, 1e-2
+#: Cost of the distance from the setpoint that follows the line to the target, and of its motion
+#: [shift of the tip per shift of the guide, squared].
+_DEVIATION, _MOTION = 1e-3, 2.5e-3
+
+#: Depths over which the tip is brought to the line, variance of the response of a hypothesis
+#: relative to its square, and least weight of a hypothesis in the plan.
+_AHEAD, _DOUBT, _LEAST_WEIGHT = 4, 0.05, 1e-4
 
 #: Distance from the target that counts as a hit [m].
 HIT: Final = 1e-3
@@ -70,10 +74,10 @@ def _ends(c: Steering, turns: int, first: int) -> FinalTip:
     means, turned = tip.means, np.zeros(len(tip.means))
     if turns > 0:
         for i in range(len(means)):
-            load = c.mean[i, BEVEL]
+            g, load = i % len(r.bevel), c.mean[i, BEVEL]
             for j in range(first, last + 1):
-                means[i] -= load * r.bevel[i, last, j] * c.turned[j]
-            turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[i, first]
+                means[i] -= load * r.bevel[g, last, j] * c.turned[j]
+            turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
     errors = np.empty(len(means))
     for i in range(len(means)):
         errors[i] = sqrt(tip.variances[i])
@@ -104,7 +108,7 @@ def _reachable(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     for j in range(k, last):
         (x, wide), (z, high) = _guide_range(c, now.real, j - k), _guide_range(c, now.imag, j - k)
         for i in range(len(middles)):
-            shift = c.responses.guide[i, last, j]
+            shift = c.responses.guide[i % len(c.responses.guide), last, j]
             middles[i] += shift * complex(x, z)
             sizes[i] += abs(shift) * complex(wide, high)
     return middles, sizes, ends.errors
@@ -161,7 +165,7 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
         for i in range(len(means)):
             push = 0.0
             for j in range(k + 1, k + 2 if turns > 1 else last + 1):
-                push += c.responses.bevel[i, last, j]
+                push += c.responses.bevel[i % len(c.responses.bevel), last, j]
             means[i] += c.mean[i, BEVEL] * push * (_direction(other) - c.turned[k + 1])
         ends = FinalTip(means, base.errors, base.turned)
         costs = _costs(c, w, ends, few)
@@ -204,15 +208,20 @@ def _best(
 ) -> tuple[float, complex]:
     """Return mean square distance from the reachable set and position of the best candidate."""
     costs, whole, found = _costs(c, w, ends, candidates), 0.0, np.empty(2)
-    plan = _plan(c, w, ends)
+    follow = _follow(c, w)
     for plane in range(2):
-        wanted, best = min(max(plan[plane], -c.limit), c.limit), inf
+        wanted = follow.imag if plane else follow.real
+        wanted, best = min(max(wanted, -c.limit), c.limit), inf
         for t in range(candidates.shape[1]):
             cost = costs[plane, t] + _DEVIATION * (candidates[plane, t] - wanted) ** 2
             if cost < best:
                 best, at = cost, t
         whole += costs[plane, at]
-        found[plane] = candidates[plane, at]
+        # Between the candidates.
+        low, high = max(at - 1, 0), min(at + 1, candidates.shape[1] - 1)
+        low, high = candidates[plane, low], candidates[plane, high]
+        here = candidates[plane, at]
+        found[plane] = min(max(wanted, 0.5 * (low + here)), 0.5 * (here + high))
     return whole, complex(found[0], found[1])
 
 
@@ -233,15 +242,15 @@ def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -
         for j in range(near):
             for t in range(count):
                 middles[j, t], halves[j, t] = _guide_range(c, to[t], j)
-        for i in range(len(w)):
-            mean = ends.means[i].imag if plane else ends.means[i].real
+        for i in np.flatnonzero(w >= _LEAST_WEIGHT):
+            mean, g = ends.means[i].imag if plane else ends.means[i].real, i % len(r.guide)
             need = c.target[plane] - mean
-            shift, anywhere = r.guide[i, last, k], c.limit * r.later_guide[i, k + 1 + near]
+            shift, anywhere = r.guide[g, last, k], c.limit * r.later_guide[g, k + 1 + near]
             for t in range(count):
                 left[t] = need - shift * to[t]
                 later[t] = _USED * anywhere + ends.turned[i]
             for j in range(near):
-                shift = r.guide[i, last, k + 1 + j]
+                shift = r.guide[g, last, k + 1 + j]
                 for t in range(count):
                     left[t] -= shift * middles[j, t]
                     later[t] += _USED * abs(shift) * halves[j, t]
@@ -264,38 +273,35 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
     if c.load_limit == inf:
         return force, stiffness
     for i in range(len(w)):
-        load = 0j
+        load, g = 0j, i % len(r.guide_load)
         for j in range(k):
-            load += r.guide_load[i, k, j] * c.guide[j]
+            load += r.guide_load[g, k, j] * c.guide[j]
         push = 0j
         for j in range(len(c.turned)):
-            push += r.bevel_load[i, k, j] * c.turned[j]
+            push += r.bevel_load[g, k, j] * c.turned[j]
         for j in range(r.causes_load.shape[2]):
-            load += (push if j == BEVEL else r.causes_load[i, k, j]) * c.mean[i, j]
+            load += (push if j == BEVEL else r.causes_load[g, k, j]) * c.mean[i, j]
         force += w[i] * load
-        stiffness += w[i] * r.guide_load[i, k, k]
+        stiffness += w[i] * r.guide_load[g, k, k]
     return force, stiffness
 
 
 @compiled
-def _plan(c: Steering, w: FloatArray, ends: FinalTip) -> tuple[float, float]:
-    """Return the next position of a least-squares plan for the mean, with a cost of motion."""
-    k, last = c.counts[STEP], len(c.guide)
-    count = last - k
-    normal, factor = np.zeros((count, count)), np.zeros((count, count))
-    for j in range(count):
-        normal[j, j] = _MOTION
-    x, z = np.zeros(count), np.zeros(count)
-    for i in range(len(w)):
-        shifts = c.responses.guide[i, last, k:]
-        for j in range(count):
-            weighted = w[i] * shifts[j]
-            x[j] += weighted * (c.target[0] - ends.means[i].real)
-            z[j] += weighted * (c.target[1] - ends.means[i].imag)
-            for m in range(j, count):
-                normal[j, m] += weighted * shifts[m]
-    cholesky(normal, factor)
-    for one in (x, z):
-        forward(factor, one)
-        backward(factor, one)
-    return x[0], z[0]
+def _follow(c: Steering, w: FloatArray) -> complex:
+    """Return the setpoint that brings the tip to the line to the target over the next steps."""
+    r, k, last, now = c.responses, c.counts[STEP], len(c.guide), _guide_now(c)
+    m, guide, need, gain = c.mean.shape[1], c.guide.copy(), 0j, _MOTION
+    row = np.empty(m, np.complex128)
+    guide[k:] = now
+    for one in np.flatnonzero(w >= _LEAST_WEIGHT):
+        i = int(one)
+        g, long, hard = i % len(r.guide), c.mean[i, m - 3].real, c.mean[i, m - 2].real
+        for at in range(k + 1, min(k + _AHEAD, last) + 1):
+            off = c.path[at] * complex(c.target[0], c.target[1]) - tip_mean(c, i, at, guide, row)
+            shift = 0.0
+            for j in range(k, at):
+                shift += r.guide[g, at, j]
+                shift += long * r.between[0, g, at, j] + hard * r.between[1, g, at, j]
+            need += w[i] * shift * off
+            gain += w[i] * (1.0 + _DOUBT) * shift**2
+    return now + need / gain

@@ -38,8 +38,12 @@ _BEVEL_RELEASE: Final = 0.03
 BEVEL: Final = 3
 
 #: Gate on the squared innovation over its variance (exceeded by noise once in 3 million tip
-#: measurements), and number of successive measurements outside the gate that is a fault.
+#: measurements), and number of successive measurements outside the gate of all hypotheses that is
+#: a fault.
 _GATE, _MOST_IMPLAUSIBLE = 30.0, 2
+
+#: Least logarithm of the weight of a hypothesis, relative to the largest; then it is discarded.
+_LEAST_LOG: Final = -30.0
 
 #: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
 MOST_SAME: Final = 2
@@ -56,7 +60,7 @@ VALID, LOST, FROZEN, OUTLIER = range(4)
 
 
 class HypothesisResponses(NamedTuple):
-    """Responses of the tip by hypothesis: arrays of `SteeringModel`, and sums."""
+    """Responses of the tip by point of the grid: arrays of `SteeringModel`, and sums."""
 
     #: As in `SteeringModel`.
     guide: Array3
@@ -68,10 +72,10 @@ class HypothesisResponses(NamedTuple):
     bevel_load: Array3
     between: Array4
     #: Sums of the absolute values of `guide` at the last depth, from each step on,
-    #: shape (h, n + 1).
+    #: shape (g, n + 1).
     later_guide: Matrix
     #: Sums of the absolute values of `bevel` at the last depth, from the skin and each step on,
-    #: shape (h, n + 3).
+    #: shape (g, n + 3).
     later_bevel: Matrix
 
 
@@ -79,13 +83,18 @@ class Steering(NamedTuple):
     """State and limits of a steering controller: h hypotheses, n steps and m constants."""
 
     responses: HypothesisResponses  #: responses of the tip
+    drifts: Vector  #: standard deviation of the slow error by hypothesis [m], shape (h,)
+    decay: Vector  #: correlation of the slow error over a step, shape (n,)
+    path: Vector  #: depths relative to the target depth, from 0 to 1, shape (n + 1,)
     limit: float  #: largest position of the guide along each axis [m]
     load_limit: float  #: largest planned force of the guide [N]
     ranges: Vector  #: range of the guide motion after a number of steps, from 1 [m], shape (n,)
     target: Vector  #: target of the tip, x and z [m], shape (2,)
     mean: ComplexMatrix  #: mean of the constants, shape (h, m)
     covariance: ComplexArray3  #: their covariance, shape (h, m, m)
-    logs: Vector  #: logarithm of the probability of each hypothesis, up to a constant, shape (h,)
+    #: Logarithm of the probability of each hypothesis, up to a constant; -inf if discarded,
+    #: shape (h,).
+    logs: Vector
     guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
     #: Direction of the bevel relative to zero roll, on the skin and in each step, shape (n + 1,).
     turned: ComplexVector
@@ -141,32 +150,50 @@ def _guide_at_rest(c: Steering) -> ComplexArray:
 
 
 @compiled
-def tip_distribution(c: Steering, at: int, guide: ComplexArray) -> TipDistribution:
-    """Return the distribution of the tip at a depth by hypothesis."""
-    r = c.responses
+def tip_mean(c: Steering, i: int, at: int, guide: ComplexArray, row: ComplexArray) -> complex:
+    """Return the mean of the tip at a depth in a hypothesis; ``row`` takes x, shape (m,)."""
+    r, m = c.responses, len(row)
+    g, mean = i % len(r.guide), 0j
+    for j in range(m - 3):
+        row[j] = r.causes[g, at, j]
+    row[BEVEL] = row[m - 3] = row[m - 2] = row[m - 1] = 0.0
+    for j in range(len(c.turned)):
+        row[BEVEL] += r.bevel[g, at, j] * c.turned[j]
+    for j in range(len(guide)):
+        mean += r.guide[g, at, j] * guide[j]
+        row[m - 3] += r.between[0, g, at, j] * guide[j]
+        row[m - 2] += r.between[1, g, at, j] * guide[j]
+    for j in range(m):
+        mean += c.mean[i, j] * row[j]
+    return mean
+
+
+@compiled
+def tip_distribution(
+    c: Steering, at: int, guide: ComplexArray, seen: float = 0.0
+) -> TipDistribution:
+    """
+    Return the distribution of the tip at a depth by hypothesis; 0 for discarded ones.
+
+    With ``seen`` = 1 it is that of the measured tip, with the slow error of the sensor.
+    """
     h, m = c.mean.shape
     means, variances = np.zeros(h, np.complex128), np.zeros(h)
     shared, row = np.zeros((h, m), np.complex128), np.empty(m, np.complex128)
     for i in range(h):
-        for j in range(m - 2):
-            row[j] = r.causes[i, at, j]
-        row[BEVEL] = row[m - 2] = row[m - 1] = 0.0
-        for j in range(len(c.turned)):
-            row[BEVEL] += r.bevel[i, at, j] * c.turned[j]
-        for j in range(len(guide)):
-            means[i] += r.guide[i, at, j] * guide[j]
-            row[m - 2] += r.between[0, i, at, j] * guide[j]
-            row[m - 1] += r.between[1, i, at, j] * guide[j]
-        of = shared[i]
+        if c.logs[i] == -inf:
+            continue
+        means[i] = tip_mean(c, i, at, guide, row) + seen * c.mean[i, m - 1]
+        of, row[m - 1] = shared[i], seen
         for j in range(m):
-            means[i] += c.mean[i, j] * row[j]
             # P is Hermitian: its rows are its conjugated columns.
             for l in range(m):
                 of[l] += row[j] * c.covariance[i, j, l]
         for j in range(m):
             variances[i] += of[j].real * row[j].real + of[j].imag * row[j].imag
             of[j] = of[j].conjugate()
-        variances[i] += (_BEVEL_RELEASE * r.elastic[i, at] * abs(c.mean[i, BEVEL])) ** 2
+        elastic = c.responses.elastic[i % len(c.responses.elastic), at]
+        variances[i] += (_BEVEL_RELEASE * elastic * abs(c.mean[i, BEVEL])) ** 2
     return TipDistribution(means, variances, shared)
 
 
@@ -203,30 +230,29 @@ def update(
     `VALID` or the reason for a stop, and the innovation along both axes [m].
     """
     c = boxed.value
-    tip, w = tip_distribution(c, at, _guide_at_rest(c)), weights(c.logs)
+    tip, w = tip_distribution(c, at, _guide_at_rest(c), 1.0), weights(c.logs)
     predicted = _moments(w, tip)
-    off_x, off_z = x - predicted.x, z - predicted.z
-    kind, counts = _check(c, x, z, off_x, off_z, predicted, variance)
+    for i in range(len(w)):
+        tip.variances[i] += variance
+    kind, counts = _check(c, complex(x, z), tip)
     if counts:
+        largest = -inf
         for i in range(len(w)):
-            _update_hypothesis(
-                c, i, complex(x, z) - tip.means[i], tip.variances[i] + variance, tip.shared[i]
-            )
-    return kind, off_x, off_z
+            if c.logs[i] > -inf:
+                _update_hypothesis(
+                    c, i, complex(x, z) - tip.means[i], tip.variances[i], tip.shared[i]
+                )
+                largest = max(largest, c.logs[i])
+        for i in range(len(w)):
+            if c.logs[i] < largest + _LEAST_LOG:
+                c.logs[i] = -inf
+    return kind, x - predicted.x, z - predicted.z
 
 
 @inlined
-def _check(
-    c: Steering,
-    x: float,
-    z: float,
-    off_x: float,
-    off_z: float,
-    predicted: TipMoments,
-    variance: float,
-) -> tuple[int, bool]:
+def _check(c: Steering, measured: complex, tip: TipDistribution) -> tuple[int, bool]:
     """Check a tip measurement; return its kind and whether the update uses it."""
-    counts = c.counts
+    counts, x, z = c.counts, measured.real, measured.imag
     if not (isfinite(x) and isfinite(z)):
         counts[MISSING] += 1
         return (LOST if counts[MISSING] > MOST_MISSING else VALID), False
@@ -236,12 +262,12 @@ def _check(
     c.last[0], c.last[1] = x, z
     if same:
         return (FROZEN if counts[SAME] >= MOST_SAME else VALID), False
-    xx, xz, zz = predicted.xx + variance, predicted.xz, predicted.zz + variance
-    distance = zz * off_x**2 - 2.0 * xz * off_x * off_z + xx * off_z**2
-    # False for an infinite distance and for nan.
-    if distance <= _GATE * (xx * zz - xz**2):
-        counts[IMPLAUSIBLE] = 0
-        return VALID, True
+    for i in range(len(c.logs)):
+        off = measured - tip.means[i]
+        # False for an infinite distance and for nan.
+        if c.logs[i] > -inf and off.real**2 + off.imag**2 <= _GATE * tip.variances[i]:
+            counts[IMPLAUSIBLE] = 0
+            return VALID, True
     counts[IMPLAUSIBLE] += 1
     return (OUTLIER if counts[IMPLAUSIBLE] >= _MOST_IMPLAUSIBLE else VALID), False
 
@@ -258,3 +284,20 @@ def _update_hypothesis(
         for k in range(len(shared)):
             to[k] -= gain * shared[k].conjugate()
     c.logs[i] -= 0.5 * (off.real**2 + off.imag**2) / variance + log(variance)
+
+
+@kernel
+def advance(boxed: Boxed[Steering]) -> None:
+    """Advance to the next step: the slow error of the sensor changes."""
+    c, k = boxed.value, boxed.value.counts[STEP]
+    if k < len(c.decay):
+        last, decay = c.mean.shape[1] - 1, c.decay[k]
+        for i in range(len(c.logs)):
+            if c.drifts[i] == 0.0 or c.logs[i] == -inf:
+                continue
+            c.mean[i, last] *= decay
+            for j in range(last + 1):
+                c.covariance[i, last, j] *= decay
+                c.covariance[i, j, last] *= decay
+            c.covariance[i, last, last] += (1.0 - decay**2) * c.drifts[i] ** 2
+    c.counts[STEP] = k + 1

@@ -12,9 +12,14 @@ class SteeringPrior:
     """Prior uncertainty of needle, tissue, guide, path and sensor."""
 
     spread: float = constant(
-        0.3, '1', 'relative uncertainty of bending length and skin stiffness',
+        0.3, '1', 'relative uncertainty of the bending length; 0: it and the skin are known',
         high=0.9,
     )  # fmt: skip
+    skin: float = constant(
+        0.06,
+        'm',
+        'largest stiffness of the skin relative to that of the tissue; 0: the nominal one',
+    )
     tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
     frame: float = constant(
         0.06, 'rad', 'standard deviation of the rotation between the frames of guide and sensor'
@@ -22,14 +27,17 @@ class SteeringPrior:
     bevel: float = constant(0.3, 'N', 'standard deviation of the lateral load of the bevel')
     offset: float = constant(1e-3, 'm', 'standard deviation of the origin of the sensor')
     path_noise: float = constant(
-        1e-4, 'rad^2/m', 'growth of the variance of the path direction per length',
-        open_low=True,
+        1e-4, 'rad^2/m', 'least growth of the variance of the path direction per length; up to '
+        '100 times as much is considered', open_low=True,
     )  # fmt: skip
     path_noise_length: float = constant(
         5e-3, 'm', 'correlation length of the path noise', open_low=True
     )
     noise: float = constant(
         4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
+    )
+    drift: float = constant(
+        5e-4, 'm', 'standard deviation of a slow error of the tip sensor, if it has one'
     )
 
     def __post_init__(self) -> None:

@@ -8,9 +8,12 @@ bevel, and in the loads that bend its path away from the nominal one:
 
 with positions :math:`b_j` of the guide in the steps, and unknown constants :math:`\theta`: origin
 and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
-between the depths. A and H depend on the bending length and on the stiffness of the skin. A
-hypothesis is a point of a grid of these two. A position between two points of the grid is
-described by two more unknown constants, with the difference of A between the points.
+between the depths. A and H depend on the bending length and on the stiffness of the skin, which
+form a grid of g points. A position between two points of the grid is described by two more unknown
+constants, with the difference of A between the points. A hypothesis is a point of the grid, a path
+noise and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
+explained by them. They widen the prediction, and path noise lets each measurement count more. The
+slow error is the last unknown constant. It changes from step to step.
 
 The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
 roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
@@ -47,8 +50,15 @@ OF_NEEDLE: Final = (
 )  # fmt: skip
 OF_STEERING: Final = ('free_length', 'skin_stiffness', 'bevel_load')
 
-#: Hypotheses of the bending length and of the skin.
-_LENGTHS, _SKINS = 13, 4
+#: Hypotheses of the bending length, and of the skin relative to the highest one.
+_LENGTHS: Final = 13
+_SKINS: Final = (0.0, 0.1, 1.0 / 3.0, 1.0)
+
+#: Hypotheses of path noise, relative to the least one.
+_PATHS: Final = (1.0, 10.0, 100.0)
+
+#: Correlation length of the slow error of the sensor [m].
+_DRIFT_LENGTH: Final = 0.05
 
 #: Half width of the grid over the spread.
 _BEYOND: Final = 1.1
@@ -65,7 +75,7 @@ _EVEN: Final = 12.0**-0.5
 
 class SteeringModel:
     """
-    Responses of the tip at the ends of the steps, one for each hypothesis.
+    Responses of the tip at the ends of the steps, and prior of their causes, by hypothesis.
 
     Parameters
     ----------
@@ -89,19 +99,27 @@ class SteeringModel:
     ----------
     needle, steering, depths, prior
         As given.
-    lengths, skins : ndarray, shape (h,)
-        Bending length and skin stiffness of each hypothesis, relative to the nominal values.
+    lengths : ndarray, shape (h,)
+        Bending length of each hypothesis, relative to the nominal one.
+    skins : ndarray, shape (h,)
+        Skin stiffness of each hypothesis, relative to the stiffness of the tissue [m].
+    drifts : ndarray, shape (h,)
+        Standard deviation of the slow error of the sensor of each hypothesis [m].
+    decay : ndarray, shape (n,)
+        Correlation of the slow error at the end of a step with that at its begin.
     push : float
         Nominal load of the bevel, along z at zero roll [N].
-    prior_covariance : ndarray, shape (7 + n, 7 + n)
-        Prior covariance of the causes, and of the position between two hypotheses.
+    prior_covariance : ndarray, shape (h / g, 8 + n, 8 + n)
+        Prior covariance of the causes, of the position between two points of the grid, and of
+        the slow error, by path noise and slow error; hypothesis i has that of number i // g.
     responses : HypothesisResponses
-        Shifts of the tip at each depth: ``guide``, shape (h, n + 1, n), per position of the guide
-        in each step; ``causes``, shape (h, n + 1, 5 + n), per origin [m], turn of the frame [rad],
+        Responses at the g points of the grid; hypothesis i has those of point i modulo g. Shifts
+        of the tip at each depth: ``guide``, shape (g, n + 1, n), per position of the guide
+        in each step; ``causes``, shape (g, n + 1, 5 + n), per origin [m], turn of the frame [rad],
         tilt, load of the bevel [N] without roll, and curvature of the path at each depth [1/m];
-        ``bevel``, shape (h, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
-        step; ``elastic``, shape (h, n + 1), of the resting tip per load of the bevel [m/N];
-        ``between``, shape (2, h, n + 1, n), change of ``guide`` from one hypothesis to the next in
+        ``bevel``, shape (g, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
+        step; ``elastic``, shape (g, n + 1), of the resting tip per load of the bevel [m/N];
+        ``between``, shape (2, g, n + 1, n), change of ``guide`` from one point to the next in
         bending length, and in skin. ``guide_load``, ``causes_load`` and ``bevel_load``, with n
         rows, are the same for the force on the guide at its position of each step [N].
 
@@ -140,21 +158,28 @@ class SteeringModel:
         b, n = self.prior, self.steps
         width = _BEYOND * b.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
-        skins = np.ones(1)
-        if width and steering.skin_stiffness > 0.0:
-            skins = np.linspace(1.0 - width, 1.0 + width, _SKINS)
-        self.lengths, self.skins = (grid.ravel() for grid in np.meshgrid(lengths, skins))
+        skins = np.array([steering.skin_stiffness / needle.tissue_stiffness])
+        if width and b.skin:
+            skins, (nominal,) = np.array(_SKINS) * b.skin, skins
+            if nominal:
+                # The nearest of the points that are not zero becomes the nominal one.
+                skins[1 + np.abs(skins[1:] - nominal).argmin()] = nominal
+        grid_lengths, grid_skins = (one.ravel() for one in np.meshgrid(lengths, skins))
         # The responses are per load in the layer with the largest load of the bevel.
         loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
         unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
         shortest = with_lengths(needle, unit, float(lengths[0]))
         rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
-        found = []
-        for i, pair in enumerate(zip(self.lengths.tolist(), self.skins.tolist(), strict=True)):
+        arrays: list[FloatArray] = []
+        for i, (length, skin) in enumerate(zip(grid_lengths, grid_skins, strict=True)):
             if progress is not None:
-                progress(i, len(self.lengths))
-            found.append(_respond(steered(*with_lengths(needle, unit, *pair)), unit, at, rows))
-        arrays = [np.array(each) for each in zip(*found, strict=True)]
+                progress(i, len(grid_lengths))
+            stiffness = float(skin) * needle.tissue_stiffness
+            point = with_lengths(needle, replace(unit, skin_stiffness=stiffness), float(length))
+            found = _respond(steered(*point), unit, at, rows)
+            arrays = arrays or [np.empty((len(grid_lengths), *one.shape)) for one in found]
+            for of_all, one in zip(arrays, found, strict=True):
+                of_all[i] = one
         guide, _, bevel, *_ = arrays
         grid = guide.reshape(len(skins), len(lengths), *guide.shape[1:])
         between = [
@@ -163,11 +188,16 @@ class SteeringModel:
         arrays.append(np.array(between).reshape(2, *guide.shape))
         arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
         self.responses = HypothesisResponses(*arrays)
-        deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN]
-        self.prior_covariance = np.diag(np.array(deviations) ** 2)
+        kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
+        self.lengths, self.skins = (np.tile(one, len(kinds)) for one in (grid_lengths, grid_skins))
+        self.drifts = np.repeat(kinds[:, 1], len(grid_lengths))
+        self.decay = np.exp(-np.diff(at) / _DRIFT_LENGTH)
+        deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN, 0.0]
+        self.prior_covariance = np.tile(np.diag(np.array(deviations) ** 2), (len(kinds), 1, 1))
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
-        variance = b.path_noise / (2.0 * b.path_noise_length)
-        self.prior_covariance[4:-2, 4:-2] = variance * np.exp(-apart)
+        for covariance, (noise, drift) in zip(self.prior_covariance, kinds, strict=True):
+            covariance[4:-3, 4:-3] = noise / (2.0 * b.path_noise_length) * np.exp(-apart)
+            covariance[-1, -1] = drift**2
 
     @property
     def steps(self) -> int:

@@ -13,6 +13,7 @@ from needle_controller import (
     SteeringModel,
     SteeringPrior,
 )
+from needle_controller.compiled.hypotheses import HypothesisResponses
 from needle_controller.steering.simulation import sample_truth, simulate_steering
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.arrays import ComplexArray
@@ -42,12 +43,23 @@ class Plain:
         limit = limits.guide_limit
         self.model, self.goal, self.limit = model, complex(*target), limit
         self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0
-        n, m = model.steps, len(model.prior_covariance)
+        n, m = model.steps, model.prior_covariance.shape[1]
         self.ways = np.minimum(limits.guide_step * np.arange(1, n + 1), 2.0 * limit)
         self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
         self.mean = np.zeros((len(model.lengths), m), complex)
         self.mean[:, 3] = 1j * model.push
-        self.covariance = np.array([model.prior_covariance] * len(model.lengths), complex)
+        repeats = len(self.mean) // len(model.prior_covariance)
+        self.covariance = np.repeat(model.prior_covariance.astype(complex), repeats, axis=0)
+        # The hypotheses are repetitions of the grid.
+        self.r = HypothesisResponses(
+            **{
+                name: np.concatenate(
+                    [one] * (len(self.mean) // len(model.responses.guide)),
+                    axis=int(name == 'between'),
+                )
+                for name, one in model.responses._asdict().items()
+            }
+        )
         self.logs = np.zeros(len(model.lengths))
 
     @property
@@ -56,12 +68,15 @@ class Plain:
         found = np.exp(self.logs - self.logs.max())
         return np.asarray(found / found.sum())
 
-    def tip(self, at: int, guide: ComplexArray) -> tuple[ComplexArray, FloatArray, ComplexArray]:
-        """Return means, variances, and covariances with the constants."""
-        r = self.model.responses
+    def tip(
+        self, at: int, guide: ComplexArray, seen: float = 0.0
+    ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+        """Return means, variances, and covariances with the constants, also as measured."""
+        r = self.r
         causes = r.causes[:, at].astype(complex)
         causes[:, 3] = r.bevel[:, at] @ self.turned
-        rows = np.concatenate([causes, (r.between[:, :, at] @ guide).T], axis=1)
+        slow = np.full((len(causes), 1), seen)
+        rows = np.concatenate([causes, (r.between[:, :, at] @ guide).T, slow], axis=1)
         means = r.guide[:, at] @ guide + np.einsum('hm,hm->h', rows, self.mean)
         shared = np.einsum('hml,hl->hm', self.covariance, rows.conj())
         variances = np.einsum('hm,hm->h', rows, shared).real
@@ -82,16 +97,17 @@ class Plain:
 
     def see(self, look: FloatArray) -> None:
         """Update the hypotheses by a tip measurement."""
-        means, variances, shared = self.tip(self.step, self.held())
+        means, variances, shared = self.tip(self.step, self.held(), 1.0)
         whole, off = variances + self.model.prior.noise**2, complex(*look) - means
         self.mean += (off / whole)[:, None] * shared
         self.covariance -= np.einsum('hm,hl->hml', shared / whole[:, None], shared.conj())
         self.logs -= 0.5 * abs(off) ** 2 / whole + np.log(whole)
+        self.logs[self.logs < self.logs.max() - 30.0] = -np.inf
 
     def ends(self, turns: int, first: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
         """Return means, standard deviations, and the range of later turns."""
         means, variances, _ = self.tip(-1, self.guide)
-        later, turned = self.model.responses.bevel[:, -1, first:], np.zeros(len(means))
+        later, turned = self.r.bevel[:, -1, first:], np.zeros(len(means))
         if turns:
             means = means - self.mean[:, 3] * (later @ self.turned[first:])
             turned = 0.8 * sqrt(0.5) * abs(self.mean[:, 3]) * abs(later).sum(axis=1)
@@ -107,7 +123,7 @@ class Plain:
     def hit_probability(self) -> float:
         """Return the probability of a hit near the target."""
         means, errors, turned = self.ends(self.turns, self.step + 1)
-        shifts, chance = self.model.responses.guide[:, -1, self.step :], 1.0
+        shifts, chance = self.r.guide[:, -1, self.step :], 1.0
         there = self.guide[self.step - 1] if 0 < self.step <= self.model.steps else 0j
         for need, at in (
             ((self.goal - means).real, there.real), ((self.goal - means).imag, there.imag),
@@ -128,13 +144,15 @@ class Plain:
 
     def costs(self, ends: tuple[Any, ...], tried: FloatArray) -> FloatArray:
         """Return the distance of the target from the reachable set for positions, (2, count)."""
-        (means, errors, turned), k, w, r = ends, self.step, self.weights, self.model.responses
+        (means, errors, turned), k, w, r = ends, self.step, self.weights.copy(), self.r
         now, after = r.guide[:, -1, k], r.guide[:, -1, k + 1 :]
         push = (r.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
-        causes = r.causes_load[:, k] * self.mean[:, :-2]
+        causes = r.causes_load[:, k] * self.mean[:, :-3]
         causes[:, 3] = push
         force = w @ (r.guide_load[:, k] @ self.guide + causes.sum(axis=1))
         found, need = np.zeros(tried.shape), self.goal - means
+        stiffness = w @ r.guide_load[:, k, k]
+        w[w < 1e-4] = 0.0
         for plane, (at, felt) in enumerate(((need.real, force.real), (need.imag, force.imag))):
             to = tried[plane]
             middle, half = self.room(to, after.shape[1])
@@ -143,19 +161,33 @@ class Plain:
             for a, weight in ((-sqrt(3), 1 / 6), (0.0, 4 / 6), (sqrt(3), 1 / 6)):
                 short = np.maximum(0.0, abs(left + a * errors[:, None]) - later)
                 found[plane] += weight * (w @ short**2)
-            load = abs(felt + w @ r.guide_load[:, k, k] * to)
+            load = abs(felt + stiffness * to)
             found[plane] += np.maximum(0.0, load - self.load_limit) ** 2
         return found
 
     def best(self, ends: tuple[Any, ...], tried: FloatArray) -> tuple[float, complex]:
         """Return the least distance from the reachable set, and its position."""
-        w, shifts = self.weights, self.model.responses.guide[:, -1, self.step :]
-        normal = (w * shifts.T) @ shifts + 1e-2 * np.eye(shifts.shape[1])
-        plan = np.linalg.solve(normal, (w * shifts.T) @ (self.goal - ends[0]))[0]
-        costs = self.costs(ends, tried)
-        wanted = np.clip([[plan.real], [plan.imag]], -self.limit, self.limit)
-        at = np.argmin(costs + 1e-5 * (tried - wanted) ** 2, axis=1)
-        return costs[[0, 1], at].sum(), complex(*tried[[0, 1], at])
+        costs, follow = self.costs(ends, tried), self.follow()
+        wanted = np.clip([[follow.real], [follow.imag]], -self.limit, self.limit)
+        at = np.argmin(costs + 1e-3 * (tried - wanted) ** 2, axis=1)
+        borders = np.column_stack(
+            [tried[:, 0], 0.5 * (tried[:, 1:] + tried[:, :-1]), tried[:, -1]]
+        )
+        found = np.clip(wanted[:, 0], borders[[0, 1], at], borders[[0, 1], at + 1])
+        return costs[[0, 1], at].sum(), complex(*found)
+
+    def follow(self) -> complex:
+        """Return the position that brings the tip to the line over the next four steps."""
+        w, r, k, n = self.weights, self.r, self.step, self.model.steps
+        w = np.where(w < 1e-4, 0.0, w)
+        need, gain = 0j, 2.5e-3
+        for at in range(k + 1, min(k + 4, n) + 1):
+            between = np.einsum('hb,bhj->hj', self.mean[:, -3:-1].real, r.between[:, :, at])
+            shift = (r.guide[:, at] + between)[:, k:at].sum(axis=1)
+            line = self.goal * DEPTHS[at] / DEPTHS[-1]
+            need += (w * shift) @ (line - self.tip(at, self.held())[0])
+            gain += 1.05 * w @ shift**2
+        return complex(self.held()[k]) + need / gain
 
     def choose(self) -> complex:
         """Return the next position, and turn the needle if that reduces the distance."""
@@ -166,7 +198,7 @@ class Plain:
             return guide
         means, errors, turned = self.ends(self.turns - 1, k + 2)
         until = k + 2 if self.turns > 1 else None
-        load = self.mean[:, 3] * self.model.responses.bevel[:, -1, k + 1 : until].sum(axis=1)
+        load = self.mean[:, 3] * self.r.bevel[:, -1, k + 1 : until].sum(axis=1)
         rolls = self.roll + tau * np.arange(-7, 9) / 16
         ways, now = np.exp(-1j * rolls), np.exp(-1j * self.roll)
         others = [(means + load * (way - now), errors, turned) for way in ways]
@@ -183,6 +215,12 @@ class Plain:
         k, last = self.step, self.model.steps - 1
         if k <= last:
             self.guide[k] = self.choose()
+        if k <= last:
+            decay = np.ones(self.mean.shape[1])
+            decay[-1] = self.model.decay[k]
+            self.mean *= decay
+            self.covariance *= np.outer(decay, decay)
+            self.covariance[:, -1, -1] += (1.0 - decay[-1] ** 2) * self.model.drifts**2
         self.step += 1
         at = self.guide[min(k, last)]
         return GuideSetpoint(at.real, at.imag, self.roll)

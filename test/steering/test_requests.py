@@ -48,7 +48,8 @@ class Relayed(Robot):
     """A robot with a relay that loses, delays or duplicates some of its messages."""
 
     def __init__(self, faults: dict[tuple[str, int], list[float]], **options: Any) -> None:
-        super().__init__(**options)
+        # Four steps are too few to identify a skin.
+        super().__init__(**{'prior': SteeringPrior(skin=0.0), **options})
         self.faults, self.counts = faults, Counter[str]()
         self.held: list[tuple[int, Callable[[], None]]] = []
 

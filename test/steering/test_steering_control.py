@@ -178,20 +178,21 @@ def test_both_planes_are_equivalent() -> None:
 
 def test_bending_length_is_identified() -> None:
     """The remaining hypotheses are near the truth, and weights are a distribution."""
-    controller = MultiHypothesisLaw(MODEL, (3e-3, -2e-3), LIMITS)
-    assert_allclose(controller.weights, 1.0 / len(MODEL.lengths))
+    model = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(skin=0.0))
+    controller = MultiHypothesisLaw(model, (3e-3, -2e-3), LIMITS)
+    assert_allclose(controller.weights, 1.0 / len(model.lengths))
     steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
     weights = controller.weights
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
     # A cell of the grid is 5 %.
-    assert weights @ MODEL.lengths == pytest.approx(1.2, abs=0.05)
+    assert weights @ model.lengths == pytest.approx(1.2, abs=0.05)
 
 
 def test_noisier_measurement_reduces_uncertainty_less() -> None:
     """The same measurement with four times its noise; a future depth is rejected."""
-    left = []
+    left, model = [], SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(drift=0.0))
     for noise in (0.0, 1.6e-4):
-        controller = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
+        controller = MultiHypothesisLaw(model, (0.0, 0.0), LIMITS)
         controller.update((1e-4, 0.0), 0, noise)
         left.append(controller.expected(0).covariance[0, 0])
     assert left[1] > 8.0 * left[0]

@@ -3,7 +3,8 @@ Steering law for all hypotheses: bring the tip to a target by guide and roll, on
 
 **Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its
 constants by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses
-together are a mixture of normal distributions.
+together are a mixture of normal distributions. A measurement is implausible if it is outside the
+gate of every hypothesis.
 
 **Control.** In a hypothesis the final position of the tip is
 
@@ -13,7 +14,14 @@ with c from past motion and expected disturbances, the next position of the guid
 the contribution u of later positions. The next position minimizes the mean squared distance of the
 target from the reachable set, over all hypotheses and their errors: **the plan keeps the target
 reachable for every hypothesis**, because the tissue is identified only during the insertion. Among
-equivalent positions, the nearest to a plan for the mean with least motion is used. The needle is
+equivalent positions, the nearest to the position :math:`b` is used that brings the tip to the line
+to the target over the next four depths,
+
+.. math:: b = b_0 + \frac{\sum w \, g \, (l - \bar z)}{(1 + \sigma^2) \sum w \, g^2 + \rho^2},
+
+with the present position :math:`b_0`, the distance of the expected tip from the line
+:math:`l - \bar z`, the shift :math:`g` of the tip per shift of the guide, whose relative variance
+is :math:`\sigma^2`, and sums over hypotheses with weights :math:`w` and over depths. The needle is
 turned only if that reduces the distance below the best distance by the guide alone. As long as a
 turn is left, the later load of the bevel may have any direction.
 """
@@ -26,6 +34,7 @@ from typing import NamedTuple
 
 from needle_controller.compiled.guide_plan import choose_guide, hit_probability, reachable_set
 from needle_controller.compiled.hypotheses import (
+    advance,
     BEVEL,
     FROZEN,
     LOST,
@@ -135,20 +144,21 @@ class MultiHypothesisLaw(SteeringLaw):
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
         from needle_dynamics.compiled.boxed import Boxed
 
-        count, size = len(model.lengths), len(model.prior_covariance)
-        mean = np.zeros((count, size), dtype=np.complex128)
+        prior, count = model.prior_covariance, len(model.lengths)
+        mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
         mean[:, BEVEL] = 1j * model.push
-        covariance = np.empty((count, size, size), dtype=np.complex128)
-        covariance[:] = model.prior_covariance
         self._model = model
         self._now = Steering(
             responses=model.responses,
+            drifts=model.drifts,
+            decay=model.decay,
+            path=(model.depths - model.depths[0]) / np.ptp(model.depths),
             limit=float(limit),
             load_limit=float(limits.load_limit),
             ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
-            covariance=covariance,
+            covariance=np.repeat(prior.astype(np.complex128), count // len(prior), axis=0),
             logs=np.zeros(count),
             guide=np.zeros(model.steps, dtype=np.complex128),
             turned=np.full(model.steps + 1, complex(cos(roll), -sin(roll))),
@@ -277,7 +287,7 @@ class MultiHypothesisLaw(SteeringLaw):
         now, k, last = self._now, self.step, self._model.steps - 1
         if k <= last:
             now.guide[k] = self._choose()
-        now.counts[STEP] = k + 1
+        advance(self._boxed)
         there = complex(now.guide[min(k, last)])
         return GuideSetpoint(there.real, there.imag, float(now.roll[0]))
 
