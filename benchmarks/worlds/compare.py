@@ -97,7 +97,8 @@ def _insert(case: Case, name: str) -> ComparedInsertion:
 
     try:
         run = simulate_steering(law, cast(SteeringPlant, world), case.sensor(), watch)
-    except SteeringFaultError as error:
+    except (SteeringFaultError, ArithmeticError) as error:
+        # Including a rod that the guide bends so far that its shape cannot be computed.
         return ComparedInsertion(stopped=str(error), chance=chance)
     expected = law.expected()
     return ComparedInsertion(

@@ -192,6 +192,8 @@ def _solve(
             )
             off += (there - off) / _SMALL
             start[:3] += motion
+        if not (np.isfinite(slopes).all() and np.isfinite(off).all()):
+            break
         change = np.linalg.solve(slopes, off)
         guess -= change
         if not moving and np.abs(change / scale).max() < _CLOSE:
