@@ -33,7 +33,7 @@ from needle_ros.contract import (
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import check_times, joint_values
+from needle_ros.trajectories import check_times, joint_values, Points
 import numpy as np
 
 
@@ -116,11 +116,7 @@ class SteeredPlant(SimulatedPlant):
         return PlantStatus(insertion_depth=y, tip=(x, z), tip_roll=roll, joint=dict(self._at))
 
     def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
+        self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         """Follow a trajectory of the given joints; `insertion` is ignored without a base."""
         known = (INSERTION, *GUIDE_JOINTS)
@@ -134,13 +130,8 @@ class SteeredPlant(SimulatedPlant):
                 raise ParameterError(f'each point needs a position of {name}')
             motion.follow(self.time, self._at[name], times, found)
         if self.base is not None and INSERTION in joints:
-            self.base.follow(
-                self.time,
-                self.depth,
-                times,
-                joint_values(INSERTION, joints, positions),
-                joint_values(INSERTION, joints, efforts),
-            )
+            columns = (joint_values(INSERTION, joints, values) for values in (positions, efforts))
+            self.base.follow(self.time, self.depth, times, *columns)
         self._motions |= followed
         self._moving |= {*followed}
 
