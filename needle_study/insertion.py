@@ -35,7 +35,7 @@ from needle_dynamics import (
 )
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import CheckedSettings, constant, from_values
 from needle_ros.timing import NANOSECONDS
 from needle_study.reading import check_names, mapping, one_of
 from needle_study.scenario import MeasuredRun, Metric, Variable
@@ -68,13 +68,13 @@ METRICS: Final[Mapping[str, Metric]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InsertionStudy:
+class InsertionStudy(CheckedSettings):
     """Settings of the scenario that are the same for all samples."""
 
     rate: float = constant(1000.0, 'Hz', 'samples of the loop', low=1.0, high=10_000.0)
     delay: float = constant(
         1.0, 'periods', 'whole periods from a measurement to the effect of its command, in the '
-        'model of the law', high=20.0,
+        'model of the law', high=20.0, whole=True,
     )  # fmt: skip
     force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
     speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
@@ -96,11 +96,6 @@ class InsertionStudy:
         _LIMITS.tip_deflection, 'm', 'tip deflection at which the guard stops',
         open_low=True,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.delay != int(self.delay):
-            raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
 
 class _Course(NamedTuple):

@@ -31,14 +31,14 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values, Points
 import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GuideParameters:
+class GuideParameters(CheckedSettings):
     """Limits of the robot that moves, tilts and rolls the needle guide."""
 
     position_limit: float = constant(
@@ -50,9 +50,6 @@ class GuideParameters:
     tilt_speed_limit: float = constant(0.2, 'rad/s', 'highest rate of the tilt', open_low=True)
     roll_speed_limit: float = constant(10.0, 'rad/s', 'highest rate of the roll', open_low=True)
     rise_time: float = constant(0.1, 's', 'time to accelerate to the highest speed', open_low=True)
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
     def motion(self, joint: str, gain: float) -> BaseMotion:
         """Return the motion controller of a guide joint, at rest at zero; ``gain`` is in 1/s."""
