@@ -400,10 +400,5 @@ class ControllerNode(ModelNode):
         return Diagnosis(severity, held or self.state, status)
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(ControllerNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(ControllerNode))

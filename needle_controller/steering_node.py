@@ -315,10 +315,5 @@ class SteeringNode(CompiledNode):
         return Diagnosis(*self._loop.diagnose(self.now()))
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(SteeringNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(SteeringNode))

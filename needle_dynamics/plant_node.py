@@ -484,10 +484,5 @@ class PlantNode(ModelNode):
         return Diagnosis(severity, '; '.join(warnings) or self.state, status)
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(PlantNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(PlantNode))

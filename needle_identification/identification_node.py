@@ -374,9 +374,5 @@ def _answer_later(service: Service) -> None:
     service.send_response = send_later  # type: ignore[method-assign]
 
 
-def main() -> int:
-    return run(IdentificationNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(IdentificationNode))

@@ -369,9 +369,5 @@ def _player() -> PlayerNode:
     return node
 
 
-def main() -> int:
-    return run(_player)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(_player))

@@ -326,9 +326,5 @@ def _offer(qos: QoSProfile) -> OfferedQos:
     )
 
 
-def main() -> int:
-    return run(RecorderNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(RecorderNode))

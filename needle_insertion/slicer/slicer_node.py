@@ -307,10 +307,5 @@ def _check_frame(frame: str) -> None:
         raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(SlicerNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(SlicerNode))
