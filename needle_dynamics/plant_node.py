@@ -19,6 +19,7 @@ from needle_dynamics.simulated.clock import build_sample_clock
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
+from needle_ros.base_node import steady_timer
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease
@@ -29,8 +30,6 @@ from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
-from rclpy.clock import Clock as NodeClock
-from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
 #: Period of the graph checks [s]; number of checks after which an unanswered sample is repeated,
@@ -226,10 +225,9 @@ class PlantNode(ModelNode):
         own = self._run.constants.own
         self._display.begin(own.rate * max(1.0, own.real_time_factor))
         self._time.begin(self.now(), paused=bool(self.get_parameter('paused').value))
-        steady = NodeClock(clock_type=ClockType.STEADY_TIME)
         self._active_timers = (
             self.create_timer(self._time.tick, self._on_timer),
-            self.create_timer(_CHECK, self._on_check, clock=steady),
+            steady_timer(self, _CHECK, self._on_check),
         )
 
     def about(self) -> str:

@@ -7,11 +7,9 @@ from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from needle_ros import contract
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.event_log import Severity
 from needle_ros.system_state import Authority, Mode, PAUSE, REQUESTS, RESUME, STOP, SystemState
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
@@ -44,8 +42,7 @@ class SystemStateTopics:
             if word not in (PAUSE, RESUME):
                 node.create_service(Trigger, f'~/{word}', self._serving(word))
         node.create_service(SetBool, f'~/{PAUSE}', self._on_pause)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_AGAIN, self._publish, clock=steady)
+        steady_timer(node, _AGAIN, self._publish)
 
     def _answer(self, word: str, response: Any) -> Any:
         response.success, response.message = self._request(word)
