@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import inf
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 from typing import Protocol as Interface
 
 from needle_dynamics import FloatArray
@@ -57,23 +57,8 @@ class Scenario(Interface):
         """Simulate one sample again; yield measurements and commands in time order per topic."""
 
 
-# Imported on demand: a study needs a single scenario.
-
-
-def _steering(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.steering import SteeringScenario
-
-    return SteeringScenario(settings)
-
-
-def _insertion(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.insertion import InsertionScenario
-
-    return InsertionScenario(settings)
-
-
-#: Constructor of each scenario from the settings of a study.
-SCENARIOS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
-    'steering': _steering,
-    'insertion': _insertion,
+#: Class of each scenario, imported on demand; it is made from the settings of a study.
+SCENARIOS: Final[Mapping[str, str]] = {
+    'steering': 'needle_study.steering:SteeringScenario',
+    'insertion': 'needle_study.insertion:InsertionScenario',
 }

@@ -158,43 +158,35 @@ class SteeringScenario:
         self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """Compute the metrics of sampled needles, as `Scenario.run`."""
-        count = len(streams)
-        each = {
-            name: samples.get(name, np.full(count, one.default))
-            for name, one in self.variables.items()
-        }
-        found = {name: np.full(count, nan) for name in METRICS}
-        for first in range(0, count, _TOGETHER):
-            some = slice(first, first + _TOGETHER)
-            self._insert(
-                {name: values[some] for name, values in each.items()},
-                streams[some],
-                {name: values[some] for name, values in found.items()},
+        rows = [
+            self._row({name: float(values[k]) for name, values in samples.items()})
+            for k in range(len(streams))
+        ]
+        done = [
+            metrics
+            for first in range(0, len(rows), _TOGETHER)
+            for metrics in self._insert(
+                rows[first : first + _TOGETHER], streams[first : first + _TOGETHER]
             )
-        targets = np.stack([each['target_x'], each['target_z']], axis=1)
-        tips = np.stack([found['tip_x'], found['tip_z']], axis=1)
-        found['miss'] = np.hypot(*(tips - targets).T)
+        ]
+        found = {name: np.array([one.get(name, nan) for one in done]) for name in METRICS}
+        off = (found[f'tip_{k}'] - np.array([row[f'target_{k}'] for row in rows]) for k in 'xz')
+        found['miss'] = np.hypot(*off)
         found['hit'] = (found['miss'] <= HIT).astype(float)
         return found
 
     def _insert(
-        self,
-        each: Mapping[str, FloatArray],
-        streams: Sequence[np.random.Generator],
-        found: Mapping[str, FloatArray],
-    ) -> None:
-        """Simulate insertions; variables and metrics have one value per insertion."""
-        rows = [
-            dict(zip(each, values, strict=True))
-            for values in zip(*(values.tolist() for values in each.values()), strict=True)
-        ]
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> list[dict[str, float]]:
+        """Simulate insertions; return the metrics of each."""
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
         if self._law == _OPEN_LOOP:
-            self._open(truths, found)
-            return
-        for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
-            for name, value in self._steered(truth, row, rng).items():
-                found[name][k] = value
+            return self._open(truths)
+        return list(map(self._steered, truths, rows, streams))
+
+    def _row(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Return the value of each variable."""
+        return {name: sample.get(name, one.default) for name, one in self.variables.items()}
 
     def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
         needle, steering = with_lengths(
@@ -216,7 +208,7 @@ class SteeringScenario:
             seed=int(rng.integers(_SEEDS)),
         )
 
-    def _open(self, truths: Sequence[GroundTruth], found: Mapping[str, FloatArray]) -> None:
+    def _open(self, truths: Sequence[GroundTruth]) -> list[dict[str, float]]:
         """Simulate all insertions with a guide at rest in one batch."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
@@ -231,15 +223,16 @@ class SteeringScenario:
             workers=1,
         )
         frames = np.array([truth.frame for truth in truths])
-        found['tip_x'][:], found['tip_z'][:] = (tips[:, -1, [0, 2]] + frames * depth).T
-        for name in ('guide_travel', 'turns'):
-            found[name][:] = 0.0
+        return [
+            {'tip_x': x, 'tip_z': z, 'guide_travel': 0.0, 'turns': 0.0}
+            for x, z in (tips[:, -1, [0, 2]] + frames * depth).tolist()
+        ]
 
     def replay(
         self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
-        row = {name: sample.get(name, one.default) for name, one in self.variables.items()}
+        row = self._row(sample)
         tilt = row['tilt_x'], row['tilt_z']
         still, messages = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
