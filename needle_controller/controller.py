@@ -438,12 +438,11 @@ class Controller:
         last, self._last_depth = self._last_depth, measured.depth
         moved = abs(measured.depth - last) if last is not None else 0.0
         elsewhere = self._stopped and moved > self.settings.jump and self.target is not None
-        if elsewhere:
-            self._discard_motion()
-            self._last_depth = measured.depth
         self._stopped = False
         if not elsewhere:
             return None
+        self._discard_motion()
+        self._last_depth = measured.depth
         return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
 
 

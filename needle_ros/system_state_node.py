@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -40,20 +41,17 @@ class SystemStateTopics:
         node.subscribe(contract.EMERGENCY_STOP, self._on_emergency)
         for word in REQUESTS:
             if word not in (PAUSE, RESUME):
-                node.create_service(Trigger, f'~/{word}', self._serving(word))
+                node.create_service(Trigger, f'~/{word}', partial(self._answer, word))
         node.create_service(SetBool, f'~/{PAUSE}', self._on_pause)
         steady_timer(node, _AGAIN, self._publish)
 
-    def _answer(self, word: str, response: Any) -> Any:
+    def _answer(self, word: str, _request: Any, response: Any) -> Any:
         response.success, response.message = self._request(word)
         self.publish()
         return response
 
-    def _serving(self, word: str) -> Callable[[Any, Any], Any]:
-        return lambda _request, response: self._answer(word, response)
-
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        return self._answer(PAUSE if request.data else RESUME, response)
+        return self._answer(PAUSE if request.data else RESUME, request, response)
 
     def _on_emergency(self, message: Bool) -> None:
         if message.data:
