@@ -162,8 +162,8 @@ class SteeringScenario(Scenario):
         steered = map(self._steered, truths, rows, streams)
         each = self._open(truths) if self._law == _OPEN_LOOP else steered
         for row, found in zip(rows, each, strict=True):
-            off = (found.get(f'tip_{axis}', nan) - row[f'target_{axis}'] for axis in 'xz')
-            miss = float(np.hypot(*off))
+            x, z = (found.get(f'tip_{axis}', nan) - row[f'target_{axis}'] for axis in 'xz')
+            miss = float(np.hypot(x, z))
             yield {**found, 'miss': miss, 'hit': float(miss <= HIT)}
 
     def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
