@@ -4,123 +4,77 @@ Control of a flexible needle: laws, references, observer, stability, safety, and
 Units are SI throughout; signs and frames follow docs/architecture.md.
 """
 
-from needle_controller.admittance import Admittance
-from needle_controller.controller import (
-    Controller,
-    ControllerOutput,
-    ControllerSettings,
-    DEFAULT_GAINS,
-    LAWS,
-    Measurement,
-)
-from needle_controller.force_command import ForceCommand
-from needle_controller.hardware import HardwareSettings, Robot
-from needle_controller.in_loop.continuous import run_continuous
-from needle_controller.in_loop.run import LoopRun
-from needle_controller.in_loop.sampled import Commander, LoopBatch, run_batch, run_controller
-from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
-from needle_controller.laws.axis import Axis
-from needle_controller.laws.continuous import (
-    ContinuousInverseDynamics,
-    ContinuousLaw,
-    ContinuousPid,
-)
-from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.laws.law import Law, no_memory, SampledLoop
-from needle_controller.laws.pid import Pid, PidGains
-from needle_controller.observer.consistency import Consistency
-from needle_controller.observer.observer import Observer
-from needle_controller.observer.settings import ObserverSettings
-from needle_controller.reference.generator import REFERENCES
-from needle_controller.reference.quintic import MinimumJerk
-from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
-from needle_controller.reference.trapezoid import Trapezoid
-from needle_controller.safety.guard import Guard
-from needle_controller.safety.input_monitor import InputMonitor
-from needle_controller.safety.limits import SafetyLimits
-from needle_controller.stability import (
-    check_stability,
-    Limit,
-    spectral_radius,
-    stability_limit,
-    transition_matrix,
-)
-from needle_controller.steering.executive import SteeringExecutive
-from needle_controller.steering.law import (
-    build_law,
-    GuideSetpoint,
-    STEERING_LAWS,
-    SteeringFaultError,
-    SteeringLaw,
-    TipEstimate,
-)
-from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
-from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits
-from needle_controller.steering.prior import SteeringPrior
-from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.uncertainty import Uncertainty
+from typing import TYPE_CHECKING
 
-__all__ = [
-    'DEFAULT_GAINS',
-    'LAWS',
-    'REFERENCES',
-    'SIMULATION_LIMITS',
-    'STEERING_LAWS',
-    'Adaptive',
-    'AdaptiveGains',
-    'Admittance',
-    'Axis',
-    'Commander',
-    'Consistency',
-    'ContinuousInverseDynamics',
-    'ContinuousLaw',
-    'ContinuousPid',
-    'Controller',
-    'ControllerOutput',
-    'ControllerSettings',
-    'ExecutiveSettings',
-    'ForceCommand',
-    'Guard',
-    'GuideSetpoint',
-    'HardwareSettings',
-    'InputMonitor',
-    'InverseDynamics',
-    'InverseDynamicsGains',
-    'Law',
-    'Limit',
-    'LoopBatch',
-    'LoopRun',
-    'Measurement',
-    'MinimumJerk',
-    'MultiHypothesisLaw',
-    'Observer',
-    'ObserverSettings',
-    'OutOfReachError',
-    'Pid',
-    'PidGains',
-    'Reference',
-    'ReferenceLimits',
-    'Robot',
-    'SafetyLimits',
-    'SampledLoop',
-    'Setpoint',
-    'SteeringExecutive',
-    'SteeringFaultError',
-    'SteeringLaw',
-    'SteeringLimits',
-    'SteeringModel',
-    'SteeringPrior',
-    'TipEstimate',
-    'Trapezoid',
-    'Uncertainty',
-    'build_law',
-    'check_stability',
-    'no_memory',
-    'run_batch',
-    'run_continuous',
-    'run_controller',
-    'spectral_radius',
-    'stability_limit',
-    'transition_matrix',
-]
+from needle_ros.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from needle_controller.admittance import Admittance as Admittance
+    from needle_controller.controller import Controller as Controller
+    from needle_controller.controller import ControllerOutput as ControllerOutput
+    from needle_controller.controller import ControllerSettings as ControllerSettings
+    from needle_controller.controller import DEFAULT_GAINS as DEFAULT_GAINS
+    from needle_controller.controller import LAWS as LAWS
+    from needle_controller.controller import Measurement as Measurement
+    from needle_controller.force_command import ForceCommand as ForceCommand
+    from needle_controller.hardware import HardwareSettings as HardwareSettings
+    from needle_controller.hardware import Robot as Robot
+    from needle_controller.in_loop.continuous import run_continuous as run_continuous
+    from needle_controller.in_loop.run import LoopRun as LoopRun
+    from needle_controller.in_loop.sampled import Commander as Commander
+    from needle_controller.in_loop.sampled import LoopBatch as LoopBatch
+    from needle_controller.in_loop.sampled import run_batch as run_batch
+    from needle_controller.in_loop.sampled import run_controller as run_controller
+    from needle_controller.laws.adaptive import Adaptive as Adaptive
+    from needle_controller.laws.adaptive import AdaptiveGains as AdaptiveGains
+    from needle_controller.laws.axis import Axis as Axis
+    from needle_controller.laws.continuous import (
+        ContinuousInverseDynamics as ContinuousInverseDynamics,
+    )
+    from needle_controller.laws.continuous import ContinuousLaw as ContinuousLaw
+    from needle_controller.laws.continuous import ContinuousPid as ContinuousPid
+    from needle_controller.laws.inverse_dynamics import InverseDynamics as InverseDynamics
+    from needle_controller.laws.inverse_dynamics import (
+        InverseDynamicsGains as InverseDynamicsGains,
+    )
+    from needle_controller.laws.law import Law as Law
+    from needle_controller.laws.law import no_memory as no_memory
+    from needle_controller.laws.law import SampledLoop as SampledLoop
+    from needle_controller.laws.pid import Pid as Pid
+    from needle_controller.laws.pid import PidGains as PidGains
+    from needle_controller.observer.consistency import Consistency as Consistency
+    from needle_controller.observer.observer import Observer as Observer
+    from needle_controller.observer.settings import ObserverSettings as ObserverSettings
+    from needle_controller.reference.generator import REFERENCES as REFERENCES
+    from needle_controller.reference.quintic import MinimumJerk as MinimumJerk
+    from needle_controller.reference.setpoint import Reference as Reference
+    from needle_controller.reference.setpoint import ReferenceLimits as ReferenceLimits
+    from needle_controller.reference.setpoint import Setpoint as Setpoint
+    from needle_controller.reference.trapezoid import Trapezoid as Trapezoid
+    from needle_controller.safety.guard import Guard as Guard
+    from needle_controller.safety.input_monitor import InputMonitor as InputMonitor
+    from needle_controller.safety.limits import SafetyLimits as SafetyLimits
+    from needle_controller.stability import check_stability as check_stability
+    from needle_controller.stability import Limit as Limit
+    from needle_controller.stability import spectral_radius as spectral_radius
+    from needle_controller.stability import stability_limit as stability_limit
+    from needle_controller.stability import transition_matrix as transition_matrix
+    from needle_controller.steering.executive import SteeringExecutive as SteeringExecutive
+    from needle_controller.steering.law import build_law as build_law
+    from needle_controller.steering.law import GuideSetpoint as GuideSetpoint
+    from needle_controller.steering.law import STEERING_LAWS as STEERING_LAWS
+    from needle_controller.steering.law import SteeringFaultError as SteeringFaultError
+    from needle_controller.steering.law import SteeringLaw as SteeringLaw
+    from needle_controller.steering.law import TipEstimate as TipEstimate
+    from needle_controller.steering.laws.multi_hypothesis import (
+        MultiHypothesisLaw as MultiHypothesisLaw,
+    )
+    from needle_controller.steering.laws.multi_hypothesis import OutOfReachError as OutOfReachError
+    from needle_controller.steering.limits import SIMULATION_LIMITS as SIMULATION_LIMITS
+    from needle_controller.steering.limits import SteeringLimits as SteeringLimits
+    from needle_controller.steering.prior import SteeringPrior as SteeringPrior
+    from needle_controller.steering.responses import SteeringModel as SteeringModel
+    from needle_controller.steering.settings import ExecutiveSettings as ExecutiveSettings
+    from needle_controller.uncertainty import Uncertainty as Uncertainty
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

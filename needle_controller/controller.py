@@ -20,7 +20,7 @@ from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, flag
+from needle_ros.settings import CheckedSettings, constant, flag
 from needle_ros.status import ControllerStatus
 
 #: Controlled axes.
@@ -51,13 +51,13 @@ LAWS: Final = tuple(DEFAULT_GAINS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ControllerSettings:
+class ControllerSettings(CheckedSettings):
     """Rate, delay and limits of a controller."""
 
     rate: float = constant(1000.0, 'Hz', 'rate of joint_states', low=1.0, high=10_000.0)
     delay: float = constant(
         1.0, 'periods', 'number of whole periods from a measurement to the effect of its command',
-        high=20.0,
+        high=20.0, whole=True,
     )  # fmt: skip
     force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
     torque_limit: float = constant(0.01, 'N m', 'largest torque', open_low=True)
@@ -82,11 +82,6 @@ class ControllerSettings:
         10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller',
         open_low=True,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.delay != int(self.delay):
-            raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
         """
@@ -443,12 +438,11 @@ class Controller:
         last, self._last_depth = self._last_depth, measured.depth
         moved = abs(measured.depth - last) if last is not None else 0.0
         elsewhere = self._stopped and moved > self.settings.jump and self.target is not None
-        if elsewhere:
-            self._discard_motion()
-            self._last_depth = measured.depth
         self._stopped = False
         if not elsewhere:
             return None
+        self._discard_motion()
+        self._last_depth = measured.depth
         return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
 
 

@@ -29,6 +29,7 @@ from needle_controller.uncertainty import Uncertainty
 from needle_controller.waiting_request import JointPath
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
+from needle_ros.base_node import steady_timer
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
@@ -40,8 +41,6 @@ from needle_ros.timing import nanoseconds, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
 from trajectory_msgs.msg import JointTrajectory
 
@@ -161,8 +160,6 @@ class ControllerNode(ModelNode):
             self._on_request,
             lambda: self._act(supervisor.obey(self.now())),
         )
-        #: A stopped or jumping ROS clock does not stop the watchdog.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def _connect(self) -> None:
         """Offer the commands and subscribe to measurements; `configure` raises the errors."""
@@ -276,9 +273,7 @@ class ControllerNode(ModelNode):
         """Start to answer measurements and to check for missing inputs."""
         self._supervisor.activate(self.now(), self._who_publishes())
         self._checks, self._missing = 0, ''
-        self._watchdog = self.create_timer(
-            self._supervisor.watch_period, self._check_inputs, clock=self._steady
-        )
+        self._watchdog = steady_timer(self, self._supervisor.watch_period, self._check_inputs)
 
     def about(self) -> str:
         """Name law, constants, rate and topics."""
@@ -400,10 +395,5 @@ class ControllerNode(ModelNode):
         return Diagnosis(severity, held or self.state, status)
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(ControllerNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(ControllerNode))

@@ -83,29 +83,10 @@ CONTRACT: Final = Topics(
 
 class Driver:
     """
-    Read and command a robot by its own topics and message types.
+    Read and command a robot by its own `topics` and message types, for the node of a controller.
 
-    Parameters
-    ----------
-    node : BaseNode
-        The controller.
-    settings : HardwareSettings
-        Joints, units, topics and commands of the robot.
-
-    Attributes
-    ----------
-    robot : Robot
-        Conversion of joints and units.
-    topics : Topics
-        Topics of the robot.
-
-    Raises
-    ------
-    ParameterError
-        If a topic name is invalid, or there is not exactly one topic of its type.
-    MessageError
-        If the message type of the joint states is not installed.
-
+    Raises `ParameterError` if a topic name is invalid, or there is not exactly one topic of its
+    type, and `MessageError` if the message type of the joint states is not installed.
     """
 
     def __init__(self, node: BaseNode, settings: HardwareSettings) -> None:

@@ -26,6 +26,7 @@ from needle_dynamics.steering.parameters import (
     SteeringParameters,
 )
 from needle_ros import contract
+from needle_ros.base_node import steady_timer
 from needle_ros.errors import printable
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import Publishers
@@ -39,8 +40,6 @@ from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration as Delay
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
@@ -126,8 +125,6 @@ class SteeringNode(CompiledNode):
         self._unreported: int | None = None
         #: Whether a motion was sent since the last report.
         self._moved = False
-        #: A stopped or jumping ROS clock does not stop the checks.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     # Transitions.
 
@@ -156,7 +153,7 @@ class SteeringNode(CompiledNode):
 
     def activate(self) -> None:
         """Start to process measurements, and to check for missing inputs."""
-        self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
+        self._timer = steady_timer(self, _WATCH, self._watch)
         if self.get_parameter('use_sim_time').value:
             self._processed = self.publisher(contract.PROCESSED, always=True)
 
@@ -315,10 +312,5 @@ class SteeringNode(CompiledNode):
         return Diagnosis(*self._loop.diagnose(self.now()))
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(SteeringNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(SteeringNode))

@@ -11,7 +11,7 @@ from needle_controller.compiled.laws import INVERSE_DYNAMICS
 from needle_controller.compiled.loop import ring
 from needle_controller.laws.axis import Axis
 from needle_controller.laws.law import Law
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 import numpy as np
 
 #: Fractions of the carriage mass that are checked.
@@ -30,7 +30,7 @@ _LEAST: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Uncertainty:
+class Uncertainty(CheckedSettings):
     """Largest deviation of the true axis from the modeled one, for the check of stability."""
 
     viscous: float = constant(0.3, '1', 'relative uncertainty of viscous friction', high=0.9)
@@ -39,9 +39,6 @@ class Uncertainty:
     carriage: float = constant(
         2.0, 'kg', 'mass that may move with the needle in addition to model.carriage_mass'
     )
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
     def axes(self, axis: Axis, *, carriage: bool = False) -> list[Axis]:
         """

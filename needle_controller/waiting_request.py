@@ -9,7 +9,7 @@ from needle_controller.controller import Controller
 from needle_ros.contract import INSERTION, Topic
 from needle_ros.errors import ParameterError
 from needle_ros.requests import RequestLog, Verdict
-from needle_ros.trajectories import joint_values, MOST_POINTS
+from needle_ros.trajectories import joint_values, MOST_POINTS, Points
 
 
 class AxialRequest(NamedTuple):
@@ -47,18 +47,14 @@ class WaitingRequest:
         if request is not None:
             self._requests.answer(request.topic, request.stamp, verdict, reason)
 
-    def forget(self) -> None:
-        """Discard the request without an answer."""
-        self._request = None
-
 
 class JointPath(NamedTuple):
     """Path of joints: times from now [s], positions [m] and velocities [m/s] or none, by joint."""
 
     joints: Sequence[str]
     times: Sequence[float]
-    positions: Sequence[Sequence[float]]
-    velocities: Sequence[Sequence[float]] = ()
+    positions: Points
+    velocities: Points = ()
 
 
 def follow_path(controller: Controller, path: JointPath) -> None:

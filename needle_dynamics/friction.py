@@ -12,6 +12,7 @@ from needle_dynamics.compiled.friction import (
     FrictionConstants,
 )
 from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,10 +57,7 @@ class Friction:
     smoothing_speed: float = 1e-4
 
     def __post_init__(self) -> None:
-        if self.law not in FRICTION_LAWS:
-            raise ParameterError(
-                f'law must be one of {", ".join(FRICTION_LAWS)}, got {self.law!r}'
-            )
+        check_choice('law', self.law, FRICTION_LAWS)
         least = {'coulomb': 0.0, 'viscous': 0.0, 'withdrawal': 0.0, 'breakaway': 1.0}
         for name, low in least.items():
             value = getattr(self, name)

@@ -15,6 +15,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
 from needle_dynamics.model import NeedleModel
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.settings import check_choice
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -282,8 +283,8 @@ def _friction(
     law: Friction, velocity: float, drive: float, sliding: str | None
 ) -> tuple[float, float]:
     """Return the friction force [N] and its derivative with respect to velocity [N s/m]."""
-    if sliding is not None and sliding not in SLIDING:
-        raise ParameterError(f'sliding must be one of {", ".join(SLIDING)}, got {sliding!r}')
+    if sliding is not None:
+        check_choice('sliding', sliding, SLIDING)
     if velocity != 0.0:
         return law.force(velocity, drive), law.slope(velocity, velocity)
     ahead, back = law.force(0.0, inf), law.force(0.0, -inf)

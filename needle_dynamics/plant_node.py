@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from functools import partial
 import sys
 from time import monotonic_ns
 from typing import Any
@@ -19,6 +20,7 @@ from needle_dynamics.simulated.clock import build_sample_clock
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
+from needle_ros.base_node import steady_timer
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease
@@ -29,8 +31,6 @@ from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
-from rclpy.clock import Clock as NodeClock
-from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
 #: Period of the graph checks [s]; number of checks after which an unanswered sample is repeated,
@@ -149,12 +149,14 @@ class PlantNode(ModelNode):
             self, lambda: self._time.simulated(self.now()), self._follow
         )
         self._reports = SampleReports(self, self._on_timer)
-        self.create_service(Trigger, '~/tare', self._on_tare)
-        self.create_service(SetBool, '~/pause_time', self._on_pause)
+        self.create_service(Trigger, '~/tare', partial(self._answer, 'tare', self._tare))
+        self.create_service(
+            SetBool, '~/pause_time', partial(self._answer, 'pause_time', self._pause)
+        )
         self._authority, self._mode = Authority(), Mode.RUNNING
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
-        self.create_service(Trigger, '~/step', self._on_step)
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(Trigger, '~/step', partial(self._answer, 'step', self._step))
+        self.create_service(Trigger, '~/reset', partial(self._answer, 'reset', self._reset))
 
     # Transitions.
 
@@ -226,10 +228,9 @@ class PlantNode(ModelNode):
         own = self._run.constants.own
         self._display.begin(own.rate * max(1.0, own.real_time_factor))
         self._time.begin(self.now(), paused=bool(self.get_parameter('paused').value))
-        steady = NodeClock(clock_type=ClockType.STEADY_TIME)
         self._active_timers = (
             self.create_timer(self._time.tick, self._on_timer),
-            self.create_timer(_CHECK, self._on_check, clock=steady),
+            steady_timer(self, _CHECK, self._on_check),
         )
 
     def about(self) -> str:
@@ -308,51 +309,41 @@ class PlantNode(ModelNode):
 
     # Services.
 
-    def _answer(self, response: Any, request: str, act: Callable[[PlantRun], str]) -> Any:
+    def _answer(
+        self, name: str, act: Callable[[PlantRun, Any], str], request: Any, response: Any
+    ) -> Any:
         """Execute a service request, or report the reason for its rejection."""
         try:
             if self._run is None or not self.is_active:
                 raise JobError('the plant is not active')
-            response.message = act(self._run)
+            response.message = act(self._run, request)
             response.success = True
         except (JobError, ParameterError) as error:
-            response.message = f'{request} refused: {error}'
+            response.message = f'{name} refused: {error}'
         self.publish_diagnostics()
         return response
 
-    def _on_tare(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def tare(plant_run: PlantRun) -> str:
-            plant_run.perform(Event(TARE))
-            return 'the force sensor is zeroed'
+    def _tare(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
+        plant_run.perform(Event(TARE))
+        return 'the force sensor is zeroed'
 
-        return self._answer(response, 'tare', tare)
+    def _pause(self, _run: PlantRun, request: SetBool.Request) -> str:
+        if request.data:
+            self._time.pause()
+            return f'paused at {self._time.stamp / NANOSECONDS:.6f} s'
+        self._time.resume(self.now())
+        return 'time resumed'
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        def pause(_run: PlantRun) -> str:
-            if request.data:
-                self._time.pause()
-                return f'paused at {self._time.stamp / NANOSECONDS:.6f} s'
-            self._time.resume(self.now())
-            return 'time resumed'
+    def _step(self, _run: PlantRun, _request: Trigger.Request) -> str:
+        self._sample(self._time.step(self.now()))
+        return f'stepped to {self._time.stamp / NANOSECONDS:.6f} s'
 
-        return self._answer(response, 'pause_time', pause)
-
-    def _on_step(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def step(_run: PlantRun) -> str:
-            self._sample(self._time.step(self.now()))
-            return f'stepped to {self._time.stamp / NANOSECONDS:.6f} s'
-
-        return self._answer(response, 'step', step)
-
-    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def reset(plant_run: PlantRun) -> str:
-            plant_run.perform(Event(RESET))
-            self._trajectories.requests.supersede(self._time.simulated(self.now()))
-            self._halted = None
-            self._set_fault({})
-            return 'needle and noise reset; time continues'
-
-        return self._answer(response, 'reset', reset)
+    def _reset(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
+        plant_run.perform(Event(RESET))
+        self._trajectories.requests.supersede(self._time.simulated(self.now()))
+        self._halted = None
+        self._set_fault({})
+        return 'needle and noise reset; time continues'
 
     # Samples.
 
@@ -484,10 +475,5 @@ class PlantNode(ModelNode):
         return Diagnosis(severity, '; '.join(warnings) or self.state, status)
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(PlantNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(PlantNode))

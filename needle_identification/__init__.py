@@ -14,91 +14,58 @@ from typing import TYPE_CHECKING
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from needle_identification.bags.bag import Bag, message_counts, read_topic, Recorded
-    from needle_identification.bags.messages import deserialize, encode, message_type
-    from needle_identification.bags.topics import BagTopic, OfferedQos
-    from needle_identification.bags.writer import BagWriter
-    from needle_identification.errors import IdentificationError, RecordingError
-    from needle_identification.estimation import ESTIMATORS
-    from needle_identification.estimation.estimate import ParameterEstimate, Statistic
-    from needle_identification.estimation.regression import regress, Regression
-    from needle_identification.friction.estimate import (
-        Fit,
-        FrictionEstimate,
-        FrictionSummary,
-        summarize,
-    )
-    from needle_identification.friction.identify import identify_friction
-    from needle_identification.friction.recursive import RecursiveFriction
-    from needle_identification.friction.settings import FrictionSettings, TERMS
-    from needle_identification.recordings.inspection import inspect_recording, Inspection
+    from needle_identification.bags.bag import Bag as Bag
+    from needle_identification.bags.bag import message_counts as message_counts
+    from needle_identification.bags.bag import read_topic as read_topic
+    from needle_identification.bags.bag import Recorded as Recorded
+    from needle_identification.bags.messages import deserialize as deserialize
+    from needle_identification.bags.messages import encode as encode
+    from needle_identification.bags.messages import message_type as message_type
+    from needle_identification.bags.topics import BagTopic as BagTopic
+    from needle_identification.bags.topics import OfferedQos as OfferedQos
+    from needle_identification.bags.writer import BagWriter as BagWriter
+    from needle_identification.errors import IdentificationError as IdentificationError
+    from needle_identification.errors import RecordingError as RecordingError
+    from needle_identification.estimation import ESTIMATORS as ESTIMATORS
+    from needle_identification.estimation.estimate import ParameterEstimate as ParameterEstimate
+    from needle_identification.estimation.estimate import Statistic as Statistic
+    from needle_identification.estimation.regression import regress as regress
+    from needle_identification.estimation.regression import Regression as Regression
+    from needle_identification.friction.estimate import Fit as Fit
+    from needle_identification.friction.estimate import FrictionEstimate as FrictionEstimate
+    from needle_identification.friction.estimate import FrictionSummary as FrictionSummary
+    from needle_identification.friction.estimate import summarize as summarize
+    from needle_identification.friction.identify import identify_friction as identify_friction
+    from needle_identification.friction.recursive import RecursiveFriction as RecursiveFriction
+    from needle_identification.friction.settings import FrictionSettings as FrictionSettings
+    from needle_identification.friction.settings import TERMS as TERMS
+    from needle_identification.recordings.inspection import inspect_recording as inspect_recording
+    from needle_identification.recordings.inspection import Inspection as Inspection
     from needle_identification.recordings.reading import (
-        read_friction_recording,
-        read_indentation_recording,
+        read_friction_recording as read_friction_recording,
     )
-    from needle_identification.recordings.recording import IndentationRecording, Recording
-    from needle_identification.result import write_result
-    from needle_identification.steering.estimate import SteeringEstimate
-    from needle_identification.steering.identify import identify_steering, SteeringSettings
-    from needle_identification.steering.reading import read_steering_recording
-    from needle_identification.steering.recording import SteeringRecording
-    from needle_identification.stiffness.estimate import (
-        LevelEstimate,
-        StiffnessEstimate,
-        StiffnessSummary,
-        summarize_stiffness,
+    from needle_identification.recordings.reading import (
+        read_indentation_recording as read_indentation_recording,
     )
-    from needle_identification.stiffness.identify import identify_stiffness
-    from needle_identification.stiffness.matrix import asymmetry
-    from needle_identification.stiffness.presses import Presses
-    from needle_identification.stiffness.settings import StiffnessSettings
+    from needle_identification.recordings.recording import (
+        IndentationRecording as IndentationRecording,
+    )
+    from needle_identification.recordings.recording import Recording as Recording
+    from needle_identification.result import write_result as write_result
+    from needle_identification.steering.estimate import SteeringEstimate as SteeringEstimate
+    from needle_identification.steering.identify import identify_steering as identify_steering
+    from needle_identification.steering.identify import SteeringSettings as SteeringSettings
+    from needle_identification.steering.reading import (
+        read_steering_recording as read_steering_recording,
+    )
+    from needle_identification.steering.recording import SteeringRecording as SteeringRecording
+    from needle_identification.stiffness.estimate import LevelEstimate as LevelEstimate
+    from needle_identification.stiffness.estimate import StiffnessEstimate as StiffnessEstimate
+    from needle_identification.stiffness.estimate import StiffnessSummary as StiffnessSummary
+    from needle_identification.stiffness.estimate import summarize_stiffness as summarize_stiffness
+    from needle_identification.stiffness.identify import identify_stiffness as identify_stiffness
+    from needle_identification.stiffness.matrix import asymmetry as asymmetry
+    from needle_identification.stiffness.presses import Presses as Presses
+    from needle_identification.stiffness.settings import StiffnessSettings as StiffnessSettings
 else:
-    __getattr__, __dir__ = lazy_names(__name__)
-
-__all__ = [
-    'ESTIMATORS',
-    'TERMS',
-    'Bag',
-    'BagTopic',
-    'BagWriter',
-    'Fit',
-    'FrictionEstimate',
-    'FrictionSettings',
-    'FrictionSummary',
-    'IdentificationError',
-    'IndentationRecording',
-    'Inspection',
-    'LevelEstimate',
-    'OfferedQos',
-    'ParameterEstimate',
-    'Presses',
-    'Recorded',
-    'Recording',
-    'RecordingError',
-    'RecursiveFriction',
-    'Regression',
-    'Statistic',
-    'SteeringEstimate',
-    'SteeringRecording',
-    'SteeringSettings',
-    'StiffnessEstimate',
-    'StiffnessSettings',
-    'StiffnessSummary',
-    'asymmetry',
-    'deserialize',
-    'encode',
-    'identify_friction',
-    'identify_steering',
-    'identify_stiffness',
-    'inspect_recording',
-    'message_counts',
-    'message_type',
-    'read_friction_recording',
-    'read_indentation_recording',
-    'read_steering_recording',
-    'read_topic',
-    'regress',
-    'summarize',
-    'summarize_stiffness',
-    'write_result',
-]
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

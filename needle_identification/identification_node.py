@@ -32,7 +32,7 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.requests import no_answer
 from needle_ros.run_node import run
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 from needle_ros.status import Diagnosis, IdentificationStatus
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
@@ -50,7 +50,7 @@ _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IdentificationSettings:
+class IdentificationSettings(CheckedSettings):
     """Settings of the node; each field has its meaning and unit."""
 
     level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
@@ -60,9 +60,6 @@ class IdentificationSettings:
         'live: time in motion in which the weight of a sample falls to 1/e',
         open_low=True,
     )
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 class _Application(NamedTuple):
@@ -377,9 +374,5 @@ def _answer_later(service: Service) -> None:
     service.send_response = send_later  # type: ignore[method-assign]
 
 
-def main() -> int:
-    return run(IdentificationNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(IdentificationNode))

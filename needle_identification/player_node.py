@@ -15,15 +15,13 @@ from needle_identification.bags.playback import BagPlayback, PlaybackSettings
 from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
-from needle_ros.base_node import BaseNode, message_class
+from needle_ros.base_node import BaseNode, message_class, steady_timer
 from needle_ros.contract import EMERGENCY_STOP, SYSTEM_STATE
 from needle_ros.errors import MessageError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, PlayerPhase, PlayerStatus
 from needle_ros.timing import NANOSECONDS
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -180,10 +178,9 @@ class PlayerNode(BaseNode):
         self._reset_clock()
         self._played = 0
         # Timers must run while the recorded time is paused.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers_of_play = [
-            self.create_timer(_TICK, self._on_timer, clock=steady),
-            self.create_timer(_CHECK, self._check_publishers, clock=steady),
+            steady_timer(self, _TICK, self._on_timer),
+            steady_timer(self, _CHECK, self._check_publishers),
         ]
 
     def about(self) -> str:
@@ -369,9 +366,5 @@ def _player() -> PlayerNode:
     return node
 
 
-def main() -> int:
-    return run(_player)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(_player))

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
-from needle_ros.base_node import BaseNode, message_class
+from needle_ros.base_node import BaseNode, message_class, steady_timer
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.event_log import Severity
@@ -19,8 +19,6 @@ from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, RecorderStatus
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -88,10 +86,9 @@ class RecorderNode(BaseNode):
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
         # The timers must run while the simulation time is paused.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
-        self.create_timer(_FLUSH_PERIOD, self._flush, clock=steady)
-        self.create_timer(_TAKE_PERIOD, self._take, clock=steady)
+        steady_timer(self, _DISCOVERY_PERIOD, self._discover)
+        steady_timer(self, _FLUSH_PERIOD, self._flush)
+        steady_timer(self, _TAKE_PERIOD, self._take)
 
     def configure(self) -> None:
         path = self.text('path')
@@ -326,9 +323,5 @@ def _offer(qos: QoSProfile) -> OfferedQos:
     )
 
 
-def main() -> int:
-    return run(RecorderNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(RecorderNode))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
+import runpy
 import signal
 import sys
 from typing import Final
@@ -20,9 +20,9 @@ NODES: Final = {
 }
 
 
-def main() -> int:
-    """Run the node with the name of this program; return the exit status."""
+def main() -> None:
+    """Run the node with the name of this program as ``python -m`` does; exit with its status."""
     # Imports take a second: Ctrl-C ends them at once, without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     name = Path(sys.argv[0]).stem.removeprefix('needle-')
-    return int(import_module(NODES[name]).main())
+    runpy.run_module(NODES[name], run_name='__main__')

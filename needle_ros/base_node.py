@@ -24,10 +24,12 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from std_msgs.msg import String
 
 
@@ -42,6 +44,11 @@ def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
         liveliness=LivelinessPolicy.AUTOMATIC,
         **lease,
     )
+
+
+def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
+    """Create a timer [s] that also runs while the ROS clock is stopped, or jumps."""
+    return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def message_class(*type_names: str) -> Any:
@@ -105,9 +112,7 @@ class BaseNode(ParameterNode):
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
         self._last_severity = Severity.INFO
-        # Steady clock: diagnostics continue in a paused simulation.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
+        steady_timer(self, 1.0, self.publish_diagnostics)
         self.add_post_set_parameters_callback(self._after_change)
 
     # Hooks of subclasses.

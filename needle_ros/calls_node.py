@@ -7,9 +7,8 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_ros import requests
+from needle_ros.base_node import steady_timer
 from rclpy.client import Client
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -48,9 +47,7 @@ class Calls:
 
     def __init__(self, node: Node) -> None:
         self._calls: list[_Call] = []
-        # Steady clock: timeouts also elapse in a paused simulation.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK, self._check, clock=steady)
+        steady_timer(node, _CHECK, self._check)
 
     def call(self, client: Client, request: Any) -> Future:
         """Call a service; the future has result None after `CALL_TIMEOUT` without a response."""

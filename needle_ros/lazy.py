@@ -10,12 +10,12 @@ import sys
 from typing import Any
 
 
-def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """
-    Return ``__getattr__`` and ``__dir__`` of a package, so that importing it is cheap.
+    Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package that is cheap to import.
 
-    The names are those that its ``__init__.py`` imports under ``if TYPE_CHECKING:``, where type
-    checkers see them; assign the two functions in the ``else`` branch.
+    The names are those that its ``__init__.py`` imports under ``if TYPE_CHECKING:``, each as
+    itself for type checkers; assign the three in the ``else`` branch.
     """
     module = sys.modules[package]
     modules = _modules_by_name(Path(str(module.__file__)).read_text(encoding='utf-8'))
@@ -27,7 +27,8 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
         setattr(module, name, value)
         return value
 
-    return get, lambda: sorted({*vars(module), *modules})
+    names = sorted(modules, key=lambda name: (not name.isupper(), name))
+    return get, lambda: sorted({*vars(module), *names}), names
 
 
 def _modules_by_name(source: str) -> dict[str, str]:

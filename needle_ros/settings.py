@@ -32,13 +32,15 @@ def constant(
     high: float = inf,
     open_low: bool = False,
     unlimited: bool = False,
+    whole: bool = False,
 ) -> Any:
     """
     Declare a numeric dataclass field with unit, description and valid range.
 
     A tuple as default declares an array field, whose elements all have the range. The unit is an
     SI unit, ``1`` for a pure number. The description becomes the description of the ROS parameter.
-    `open_low` excludes ``low`` itself. With `unlimited` infinity is valid.
+    `open_low` excludes ``low`` itself. With `unlimited` infinity is valid, with `whole` only whole
+    numbers are.
     """
     return field(
         default=default,
@@ -49,6 +51,7 @@ def constant(
             'high': high,
             'open_low': open_low,
             'unlimited': unlimited,
+            'whole': whole,
         },
     )
 
@@ -89,6 +92,15 @@ def check_constants(values: object) -> None:
             raise ParameterError(f'{item.name} must be {_NAMES[meta["type"]]}, got {value!r}')
 
 
+class CheckedSettings:
+    """Base of dataclasses whose fields are checked by `check_constants`."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
 def check_choice(name: str, value: object, valid: Collection[str]) -> None:
     """Raise `ParameterError` if a value is not one of the valid words."""
     if not isinstance(value, str) or value not in valid:
@@ -110,6 +122,9 @@ def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
             f'{name} must be {finite}{sign} {meta["low"]:g}{upper}'
             f'{" " + meta["unit"] if meta["unit"] != "1" else ""}, got {value!r}'
         )
+    if meta['whole'] and value != int(value):
+        of = '' if meta['unit'] == '1' else f' of {meta["unit"]}'
+        raise ParameterError(f'{name} must be a whole number{of}, got {value!r}')
 
 
 def from_values(

@@ -142,20 +142,8 @@ class Authority:
     """
     System state in one node, and the requests that change it.
 
-    Parameters
-    ----------
-    node : str
-        Name of the node.
-    time : callable
-        Returns a time [ns] by which requests of different nodes are ordered.
-
-    Attributes
-    ----------
-    state : SystemState
-        The state.
-    changed : bool
-        Whether the state has changed since the node published it.
-
+    ``time`` returns a time [ns] by which requests of different nodes are ordered. `changed` is
+    whether the state has changed since the node published it.
     """
 
     def __init__(self, node: str = '', time: Callable[[], int] = time_ns) -> None:
@@ -207,18 +195,8 @@ class Authority:
         """
         Execute a request of a user, a word of `REQUESTS`.
 
-        Parameters
-        ----------
-        word : str
-            The request.
-        obstacle : str
-            Reason why the node cannot execute it, or ''.
-
-        Returns
-        -------
-        tuple of (bool, str)
-            Whether it is executed, and one line for the user.
-
+        ``obstacle`` is the reason why the node cannot execute it, or ''. Return whether it is
+        executed, and one line for the user.
         """
         stopped = self.reason
         if word == STOP:

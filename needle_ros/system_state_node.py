@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from needle_ros import contract
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.event_log import Severity
 from needle_ros.system_state import Authority, Mode, PAUSE, REQUESTS, RESUME, STOP, SystemState
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
@@ -42,21 +41,17 @@ class SystemStateTopics:
         node.subscribe(contract.EMERGENCY_STOP, self._on_emergency)
         for word in REQUESTS:
             if word not in (PAUSE, RESUME):
-                node.create_service(Trigger, f'~/{word}', self._serving(word))
+                node.create_service(Trigger, f'~/{word}', partial(self._answer, word))
         node.create_service(SetBool, f'~/{PAUSE}', self._on_pause)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_AGAIN, self._publish, clock=steady)
+        steady_timer(node, _AGAIN, self._publish)
 
-    def _answer(self, word: str, response: Any) -> Any:
+    def _answer(self, word: str, _request: Any, response: Any) -> Any:
         response.success, response.message = self._request(word)
         self.publish()
         return response
 
-    def _serving(self, word: str) -> Callable[[Any, Any], Any]:
-        return lambda _request, response: self._answer(word, response)
-
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        return self._answer(PAUSE if request.data else RESUME, response)
+        return self._answer(PAUSE if request.data else RESUME, request, response)
 
     def _on_emergency(self, message: Bool) -> None:
         if message.data:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final
+from typing import Final, TypeAlias
 
 from needle_ros.errors import ParameterError
 
 #: Maximum number of points: checking a million invalid points would take seconds.
 MOST_POINTS: Final = 10_000
 
+#: A number of each joint at each point, or none at a point.
+Points: TypeAlias = Sequence[Sequence[float]]
 
-def joint_values(
-    joint: str, joints: Sequence[str], values: Sequence[Sequence[float]]
-) -> list[float | None]:
+
+def joint_values(joint: str, joints: Sequence[str], values: Points) -> list[float | None]:
     """
     Return the values of one joint at each point of a trajectory, None at points without one.
 

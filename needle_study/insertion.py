@@ -35,10 +35,10 @@ from needle_dynamics import (
 )
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import CheckedSettings, constant, from_values
 from needle_ros.timing import NANOSECONDS
 from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import MeasuredRun, Metric, Variable
+from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 from scipy.optimize import brentq
 
@@ -68,13 +68,13 @@ METRICS: Final[Mapping[str, Metric]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InsertionStudy:
+class InsertionStudy(CheckedSettings):
     """Settings of the scenario that are the same for all samples."""
 
     rate: float = constant(1000.0, 'Hz', 'samples of the loop', low=1.0, high=10_000.0)
     delay: float = constant(
         1.0, 'periods', 'whole periods from a measurement to the effect of its command, in the '
-        'model of the law', high=20.0,
+        'model of the law', high=20.0, whole=True,
     )  # fmt: skip
     force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
     speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
@@ -96,11 +96,6 @@ class InsertionStudy:
         _LIMITS.tip_deflection, 'm', 'tip deflection at which the guard stops',
         open_low=True,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.delay != int(self.delay):
-            raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
 
 class _Course(NamedTuple):
@@ -133,7 +128,7 @@ class _Course(NamedTuple):
         return self.model.tip_deflections(self.states)
 
 
-class InsertionScenario:
+class InsertionScenario(Scenario):
     """
     Insert needles that differ from the nominal model to a depth.
 
@@ -142,7 +137,7 @@ class InsertionScenario:
     fields of `InsertionStudy`. Raises `ParameterError` if a setting is not valid.
     """
 
-    metrics = METRICS
+    metrics, at_once = METRICS, _AT_ONCE
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
@@ -245,28 +240,18 @@ class InsertionScenario:
         check_stability(law, int(self._numbers.delay), f'{controller} gains', plants=plants)
         return law
 
-    def run(
-        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
-    ) -> dict[str, FloatArray]:
-        """Compute the metrics of sampled needles, as `Scenario.run`."""
-        rows = [
-            self._row({name: float(values[k]) for name, values in samples.items()})
-            for k in range(len(streams))
-        ]
-        found = [
-            self._judged(row, course)
-            for first in range(0, len(rows), _AT_ONCE)
-            for row, course in self._courses(
-                rows[first : first + _AT_ONCE], streams[first : first + _AT_ONCE]
-            )
-        ]
-        return {name: np.array([one[name] for one in found]) for name in METRICS}
+    def insert(
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> Iterator[dict[str, float]]:
+        """Simulate insertions; return the metrics of each."""
+        return map(self._judged, rows, self._courses(rows, streams))
 
     def replay(
         self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield joints, tip and commands at each sample up to a stop, and the target."""
-        ((row, course),) = self._courses([self._row(sample)], [rng])
+        row = self.row(sample)
+        (course,) = self._courses([row], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
         m = course.model.coordinates
         depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
@@ -282,9 +267,6 @@ class InsertionScenario:
                 force = (0.0, float(course.commands[k]), 0.0)
                 yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
 
-    def _row(self, sample: Mapping[str, float]) -> dict[str, float]:
-        return {name: sample.get(name, one.default) for name, one in self.variables.items()}
-
     def _truth(self, row: Mapping[str, float]) -> NeedleParameters:
         p, stiffness = self._needle, row['tissue_stiffness']
         factors = ('coulomb_friction', 'viscous_friction', 'tissue_damping', 'tissue_stiffness')
@@ -297,14 +279,12 @@ class InsertionScenario:
 
     def _courses(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[tuple[Mapping[str, float], _Course]]:
+    ) -> Iterator[_Course]:
         """Simulate the insertions."""
-        if self._law is None:
-            courses = self._open(rows, streams)
-        else:
-            law = self._law
-            courses = (self._closed(law, row, rng) for row, rng in zip(rows, streams, strict=True))
-        return zip(rows, courses, strict=True)
+        law = self._law
+        if law is None:
+            return self._open(rows, streams)
+        return (self._closed(law, row, rng) for row, rng in zip(rows, streams, strict=True))
 
     def _noise(self, row: Mapping[str, float], rng: np.random.Generator, count: int) -> FloatArray:
         """Return the noise of depth, velocity and force for each period, shape (count, 3)."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import inf
-from typing import Any, Final, NamedTuple
-from typing import Protocol as Interface
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from math import inf, nan
+from typing import Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_ros.contract import Topic
@@ -40,40 +40,49 @@ class MeasuredRun(NamedTuple):
     values: Sequence[float]  #: numbers of `Topic.quantities`
 
 
-class Scenario(Interface):
-    """Interface of a scenario, which is simulated with each sample."""
+class Scenario(ABC):
+    """Base of scenarios, which are simulated with each sample."""
 
     variables: Mapping[str, Variable]  #: variables of a sample
     metrics: Mapping[str, Metric]  #: metrics, the primary metric first
+    at_once: int  #: samples that are simulated together
 
     def run(
         self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
+        rows = [
+            self.row({name: float(values[k]) for name, values in samples.items()})
+            for k in range(len(streams))
+        ]
+        found = [
+            one
+            for first in range(0, len(rows), self.at_once)
+            for one in self.insert(
+                rows[first : first + self.at_once], streams[first : first + self.at_once]
+            )
+        ]
+        return {name: np.array([one.get(name, nan) for one in found]) for name in self.metrics}
 
+    def row(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Return the value of each variable, by default its default."""
+        return {name: sample.get(name, one.default) for name, one in self.variables.items()}
+
+    @abstractmethod
+    def insert(
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> Iterable[Mapping[str, float]]:
+        """Simulate samples with a value of each variable; return the known metrics of each."""
+
+    @abstractmethod
     def replay(
         self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Simulate one sample again; yield measurements and commands in time order per topic."""
 
 
-# Imported on demand: a study needs a single scenario.
-
-
-def _steering(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.steering import SteeringScenario
-
-    return SteeringScenario(settings)
-
-
-def _insertion(settings: Mapping[str, Any]) -> Scenario:
-    from needle_study.insertion import InsertionScenario
-
-    return InsertionScenario(settings)
-
-
-#: Constructor of each scenario from the settings of a study.
-SCENARIOS: Final[Mapping[str, Callable[[Mapping[str, Any]], Scenario]]] = {
-    'steering': _steering,
-    'insertion': _insertion,
+#: Class of each scenario, imported on demand; it is made from the settings of a study.
+SCENARIOS: Final[Mapping[str, str]] = {
+    'steering': 'needle_study.steering:SteeringScenario',
+    'insertion': 'needle_study.insertion:InsertionScenario',
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import nan
@@ -36,7 +36,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
 from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import MeasuredRun, Metric, Variable
+from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 
 #: Law of a guide at rest, for which a batch is simulated without a law.
@@ -49,7 +49,7 @@ _JOINTS: Final = contract.steered_states().without_efforts()
 
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion
-_TOGETHER: Final = 256  #: needles per batch, which are in memory together
+_AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
 METRICS: Final[Mapping[str, Metric]] = {
@@ -77,7 +77,7 @@ class SteeringStudy(SteeringLimits):
     step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
 
 
-class SteeringScenario:
+class SteeringScenario(Scenario):
     """
     Steer needles that differ from the nominal model to a target.
 
@@ -85,7 +85,7 @@ class SteeringScenario:
     ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises `ParameterError`.
     """
 
-    metrics = METRICS
+    metrics, at_once = METRICS, _AT_ONCE
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
@@ -154,47 +154,17 @@ class SteeringScenario:
         """Model of all hypotheses, the same for all samples."""
         return SteeringModel(self._needle, self._steering, self._depths, self._prior)
 
-    def run(
-        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
-    ) -> dict[str, FloatArray]:
-        """Compute the metrics of sampled needles, as `Scenario.run`."""
-        count = len(streams)
-        each = {
-            name: samples.get(name, np.full(count, one.default))
-            for name, one in self.variables.items()
-        }
-        found = {name: np.full(count, nan) for name in METRICS}
-        for first in range(0, count, _TOGETHER):
-            some = slice(first, first + _TOGETHER)
-            self._insert(
-                {name: values[some] for name, values in each.items()},
-                streams[some],
-                {name: values[some] for name, values in found.items()},
-            )
-        targets = np.stack([each['target_x'], each['target_z']], axis=1)
-        tips = np.stack([found['tip_x'], found['tip_z']], axis=1)
-        found['miss'] = np.hypot(*(tips - targets).T)
-        found['hit'] = (found['miss'] <= HIT).astype(float)
-        return found
-
-    def _insert(
-        self,
-        each: Mapping[str, FloatArray],
-        streams: Sequence[np.random.Generator],
-        found: Mapping[str, FloatArray],
-    ) -> None:
-        """Simulate insertions; variables and metrics have one value per insertion."""
-        rows = [
-            dict(zip(each, values, strict=True))
-            for values in zip(*(values.tolist() for values in each.values()), strict=True)
-        ]
+    def insert(
+        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
+    ) -> Iterator[dict[str, float]]:
+        """Simulate insertions; yield the metrics of each."""
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
-        if self._law == _OPEN_LOOP:
-            self._open(truths, found)
-            return
-        for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
-            for name, value in self._steered(truth, row, rng).items():
-                found[name][k] = value
+        steered = map(self._steered, truths, rows, streams)
+        each = self._open(truths) if self._law == _OPEN_LOOP else steered
+        for row, found in zip(rows, each, strict=True):
+            x, z = (found.get(f'tip_{axis}', nan) - row[f'target_{axis}'] for axis in 'xz')
+            miss = float(np.hypot(x, z))
+            yield {**found, 'miss': miss, 'hit': float(miss <= HIT)}
 
     def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
         needle, steering = with_lengths(
@@ -216,7 +186,7 @@ class SteeringScenario:
             seed=int(rng.integers(_SEEDS)),
         )
 
-    def _open(self, truths: Sequence[GroundTruth], found: Mapping[str, FloatArray]) -> None:
+    def _open(self, truths: Sequence[GroundTruth]) -> Iterable[dict[str, float]]:
         """Simulate all insertions with a guide at rest in one batch."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
@@ -231,15 +201,16 @@ class SteeringScenario:
             workers=1,
         )
         frames = np.array([truth.frame for truth in truths])
-        found['tip_x'][:], found['tip_z'][:] = (tips[:, -1, [0, 2]] + frames * depth).T
-        for name in ('guide_travel', 'turns'):
-            found[name][:] = 0.0
+        return [
+            {'tip_x': x, 'tip_z': z, 'guide_travel': 0.0, 'turns': 0.0}
+            for x, z in (tips[:, -1, [0, 2]] + frames * depth).tolist()
+        ]
 
     def replay(
         self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
-        row = {name: sample.get(name, one.default) for name, one in self.variables.items()}
+        row = self.row(sample)
         tilt = row['tilt_x'], row['tilt_z']
         still, messages = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 

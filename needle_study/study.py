@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from math import isfinite
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
@@ -134,7 +135,7 @@ def made(document: Any) -> Study:
     if design == 'latin' and samples > _MOST_LATIN:
         raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
-    scenario = SCENARIOS[kind](settings)
+    scenario: Scenario = resolve_name(SCENARIOS[kind])(settings)
     known = scenario.variables
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.

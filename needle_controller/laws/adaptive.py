@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from math import inf
 
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_ros.settings import check_constants, constant, flag
+from needle_ros.settings import constant, flag
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,9 +22,6 @@ class AdaptiveGains(InverseDynamicsGains):
         0.05, 'N or N m', 'standard deviation of the force not explained by the friction model',
         open_low=True,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

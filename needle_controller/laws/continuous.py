@@ -10,6 +10,7 @@ from typing import Final
 from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import check_choice
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -65,12 +66,6 @@ class ContinuousLaw(ABC):
     def integrals(self) -> int:
         """Number of integrals of the error in the state of the closed loop."""
         return 0
-
-    def _check_actuation(self) -> None:
-        if self.actuation not in ACTUATIONS:
-            raise ParameterError(
-                f'actuation must be one of {", ".join(ACTUATIONS)}, got {self.actuation!r}'
-            )
 
     def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
         """
@@ -153,7 +148,7 @@ class ContinuousInverseDynamics(ContinuousLaw):
     _gains: tuple[FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._check_actuation()
+        check_choice('actuation', self.actuation, ACTUATIONS)
         if not 0.0 <= self.breakaway_speed < inf:
             raise ParameterError(
                 f'breakaway_speed must be finite and >= 0 m/s, got {self.breakaway_speed!r}'
@@ -210,7 +205,7 @@ class ContinuousPid(ContinuousLaw):
     _gains: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._check_actuation()
+        check_choice('actuation', self.actuation, ACTUATIONS)
         k = self.driven
         ki = np.zeros(k) if self.ki is None else self.ki
         gains = (

@@ -7,7 +7,7 @@ from typing import Final
 
 from needle_controller.compiled.laws import INVERSE_DYNAMICS
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import constant
 
 #: Feedback at a bandwidth b: added damping as a fraction of viscous friction, bandwidth of the
 #: integral as a fraction of b, and the reduction of b to b / (1 + 5 b h). With these values the
@@ -37,9 +37,6 @@ class InverseDynamicsGains(LawGains):
     tolerance: float = constant(
         5e-6, 'm or rad', 'error at rest below which the integral is frozen (no hunting)'
     )
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

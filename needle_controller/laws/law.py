@@ -24,6 +24,7 @@ from needle_controller.laws.axis import Axis
 from needle_controller.reference.setpoint import Setpoint
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
+from needle_ros.settings import CheckedSettings
 import numpy as np
 
 #: Coulomb friction is compensated in the direction of the desired velocity this much later [s], or
@@ -48,7 +49,7 @@ def no_memory() -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LawGains:
+class LawGains(CheckedSettings):
     """Gains of a law on one axis: `scaled` applies to kp, ki, kd, kv and bandwidth only."""
 
     def scaled(self, factor: float) -> LawGains:

@@ -7,7 +7,7 @@ from typing import Final
 
 from needle_controller.compiled.laws import PID
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.settings import check_constants, choice, constant, flag
+from needle_ros.settings import choice, constant, flag
 
 #: Methods against integrator windup by name.
 ANTI_WINDUP: Final = ('conditional', 'back_calculation')
@@ -33,9 +33,6 @@ class PidGains(LawGains):
         1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward fully includes '
         'Coulomb friction', open_low=True,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 
 #: Relative rounding error by which a limit may be exceeded.
 ROUNDING: Final = 1e-9
@@ -26,16 +26,13 @@ class Setpoint(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferenceLimits:
+class ReferenceLimits(CheckedSettings):
     """Limits of a reference."""
 
     speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
     acceleration: float = constant(
         0.1, 'm/s^2', 'highest acceleration of the reference', open_low=True
     )
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 class Reference(Protocol):

@@ -13,17 +13,7 @@ _FEW: Final = 3.0
 
 
 class LatencyMonitor:
-    """
-    Count the commands that are later than the delay of the control laws.
-
-    Parameters
-    ----------
-    delay : int
-        Configured delay from a measurement to the effect of its command, in periods.
-    period : float
-        Period [s].
-
-    """
+    """Count the commands that are later than ``delay``, in periods [s] of the control laws."""
 
     def __init__(self, delay: int = 0, period: float = 1.0) -> None:
         self._delay, self._longest = delay, (delay + 1) * period

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_ros.settings import check_constants, constant, flag
+from needle_ros.settings import CheckedSettings, constant, flag
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SafetyLimits:
+class SafetyLimits(CheckedSettings):
     """
     Limits of the measurements; beyond them the controller stops until ``~/clear_stop``.
 
@@ -72,6 +72,3 @@ class SafetyLimits:
         False, 'stop when base_wrench or tip_deflection, which the observer expects, are stale; '
         'else the observer continues without them',
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)

@@ -23,14 +23,8 @@ class RateMonitor:
 
     Only a sample of the measurements is compared, to save computing time. Lost measurements and
     jitter make some steps longer and others shorter; a wrong rate changes nearly all of them.
-
-    Parameters
-    ----------
-    rate : float
-        Configured rate of the control laws [Hz].
-    longest : float
-        Time between two measurements that is a gap [s].
-
+    ``rate`` is the configured rate of the laws [Hz], ``longest`` the time between measurements
+    from which it is a gap [s].
     """
 
     def __init__(self, rate: float, longest: float) -> None:

@@ -19,7 +19,7 @@ class ContinuousInsertion(InsertionStrategy):
     Insert a needle without rests; the guide follows the measured insertion depth.
 
     The tip is measured during the motion through each depth, and at rest at the first and last
-    one. Parameters as for `InsertionStrategy`.
+    one.
     """
 
     def __init__(

@@ -32,32 +32,8 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`, for every law.
-
-    Parameters
-    ----------
-    law : SteeringLaw
-        The law.
-    depths : ndarray, shape (n + 1,)
-        Depths of the tip measurements [m].
-    noise : float
-        Configured standard deviation of a tip measurement [m].
-    settings : ExecutiveSettings
-        Limits.
-    events : EventLog
-        Lines for the log.
-
-    Attributes
-    ----------
-    law, depths
-        As given.
-    step : int
-        Number of plans so far: the number of the present depth.
-    expected : TipEstimate or None
-        Expected position of the tip at the target depth; a new one after each plan.
-    measured : AveragedTipMeasurement or None
-        The last measurement.
-
+    the law raise a `NeedleError`, for every law. ``depths`` are the depths of the tip measurements
+    [m], shape (n + 1,), and ``noise`` is the configured standard deviation of a measurement [m].
     """
 
     def __init__(
@@ -70,8 +46,11 @@ class GuardedLaw:
     ) -> None:
         self.law, self.depths = law, depths
         self._noise, self._settings, self._events = noise, settings, events
+        #: Number of plans so far: the number of the present depth.
         self.step = 0
+        #: Expected position of the tip at the target depth, new after each plan.
         self.expected: TipEstimate | None = None
+        #: Last measurement.
         self.measured: AveragedTipMeasurement | None = None
         #: Largest deviation of a reading of the tip so far [m].
         self._scatter = 0.0

@@ -21,22 +21,8 @@ class InsertionStrategy(ABC):
     Insert a needle under a steering law: straighten the guide, measure, plan, move.
 
     Every event is a method that returns a motion to send, as in `SteeringExecutive`. A fault is
-    raised as a `NeedleError`, after which the executive stops the insertion.
-
-    Parameters
-    ----------
-    law : GuardedLaw
-        Steering law, with the depths of the measurements.
-    motions : MotionControl
-        Motions of the joints.
-    settings : ExecutiveSettings
-        Steps, tip measurements and limits.
-
-    Attributes
-    ----------
-    phase : Phase
-        GUIDING, INSERTING, MEASURING or DONE.
-
+    raised as a `NeedleError`, after which the executive stops the insertion. `phase` is GUIDING,
+    INSERTING, MEASURING or DONE.
     """
 
     def __init__(
@@ -49,11 +35,6 @@ class InsertionStrategy(ABC):
         self._measured: TipMeasurements | None = None
         #: Stamps between which readings belong to a measurement at rest [ns].
         self._span = 0, 0
-
-    @property
-    def under_way(self) -> bool:
-        """Whether the last measurement is not done yet."""
-        return self.phase is not Phase.DONE
 
     def begin(self, at: FloatArray, now: int) -> JointMotion | None:
         """Send the guide to its zero, from positions of the joints [m, rad]."""

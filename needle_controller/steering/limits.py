@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
 
@@ -30,12 +29,10 @@ class SteeringLimits:
         'reachable set is computed without it',
         open_low=True, unlimited=True,
     )  # fmt: skip
-    turns: int = constant(0, '1', 'allowed number of turns of the needle')
+    turns: int = constant(0, '1', 'allowed number of turns of the needle', whole=True)
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if self.turns != int(self.turns):
-            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
         object.__setattr__(self, 'turns', int(self.turns))
 
 

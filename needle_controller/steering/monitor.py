@@ -27,13 +27,7 @@ class MotionMonitor:
     """
     Compare the last motion with the joint positions, and with the answers to it.
 
-    Parameters
-    ----------
-    joints : sequence of str
-        Joints of the robot.
-    tolerances : ndarray, shape (joints,)
-        Tolerances of their positions [m, rad].
-
+    ``tolerances``, shape (joints,), are of the positions of the ``joints`` [m, rad].
     """
 
     def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:

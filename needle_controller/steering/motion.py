@@ -24,27 +24,13 @@ _INTERVAL: Final = 0.05
 
 
 class JointMotion(NamedTuple):
-    """
-    Joint motion of needle and guide, for a robot or a controller.
+    """Joint motion of needle and guide, for a robot or a controller."""
 
-    Attributes
-    ----------
-    joints : tuple of str
-        Names of the joints.
-    times : ndarray, shape (n,)
-        Times from the start [s].
-    positions, velocities : ndarray, shape (n, joints)
-        Positions and velocities [m, rad, and these per s].
-    stamp : int
-        Time at which it is sent [ns], which identifies it; 0 until it is sent.
-
-    """
-
-    joints: tuple[str, ...]
-    times: FloatArray
-    positions: FloatArray
-    velocities: FloatArray
-    stamp: int = 0
+    joints: tuple[str, ...]  #: names of the joints
+    times: FloatArray  #: times from the start [s], shape (n,)
+    positions: FloatArray  #: positions [m, rad], shape (n, joints)
+    velocities: FloatArray  #: velocities [m/s, rad/s], shape (n, joints)
+    stamp: int = 0  #: time at which it is sent [ns], which identifies it; 0 until it is sent
 
 
 def smooth(

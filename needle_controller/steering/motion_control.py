@@ -36,38 +36,18 @@ SAME: Final = 1e-6
 
 
 class MotionControl:
-    """
-    Create the motions of needle and guide, check that they are followed, and stop them.
-
-    Parameters
-    ----------
-    settings : ExecutiveSettings
-        Joints, speeds and tolerances.
-    events : EventLog
-        Lines for the log.
-
-    Attributes
-    ----------
-    monitor : MotionMonitor
-        Compares the last motion with the positions, and with the answers to it.
-    at : ndarray, shape (joints,)
-        Measured positions [m, rad]; nan before the first measurement.
-    origin, goal : ndarray, shape (joints,)
-        Positions at the start and at the end of the motion [m, rad].
-    due : int
-        Time at which the motion should end [ns].
-    again : callable
-        Creates the motion again at a time [ns], from the present positions.
-
-    """
+    """Create the motions of needle and guide, check that they are followed, and stop them."""
 
     def __init__(self, settings: ExecutiveSettings, events: EventLog) -> None:
         self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
+        #: Measured positions [m, rad], shape (joints,); nan before the first measurement.
         self.at = np.full(len(settings.joints), np.nan)
         #: Velocity of the needle [m/s]; stamp [ns] and depth [m] from which it is measured.
         self.velocity = 0.0
         self._before: tuple[int, float] | None = None
+        #: Positions at the start and at the end of the motion [m, rad], shape (joints,); time at
+        #: which it should end [ns]; creates it again at a time [ns], from the present positions.
         self.origin = self.goal = np.zeros(len(settings.joints))
         self.due = 0
         self.again: Callable[[int], JointMotion | None] = lambda _now: None

@@ -14,7 +14,6 @@ class SteppedInsertion(InsertionStrategy):
     Insert a needle in steps, with a measurement at rest at the end of each.
 
     The needle moves when the guide has arrived: the path is independent of their speeds.
-    Parameters as for `InsertionStrategy`.
     """
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:

@@ -9,7 +9,7 @@ from math import copysign, inf, sqrt
 from typing import Final
 
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 from needle_ros.trajectories import check_times
 import numpy as np
 
@@ -21,7 +21,7 @@ _SETTLED: Final = 1e-8  #: position error below which the base rests at the end 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BaseParameters:
+class BaseParameters(CheckedSettings):
     """Limits of the motion-controlled base (the robot that moves the needle)."""
 
     speed_limit: float = constant(0.05, 'm/s', 'highest speed of the base', open_low=True)
@@ -32,9 +32,6 @@ class BaseParameters:
         20.0, '1/s', 'rate at which the base closes a position error', open_low=True
     )
     encoder_resolution: float = constant(1e-6, 'm', 'length per count of the joint position')
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 def on_grid(value: float, resolution: float) -> float:

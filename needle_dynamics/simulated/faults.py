@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 import numpy as np
 
 Reading: TypeAlias = tuple[int, list[float]]  #: stamp [ns] and values of a measurement
@@ -25,7 +25,7 @@ FAULTY: Final[Mapping[str, Sequence[int]]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FaultParameters:
+class FaultParameters(CheckedSettings):
     """Probability, delay and size of a fault."""
 
     probability: float = constant(1.0, '1', 'probability that a measurement is affected', high=1)
@@ -34,9 +34,6 @@ class FaultParameters:
         0.0, 'SI', 'size of a bias, or bound of a saturated measurement (both signs), in its unit',
         low=-1e3, high=1e3,
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
 
 class SensorFault:

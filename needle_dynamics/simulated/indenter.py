@@ -16,7 +16,7 @@ from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import check_times, joint_values
+from needle_ros.trajectories import check_times, joint_values, Points
 import numpy as np
 
 JOINTS = ('x', 'z')  #: joints of the indenter trajectories: the axes of the plane
@@ -152,11 +152,7 @@ class Indenter(SimulatedPlant):
         return PlantStatus(force=(x, z))
 
     def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
+        self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         check_times(times)
         if any(len(point) for point in positions):

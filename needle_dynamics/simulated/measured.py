@@ -13,6 +13,7 @@ from needle_dynamics.simulated.tip_sensor import TipReading
 from needle_ros.contract import BASE_WRENCH, GROUND_TRUTH, JOINT_STATES, TIP_DEFLECTION, Topic
 from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
+from needle_ros.trajectories import Points
 import numpy as np
 
 AT_REST: Final = 1e-6  #: velocity below which taring is permitted [m/s]
@@ -74,11 +75,7 @@ class SimulatedPlant(ABC):
 
     @abstractmethod
     def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
+        self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         """
         Follow a trajectory from now on, linear in time between its points.

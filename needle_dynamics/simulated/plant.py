@@ -25,7 +25,7 @@ from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipS
 from needle_ros.contract import BASE_WRENCH, ground_truth, INSERTION, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import ParameterError
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import joint_values
+from needle_ros.trajectories import joint_values, Points
 import numpy as np
 
 _POINTS: Final = 21  #: number of points of an outline
@@ -106,21 +106,12 @@ class Plant(SimulatedPlant):
         return PlantStatus(insertion_depth=self.depth)
 
     def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
+        self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         if self.base is None:
             raise ParameterError('is followed in the modes robot and indenter only')
-        self.base.follow(
-            self.time,
-            self.depth,
-            times,
-            joint_values(INSERTION, joints, positions),
-            joint_values(INSERTION, joints, efforts),
-        )
+        columns = (joint_values(INSERTION, joints, values) for values in (positions, efforts))
+        self.base.follow(self.time, self.depth, times, *columns)
 
     def _motion(self) -> str:
         return velocity_text(self.integrator.velocity)

@@ -31,14 +31,14 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import CheckedSettings, constant
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import check_times, joint_values
+from needle_ros.trajectories import check_times, joint_values, Points
 import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GuideParameters:
+class GuideParameters(CheckedSettings):
     """Limits of the robot that moves, tilts and rolls the needle guide."""
 
     position_limit: float = constant(
@@ -50,9 +50,6 @@ class GuideParameters:
     tilt_speed_limit: float = constant(0.2, 'rad/s', 'highest rate of the tilt', open_low=True)
     roll_speed_limit: float = constant(10.0, 'rad/s', 'highest rate of the roll', open_low=True)
     rise_time: float = constant(0.1, 's', 'time to accelerate to the highest speed', open_low=True)
-
-    def __post_init__(self) -> None:
-        check_constants(self)
 
     def motion(self, joint: str, gain: float) -> BaseMotion:
         """Return the motion controller of a guide joint, at rest at zero; ``gain`` is in 1/s."""
@@ -116,11 +113,7 @@ class SteeredPlant(SimulatedPlant):
         return PlantStatus(insertion_depth=y, tip=(x, z), tip_roll=roll, joint=dict(self._at))
 
     def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
+        self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         """Follow a trajectory of the given joints; `insertion` is ignored without a base."""
         known = (INSERTION, *GUIDE_JOINTS)
@@ -134,13 +127,8 @@ class SteeredPlant(SimulatedPlant):
                 raise ParameterError(f'each point needs a position of {name}')
             motion.follow(self.time, self._at[name], times, found)
         if self.base is not None and INSERTION in joints:
-            self.base.follow(
-                self.time,
-                self.depth,
-                times,
-                joint_values(INSERTION, joints, positions),
-                joint_values(INSERTION, joints, efforts),
-            )
+            columns = (joint_values(INSERTION, joints, values) for values in (positions, efforts))
+            self.base.follow(self.time, self.depth, times, *columns)
         self._motions |= followed
         self._moving |= {*followed}
 

@@ -13,7 +13,7 @@ from needle_identification.bags.files import LOST, METADATA
 from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.errors import RecordingError
-from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice
 import yaml
 
 _COMPRESSIONS: Final = {
@@ -72,10 +72,7 @@ class BagWriter:
 
     def __init__(self, path: Path | str, compression: str = 'zstd') -> None:
         self.path = path = Path(path)
-        if compression not in _COMPRESSIONS:
-            raise ParameterError(
-                f'compression must be one of {", ".join(COMPRESSIONS)}, got {compression!r}'
-            )
+        check_choice('compression', compression, COMPRESSIONS)
         self._file = path / f'{path.name}_0.mcap'
         try:
             path.mkdir(parents=True)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
-from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice
 
 ESTIMATORS: Final = ('ordinary', 'weighted', 'huber', 'total')  # estimators of `regress`
 
 
 def check_estimator(estimator: str, *more: str) -> None:
     """Reject a name that is not in `ESTIMATORS` or in the additional names."""
-    names = (*more, *ESTIMATORS)
-    if estimator not in names:
-        raise ParameterError(f'estimator must be one of {", ".join(names)}, got {estimator!r}')
+    check_choice('estimator', estimator, (*more, *ESTIMATORS))

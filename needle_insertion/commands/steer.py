@@ -15,7 +15,6 @@ from needle_controller.steering.law import (
     DEFAULT_LAW,
     find_law,
     STEERING_LAWS,
-    TipEstimate,
 )
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
@@ -45,7 +44,7 @@ from needle_insertion.commands.common import (
 )
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
-from needle_insertion.report.insertion import draw_needle, draw_reach
+from needle_insertion.report.insertion import draw_needle, draw_reach, evenly
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
@@ -190,30 +189,19 @@ def sample_needle(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
-def _expected(estimate: TipEstimate | None) -> dict[str, list[float] | None]:
-    """Return the expected tip and the half width of its 95 % interval; None if not predicted."""
-    mean = None if estimate is None else estimate.mean.tolist()
-    half = None if estimate is None else estimate.half_width.tolist()
-    return {'expected tip [m]': mean, 'expected tip half width [m]': half}
-
-
 def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print the final tip positions of both needles."""
     target, needle, steering, prior, depths = _task(options)
     aim = target[[0, 2]]
     model = SteeringModel(needle, steering, depths, prior)
+    limits = replace(
+        SIMULATION_LIMITS,
+        guide_limit=options.limit,
+        turns=options.turns,
+        load_limit=options.load_limit,
+    )
     try:
-        law = build_law(
-            options.law,
-            model,
-            aim,
-            replace(
-                SIMULATION_LIMITS,
-                guide_limit=options.limit,
-                turns=options.turns,
-                load_limit=options.load_limit,
-            ),
-        )
+        law = build_law(options.law, model, aim, limits)
     except OutOfReachError as error:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
@@ -231,12 +219,15 @@ def _run(options: argparse.Namespace) -> int:
     ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
     done = simulate_steering(law, ours, sensor, watch)
     alone.insert()
-    tip, other = ours.tip, alone.tip
+    tip, other, expected = ours.tip, alone.tip, law.expected()
     found: dict[str, Any] = {
         'target [m]': aim.tolist(),
         'tip [m]': tip.tolist(),
         'tip open loop [m]': other.tolist(),
-        **_expected(law.expected()),
+        'expected tip [m]': None if expected is None else expected.mean.tolist(),
+        'expected tip half width [m]': (
+            None if expected is None else expected.half_width.tolist()
+        ),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
         'guide travel [m]': done.travel,
@@ -247,11 +238,10 @@ def _run(options: argparse.Namespace) -> int:
     }
     print_each('warning', found['warnings'])
     if options.output is not None:
-        at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
         # In the frame of the needle, to which the sensor frame is rotated.
         mark = target - np.array([truth.frame[0], 0.0, truth.frame[1]]) * target[1]
         figure = draw_needle(
-            [shapes[k] for k in at.tolist()],
+            evenly(shapes, min(_SHOWN, len(shapes))),
             _line(ours.needle.path),
             mark,
             _line(alone.needle.shape),

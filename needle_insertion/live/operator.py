@@ -9,7 +9,7 @@ from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.messages import listen_states, State, target_message
 from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
 from needle_ros import contract
-from needle_ros.base_node import profile
+from needle_ros.base_node import profile, steady_timer
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
@@ -17,8 +17,6 @@ from needle_ros.requests import no_answer, PendingRequest
 from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
@@ -62,8 +60,7 @@ class Operator:
                 kind = Trigger if request.data is None else SetBool
                 self._client(kind, request.node, request.service)
         self.states = listen_states(node, self._on_state)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_CHECK, self._repeat, clock=steady)
+        steady_timer(node, _CHECK, self._repeat)
 
     def _client(self, kind: Any, node: str, service: str) -> Client:
         if (node, service) not in self._clients:

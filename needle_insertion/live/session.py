@@ -15,7 +15,6 @@ from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import (
     activate_plant,
-    RunSample,
     start_nodes,
     WARM_UP,
     Witness,
@@ -82,9 +81,12 @@ def run(session: Session) -> int:
         operator = Operator(node)
         readings = Readings(Node('readings', context=graph.context))
         screen.say(f'starting {", ".join(session.nodes)}')
-        # The first commands of a script are always executed at the same sample.
+        # The first commands of a script are always executed at the same sample: time continues
+        # until all sensors have reported.
         holds = session.lockstep and not screen.typed
-        witness = Witness(node, _warms_up, lockstep=True) if holds else None
+        witness = (
+            Witness(node, lambda sample: sample.time < WARM_UP, lockstep=True) if holds else None
+        )
         processes = _bring_up(session, graph, node, operator, screen, holds=holds)
         terminal = Terminal(graph, operator, readings, screen)
         terminal.begin(session.nodes)
@@ -107,11 +109,6 @@ def run(session: Session) -> int:
     if 'recorder' in session.nodes:
         screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
     return 0
-
-
-def _warms_up(sample: RunSample) -> bool:
-    """Return whether time continues: until all sensors have reported."""
-    return sample.time < WARM_UP
 
 
 def _bring_up(

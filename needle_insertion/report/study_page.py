@@ -196,7 +196,7 @@ def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
     drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
     axes = drawing.subplots()
     finite = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
-    words = f'Distribution of {name}; dashed: {_dashed()}.'
+    words = f'Distribution of {name}; dashed: {", ".join(f"{part:.0%}" for part in _PARTS)}.'
     if len(finite):
         end = float(finite[-1])
         if len(finite) >= _TAILED:
@@ -209,10 +209,6 @@ def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
             axes.axvline(float(np.quantile(finite, part)), color='k', lw=0.8, ls='--')
     axes.set(xlabel=_head(name, figure.unit), ylabel='samples')
     return Picture('distribution', words, drawing)
-
-
-def _dashed() -> str:
-    return ', '.join(f'{part:.0%}' for part in _PARTS)
 
 
 def _map(

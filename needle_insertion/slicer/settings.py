@@ -18,7 +18,7 @@ class LinkSettings:
         '127.0.0.1', 'IPv4 address: as server, address of this machine to listen on (0.0.0.0: all '
         'addresses); as client, address of the peer',
     )  # fmt: skip
-    port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0)
+    port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0, whole=True)
     reach: float = constant(
         0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
     )
@@ -32,6 +32,4 @@ class LinkSettings:
             raise ParameterError(
                 f'host must be an IPv4 address such as 127.0.0.1, got {self.host!r}'
             ) from error
-        if self.port != int(self.port):
-            raise ParameterError(f'port must be a whole number, got {self.port!r}')
         object.__setattr__(self, 'port', int(self.port))

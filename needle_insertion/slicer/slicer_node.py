@@ -19,7 +19,7 @@ from needle_insertion.slicer.registration import MILLIMETERS, Registration
 from needle_insertion.slicer.settings import LinkSettings
 from needle_insertion.slicer.states import NodeStates
 from needle_ros import contract
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.event_log import EventLog, Severity
@@ -29,8 +29,6 @@ from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, SlicerPhase, SlicerStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 
 if TYPE_CHECKING:
     from needle_insertion.slicer.frames import Frame
@@ -110,9 +108,7 @@ class SlicerNode(BaseNode):
     def activate(self) -> None:
         """Open the connection and start its timer."""
         self._due = monotonic()
-        # Steady clock: a stopped ROS clock does not stop the connection.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(_CHECK, self._tick, clock=steady)
+        self._timer = steady_timer(self, _CHECK, self._tick)
 
     def deactivate(self) -> None:
         self.destroy_timer(self._timer)
@@ -307,10 +303,5 @@ def _check_frame(frame: str) -> None:
         raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
 
 
-def main() -> int:
-    """Run the node; return its exit status."""
-    return run(SlicerNode)
-
-
 if __name__ == '__main__':
-    sys.exit(main())
+    sys.exit(run(SlicerNode))

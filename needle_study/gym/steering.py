@@ -13,6 +13,7 @@ from needle_controller.steering.simulation import sample_truth, SteeringPlant, s
 from needle_dynamics import FloatArray, STEERING_PRESETS
 from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
 from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice
 from needle_study.gym.pushed import BOUND
 import numpy as np
 
@@ -47,10 +48,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
     ) -> None:
-        if needle not in STEERING_PRESETS:
-            raise ParameterError(
-                f'needle must be one of {", ".join(STEERING_PRESETS)}, got {needle!r}'
-            )
+        check_choice('needle', needle, STEERING_PRESETS)
         for name, value in (
             ('depth', depth), ('step', step), ('guide_limit', guide_limit), ('aside', aside),
         ):  # fmt: skip

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-PACKAGES = ['needle_dynamics', 'needle_identification']
+PACKAGES = ['needle_controller', 'needle_dynamics', 'needle_identification']
 
 
 @pytest.mark.parametrize('package', PACKAGES)
