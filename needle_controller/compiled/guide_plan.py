@@ -157,7 +157,7 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
     if turns == 0 or cost < _TURN:
         return guide
     # The present plan with a turn now.
-    base, few = _ends(c, turns - 1, k + 2), _candidates(c, _COARSE)
+    base, few = ends if turns > 1 else _ends(c, 0, k + 2), _candidates(c, _COARSE)
     best, roll, chosen = inf, 0.0, base
     for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
         other = c.roll[-1] + tau * turn / _ROLLS
@@ -217,7 +217,7 @@ def _best(
 ) -> tuple[float, complex]:
     """Return mean square distance from the reachable set and position of the best candidate."""
     costs, whole, found = _costs(c, w, ends, candidates), 0.0, np.empty(2)
-    follow = _follow(c, w)
+    follow = _follow(c, w) if c.limit > 0.0 else 0j
     for plane in range(2):
         wanted = follow.imag if plane else follow.real
         wanted, best = min(max(wanted, -c.limit), c.limit), inf

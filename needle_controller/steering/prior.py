@@ -16,8 +16,8 @@ class SteeringPrior:
         high=0.9,
     )  # fmt: skip
     skin: float = constant(
-        0.06, 'm', 'highest stiffness of the skin relative to that of the tissue; 0: the nominal '
-        'one',
+        0.06, 'm',
+        'highest stiffness of the skin relative to that of the tissue; 0: the nominal one',
     )  # fmt: skip
     tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
     frame: float = constant(

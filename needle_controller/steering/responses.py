@@ -18,23 +18,13 @@ slow error is the last unknown constant. It changes from step to step.
 The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
 roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
 
-A needle with a bevel that is turned has kinematic points in addition to the grid: a stiff tissue
-holds the shaft, which follows the tip, and the guide has no effect. A bevel of direction u(s) cuts
-an arc of curvature :math:`\kappa`, and the tip is ahead of it by a distance :math:`\ell`
-[Webster2006]_,
-
-.. math:: z(s) = \kappa \int_0^s (s - s' + \ell) \, u(s') \, ds'.
-
-Friction on the shaft winds it up: the roll of the tip lags the roll of the base by an angle that
-grows with the depth, as a dead band [Reed2009]_. Each of these points has its lag per depth.
-
-References
-----------
-.. [Webster2006] R. J. Webster, J. S. Kim, N. J. Cowan, G. S. Chirikjian, A. M. Okamura,
-   "Nonholonomic modeling of needle steering", International Journal of Robotics Research 25, 2006.
-.. [Reed2009] K. B. Reed, A. M. Okamura, N. J. Cowan, "Modeling and control of needles with
-   torsional friction", IEEE Transactions on Biomedical Engineering 56, 2009.
-
+A needle with a bevel has kinematic points in addition to the grid, for a needle that is turned: a
+stiff tissue holds the shaft, which follows the tip, and the guide has no effect. A bevel along u
+cuts an arc of curvature :math:`\kappa`, with the tip ahead of it by :math:`\ell` (Webster et al.,
+"Nonholonomic modeling of needle steering", 2006): the tip is at
+:math:`\kappa \int_0^s (s - s' + \ell) \, u(s') \, ds'`. Friction winds up the shaft: the roll of
+the tip lags the roll of the base by an angle that grows with the depth (Reed et al., "Modeling and
+control of needles with torsional friction", 2009). Each of these points has its lag per depth.
 """
 
 from __future__ import annotations

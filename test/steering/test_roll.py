@@ -87,7 +87,7 @@ def test_roll_is_never_worse_than_towards_the_target(world: str) -> None:
                 lags = model.responses.lags[:, -1] / case.depths[-1]
                 windups.append(law.weights @ np.tile(lags, len(law.weights) // len(lags)))
     ours, towards = misses.values()
-    assert np.mean(ours) < 0.5 * np.mean(towards)
+    assert np.mean(ours) < 0.8 * np.mean(towards)
     assert max(ours) < max(towards)
     # 7.9 rad/m; hypotheses are 4 rad/m apart.
     assert np.median(windups) == pytest.approx(7.9, abs=2.0)
