@@ -76,7 +76,7 @@ def _ends(c: Steering, turns: int, first: int) -> FinalTip:
         for i in range(len(means)):
             g, load = i % len(r.bevel), c.mean[i, BEVEL]
             for j in range(first, last + 1):
-                means[i] -= load * r.bevel[g, last, j] * c.turned[j]
+                means[i] -= load * r.bevel[g, last, j] * c.turned[g, j]
             turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
     errors = np.empty(len(means))
     for i in range(len(means)):
@@ -157,16 +157,17 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
     if turns == 0 or cost < _TURN:
         return guide
     # The present plan with a turn now.
-    base, few = _ends(c, turns - 1, k + 2), _candidates(c, _COARSE)
+    base, few = ends if turns > 1 else _ends(c, 0, k + 2), _candidates(c, _COARSE)
     best, roll, chosen = inf, 0.0, base
     for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
-        other = c.roll[0] + tau * turn / _ROLLS
+        other = c.roll[-1] + tau * turn / _ROLLS
         means = base.means.copy()
         for i in range(len(means)):
-            push = 0.0
+            g, push = i % len(c.turned), 0.0
             for j in range(k + 1, k + 2 if turns > 1 else last + 1):
-                push += c.responses.bevel[i % len(c.responses.bevel), last, j]
-            means[i] += c.mean[i, BEVEL] * push * (_direction(other) - c.turned[k + 1])
+                push += c.responses.bevel[g, last, j]
+            change = _direction(_tip_roll(c, g, other)) - c.turned[g, k + 1]
+            means[i] += c.mean[i, BEVEL] * push * change
         ends = FinalTip(means, base.errors, base.turned)
         costs = _costs(c, w, ends, few)
         along_x = along_z = inf
@@ -177,10 +178,18 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
             best, roll, chosen = found, other, ends
     if best + _TURN > cost:
         return guide
-    c.roll[0], c.counts[TURNS] = roll, turns - 1
-    for j in range(k + 1, len(c.turned)):
-        c.turned[j] = _direction(roll)
+    for g in range(len(c.turned)):
+        c.roll[g] = _tip_roll(c, g, roll)
+        c.turned[g, k + 1 :] = _direction(c.roll[g])
+    c.roll[-1], c.counts[TURNS] = roll, turns - 1
     return _best(c, w, chosen, candidates)[1]
+
+
+@inlined
+def _tip_roll(c: Steering, g: int, base: float) -> float:
+    """Return the roll of the tip at a point of the grid for a roll of the base [rad]."""
+    lag = c.responses.lags[g, c.counts[STEP]]
+    return min(max(c.roll[g], base - lag), base + lag)
 
 
 @inlined
@@ -208,7 +217,7 @@ def _best(
 ) -> tuple[float, complex]:
     """Return mean square distance from the reachable set and position of the best candidate."""
     costs, whole, found = _costs(c, w, ends, candidates), 0.0, np.empty(2)
-    follow = _follow(c, w)
+    follow = _follow(c, w) if c.limit > 0.0 else 0j
     for plane in range(2):
         wanted = follow.imag if plane else follow.real
         wanted, best = min(max(wanted, -c.limit), c.limit), inf
@@ -260,9 +269,8 @@ def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -
                     short = max(0.0, abs(left[t] + off) - later[t])
                     found[plane, t] += weight * short * short
         force = load.imag if plane else load.real
-        for t in range(count):
-            over = max(0.0, abs(force + stiffness * to[t]) - c.load_limit)
-            found[plane, t] += _OVERLOAD * over**2
+        over = np.maximum(0.0, np.abs(force + stiffness * to) - c.load_limit)
+        found[plane] += _OVERLOAD * over**2
     return found
 
 
@@ -277,8 +285,8 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
         for j in range(k):
             load += r.guide_load[g, k, j] * c.guide[j]
         push = 0j
-        for j in range(len(c.turned)):
-            push += r.bevel_load[g, k, j] * c.turned[j]
+        for j in range(c.turned.shape[1]):
+            push += r.bevel_load[g, k, j] * c.turned[g, j]
         for j in range(r.causes_load.shape[2]):
             load += (push if j == BEVEL else r.causes_load[g, k, j]) * c.mean[i, j]
         force += w[i] * load

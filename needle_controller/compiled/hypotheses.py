@@ -71,6 +71,7 @@ class HypothesisResponses(NamedTuple):
     causes_load: Array3
     bevel_load: Array3
     between: Array4
+    lags: Matrix
     #: Sums of the absolute values of `guide` at the last depth, from each step on,
     #: shape (g, n + 1).
     later_guide: Matrix
@@ -96,9 +97,11 @@ class Steering(NamedTuple):
     #: shape (h,).
     logs: Vector
     guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
-    #: Direction of the bevel relative to zero roll, on the skin and in each step, shape (n + 1,).
-    turned: ComplexVector
-    roll: Vector  #: roll of the needle [rad], shape (1,)
+    #: Direction of the bevel relative to zero roll, on the skin and in each step, by point of the
+    #: grid, shape (g, n + 1).
+    turned: ComplexMatrix
+    #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
+    roll: Vector
     last: Vector  #: last tip measurement [m], shape (2,)
     #: Tip measurements so far, remaining turns, successive equal, implausible and missing
     #: measurements, shape (5,).
@@ -157,8 +160,8 @@ def tip_mean(c: Steering, i: int, at: int, guide: ComplexArray, row: ComplexArra
     for j in range(m - 3):
         row[j] = r.causes[g, at, j]
     row[BEVEL] = row[m - 3] = row[m - 2] = row[m - 1] = 0.0
-    for j in range(len(c.turned)):
-        row[BEVEL] += r.bevel[g, at, j] * c.turned[j]
+    for j in range(c.turned.shape[1]):
+        row[BEVEL] += r.bevel[g, at, j] * c.turned[g, j]
     for j in range(len(guide)):
         mean += r.guide[g, at, j] * guide[j]
         row[m - 3] += r.between[0, g, at, j] * guide[j]

@@ -16,10 +16,9 @@ class SteeringPrior:
         high=0.9,
     )  # fmt: skip
     skin: float = constant(
-        0.06,
-        'm',
+        0.06, 'm',
         'largest stiffness of the skin relative to that of the tissue; 0: the nominal one',
-    )
+    )  # fmt: skip
     tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
     frame: float = constant(
         0.06, 'rad', 'standard deviation of the rotation between the frames of guide and sensor'

@@ -9,14 +9,22 @@ bevel, and in the loads that bend its path away from the nominal one:
 with positions :math:`b_j` of the guide in the steps, and unknown constants :math:`\theta`: origin
 and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
 between the depths. A and H depend on the bending length and on the stiffness of the skin, which
-form a grid of g points. A position between two points of the grid is described by two more unknown
-constants, with the difference of A between the points. A hypothesis is a point of the grid, a path
+form a grid. A position between two points of the grid is described by two more unknown constants,
+with the difference of A between the points. A hypothesis is one of g points together with a path
 noise and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
 explained by them. They widen the prediction, and path noise lets each measurement count more. The
 slow error is the last unknown constant. It changes from step to step.
 
 The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
 roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
+
+A needle with a bevel has kinematic points in addition to the grid, for a needle that is turned: a
+stiff tissue holds the shaft, which follows the tip, and the guide has no effect. A bevel along u
+cuts an arc of curvature :math:`\kappa`, with the tip ahead of it by :math:`\ell` (Webster et al.,
+"Nonholonomic modeling of needle steering", 2006): the tip is at
+:math:`\kappa \int_0^s (s - s' + \ell) \, u(s') \, ds'`. Friction winds up the shaft: the roll of
+the tip lags the roll of the base by an angle that grows with the depth (Reed et al., "Modeling and
+control of needles with torsional friction", 2009). Each of these points has its lag per depth.
 """
 
 from __future__ import annotations
@@ -53,6 +61,11 @@ OF_STEERING: Final = ('free_length', 'skin_stiffness', 'bevel_load')
 #: Hypotheses of the bending length, and of the skin relative to the highest one.
 _LENGTHS: Final = 13
 _SKINS: Final = (0.0, 0.1, 1.0 / 3.0, 1.0)
+
+#: Kinematic hypotheses: distance of the tip ahead of the arcs [m] (24 mm in Webster et al.), and
+#: lag of its roll per depth [rad/m] (45 degrees at 10 cm in Reed et al.).
+_LEADS: Final = (0.0, 0.025)
+_WINDUPS: Final = (0.0, 4.0, 8.0)
 
 #: Hypotheses of path noise, relative to the least one.
 _PATHS: Final = (1.0, 10.0, 100.0)
@@ -105,6 +118,8 @@ class SteeringModel:
         Skin stiffness of each hypothesis, relative to the stiffness of the tissue [m].
     drifts : ndarray, shape (h,)
         Standard deviation of the slow error of the sensor of each hypothesis [m].
+    rolled : ndarray of bool, shape (h,)
+        Whether a hypothesis is kinematic: of a needle that is turned.
     decay : ndarray, shape (n,)
         Correlation of the slow error at the end of a step with that at its begin.
     push : float
@@ -120,8 +135,9 @@ class SteeringModel:
         ``bevel``, shape (g, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
         step; ``elastic``, shape (g, n + 1), of the resting tip per load of the bevel [m/N];
         ``between``, shape (2, g, n + 1, n), change of ``guide`` from one point to the next in
-        bending length, and in skin. ``guide_load``, ``causes_load`` and ``bevel_load``, with n
-        rows, are the same for the force on the guide at its position of each step [N].
+        bending length, and in skin; ``lags``, shape (g, n + 1), largest lag of the roll of the tip
+        behind the base at each depth [rad]. ``guide_load``, ``causes_load`` and ``bevel_load``,
+        with n rows, are the same for the force on the guide at its position of each step [N].
 
     Raises
     ------
@@ -158,9 +174,10 @@ class SteeringModel:
         b, n = self.prior, self.steps
         width = _BEYOND * b.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
-        skins = np.array([steering.skin_stiffness / needle.tissue_stiffness])
+        nominal = steering.skin_stiffness / needle.tissue_stiffness
+        skins = np.array([nominal])
         if width and b.skin:
-            skins, (nominal,) = np.array(_SKINS) * b.skin, skins
+            skins = np.array(_SKINS) * b.skin
             if nominal:
                 # The nearest of the points that are not zero becomes the nominal one.
                 skins[1 + np.abs(skins[1:] - nominal).argmin()] = nominal
@@ -170,25 +187,35 @@ class SteeringModel:
         unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
         shortest = with_lengths(needle, unit, float(lengths[0]))
         rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
+        arcs = [(lead, windup) for lead in _LEADS for windup in _WINDUPS if width and most]
+        beams, points = len(grid_lengths), len(grid_lengths) + len(arcs)
         arrays: list[FloatArray] = []
-        for i, (length, skin) in enumerate(zip(grid_lengths, grid_skins, strict=True)):
+        for i in range(points):
             if progress is not None:
-                progress(i, len(grid_lengths))
-            stiffness = float(skin) * needle.tissue_stiffness
-            point = with_lengths(needle, replace(unit, skin_stiffness=stiffness), float(length))
-            found = _respond(steered(*point), unit, at, rows)
-            arrays = arrays or [np.empty((len(grid_lengths), *one.shape)) for one in found]
+                progress(i, points)
+            if i < beams:
+                stiffness = float(grid_skins[i]) * needle.tissue_stiffness
+                skin = replace(unit, skin_stiffness=stiffness)
+                point = with_lengths(needle, skin, float(grid_lengths[i]))
+                found = _respond(steered(*point), unit, at, rows)
+            else:
+                found = _kinematic(steered(needle, unit), unit, at, arcs[i - beams][0])
+            arrays = arrays or [np.empty((points, *one.shape)) for one in found]
             for of_all, one in zip(arrays, found, strict=True):
                 of_all[i] = one
         guide, _, bevel, *_ = arrays
-        grid = guide.reshape(len(skins), len(lengths), *guide.shape[1:])
-        between = [
-            np.gradient(grid, axis=axis) if grid.shape[axis] > 1 else 0.0 * grid for axis in (1, 0)
-        ]
-        arrays.append(np.array(between).reshape(2, *guide.shape))
-        arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
-        self.responses = HypothesisResponses(*arrays)
+        between, grid = np.zeros((2, *guide.shape)), (len(skins), len(lengths), n + 1, n)
+        for change, axis in zip(between, (1, 0), strict=True):
+            if grid[axis] > 1:
+                whole = np.gradient(guide[:beams].reshape(grid), axis=axis)
+                change[:beams] = whole.reshape(beams, n + 1, n)
+        lags = np.outer([0.0] * beams + [windup for _, windup in arcs], at)
+        later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
+        self.responses = HypothesisResponses(*arrays, between, lags, *later)
+        grid_lengths = np.append(grid_lengths, np.ones(len(arcs)))
+        grid_skins = np.append(grid_skins, np.full(len(arcs), nominal))
         kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
+        self.rolled = np.tile(np.arange(points) >= beams, len(kinds))
         self.lengths, self.skins = (np.tile(one, len(kinds)) for one in (grid_lengths, grid_skins))
         self.drifts = np.repeat(kinds[:, 1], len(grid_lengths))
         self.decay = np.exp(-np.diff(at) / _DRIFT_LENGTH)
@@ -225,6 +252,26 @@ def _respond(
     # The frame of the sensor has no effect on the force on the guide.
     of_guide = _by_cause(forces[rows.guided], np.zeros(n), np.zeros(n))
     return *of_tip, np.append(elastic, elastic[-1]), *of_guide
+
+
+def _kinematic(
+    base: Steered, steering: SteeringParameters, depths: FloatArray, lead: float
+) -> tuple[FloatArray, ...]:
+    """Return the responses, as `_respond`, of a tip ahead of the arcs that it cuts [m]."""
+    n, edges = len(depths) - 1, np.append(0.0, depths)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    layers = _layers(base.starts, middles)
+    turning = np.array([turning_load(base.ei, k) for k in base.stiffness[layers].tolist()])
+    # A load F bends the path of a long needle by F lambda / (E I).
+    bent = np.divide(base.bevel[layers], turning, out=np.zeros(n + 1), where=turning > 0.0)
+    left = np.maximum(depths[:, np.newaxis] - edges, 0.0)
+    arcs, shifts = -np.diff(0.5 * left**2, axis=1), -np.diff(left, axis=1)
+    bevel = (arcs + lead * shifts) * bent
+    path = arcs @ np.array([np.interp(middles, depths, one) for one in np.eye(n + 1)]).T
+    tilt = steering.free_length + depths
+    causes = np.column_stack([np.ones(n + 1), depths, tilt, bevel.sum(axis=1), path])
+    rest = np.zeros((n, n)), np.zeros((n, 5 + n)), np.zeros((n, n + 1))
+    return np.zeros((n + 1, n)), causes, bevel, np.zeros(n + 1), *rest
 
 
 def _by_cause(

@@ -45,8 +45,9 @@ class Plain:
         self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0
         n, m = model.steps, model.prior_covariance.shape[1]
         self.ways = np.minimum(limits.guide_step * np.arange(1, n + 1), 2.0 * limit)
-        self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
-        self.mean = np.zeros((len(model.lengths), m), complex)
+        self.guide, h = np.zeros(n, complex), len(model.lengths)
+        self.turned, self.tips = np.ones((h, n + 1), complex), np.zeros(h)
+        self.mean = np.zeros((h, m), complex)
         self.mean[:, 3] = 1j * model.push
         repeats = len(self.mean) // len(model.prior_covariance)
         self.covariance = np.repeat(model.prior_covariance.astype(complex), repeats, axis=0)
@@ -60,7 +61,7 @@ class Plain:
                 for name, one in model.responses._asdict().items()
             }
         )
-        self.logs = np.zeros(len(model.lengths))
+        self.logs = np.zeros(h)
 
     @property
     def weights(self) -> FloatArray:
@@ -74,7 +75,7 @@ class Plain:
         """Return means, variances, and covariances with the constants, also as measured."""
         r = self.r
         causes = r.causes[:, at].astype(complex)
-        causes[:, 3] = r.bevel[:, at] @ self.turned
+        causes[:, 3] = (r.bevel[:, at] * self.turned).sum(axis=1)
         slow = np.full((len(causes), 1), seen)
         rows = np.concatenate([causes, (r.between[:, :, at] @ guide).T, slow], axis=1)
         means = r.guide[:, at] @ guide + np.einsum('hm,hm->h', rows, self.mean)
@@ -109,7 +110,7 @@ class Plain:
         means, variances, _ = self.tip(-1, self.guide)
         later, turned = self.r.bevel[:, -1, first:], np.zeros(len(means))
         if turns:
-            means = means - self.mean[:, 3] * (later @ self.turned[first:])
+            means = means - self.mean[:, 3] * (later * self.turned[:, first:]).sum(axis=1)
             turned = 0.8 * sqrt(0.5) * abs(self.mean[:, 3]) * abs(later).sum(axis=1)
         return means, np.sqrt(variances), turned
 
@@ -146,7 +147,7 @@ class Plain:
         """Return the distance of the target from the reachable set for positions, (2, count)."""
         (means, errors, turned), k, w, r = ends, self.step, self.weights.copy(), self.r
         now, after = r.guide[:, -1, k], r.guide[:, -1, k + 1 :]
-        push = (r.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
+        push = (r.bevel_load[:, k] * self.turned).sum(axis=1) * self.mean[:, 3]
         causes = r.causes_load[:, k] * self.mean[:, :-3]
         causes[:, 3] = push
         force = w @ (r.guide_load[:, k] @ self.guide + causes.sum(axis=1))
@@ -200,14 +201,16 @@ class Plain:
         until = k + 2 if self.turns > 1 else None
         load = self.mean[:, 3] * self.r.bevel[:, -1, k + 1 : until].sum(axis=1)
         rolls = self.roll + tau * np.arange(-7, 9) / 16
-        ways, now = np.exp(-1j * rolls), np.exp(-1j * self.roll)
+        lags = self.r.lags[:, k]
+        tips = [np.clip(self.tips, base - lags, base + lags) for base in rolls]
+        ways, now = np.exp(-1j * np.array(tips)), self.turned[:, k + 1]
         others = [(means + load * (way - now), errors, turned) for way in ways]
         costs = [self.costs(one, self.tried(13)).min(axis=1).sum() for one in others]
         one = int(np.argmin(costs))
         if costs[one] + 1e-8 > cost:
             return guide
-        self.roll, self.turns = rolls[one], self.turns - 1
-        self.turned[k + 1 :] = ways[one]
+        self.roll, self.tips, self.turns = rolls[one], tips[one], self.turns - 1
+        self.turned[:, k + 1 :] = ways[one][:, None]
         return self.best(others[one], tried)[1]
 
     def plan(self) -> GuideSetpoint:

@@ -23,7 +23,9 @@ with the present position :math:`b_0`, the distance of the expected tip from the
 :math:`l - \bar z`, the shift :math:`g` of the tip per shift of the guide, whose relative variance
 is :math:`\sigma^2`, and sums over hypotheses with weights :math:`w` and over depths. The needle is
 turned only if that reduces the distance below the best distance by the guide alone. As long as a
-turn is left, the later load of the bevel may have any direction.
+turn is left, the later load of the bevel may have any direction. A hypothesis with windup has its
+own roll of the tip, :math:`\max(\phi - d, \min(\phi + d, \varphi))` after a roll of the base
+to :math:`\phi`, with the previous roll of the tip :math:`\varphi` and the lag :math:`d`.
 """
 
 from __future__ import annotations
@@ -145,6 +147,7 @@ class MultiHypothesisLaw(SteeringLaw):
         from needle_dynamics.compiled.boxed import Boxed
 
         prior, count = model.prior_covariance, len(model.lengths)
+        points = len(model.responses.guide)
         mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
         mean[:, BEVEL] = 1j * model.push
         self._model = model
@@ -158,11 +161,12 @@ class MultiHypothesisLaw(SteeringLaw):
             ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
-            covariance=np.repeat(prior.astype(np.complex128), count // len(prior), axis=0),
-            logs=np.zeros(count),
+            covariance=np.repeat(prior.astype(np.complex128), points, axis=0),
+            # A needle that is not turned is steered by the guide.
+            logs=np.where(model.rolled & (turns == 0), -np.inf, 0.0),
             guide=np.zeros(model.steps, dtype=np.complex128),
-            turned=np.full(model.steps + 1, complex(cos(roll), -sin(roll))),
-            roll=np.array([roll], dtype=np.float64),
+            turned=np.full((points, model.steps + 1), complex(cos(roll), -sin(roll))),
+            roll=np.full(points + 1, roll),
             last=np.full(2, nan),
             counts=np.array([0, turns, 0, 0, 0]),
         )
@@ -289,7 +293,7 @@ class MultiHypothesisLaw(SteeringLaw):
             now.guide[k] = self._choose()
         advance(self._boxed)
         there = complex(now.guide[min(k, last)])
-        return GuideSetpoint(there.real, there.imag, float(now.roll[0]))
+        return GuideSetpoint(there.real, there.imag, float(now.roll[-1]))
 
     def _choose(self) -> complex:
         """Return the next position of the guide, x + i z [m]."""
