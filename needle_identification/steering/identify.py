@@ -34,7 +34,7 @@ from typing import Final, NamedTuple
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
-from needle_identification.steering.mixed import variances
+from needle_identification.steering.mixed import MixedModel, variances
 from needle_identification.steering.prediction import held_out, rms_of
 from needle_identification.steering.recording import readings, SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
@@ -165,7 +165,7 @@ def _refined(fit: _Fit) -> _Fit:
     """Return the fit with the probable ratios of variances alone, which is faster."""
     search = fit.search
     models = [
-        model.only(one.weights > _LEAST)
+        MixedModel(model.depths, model.ratios[one.weights > _LEAST])
         for model, one in zip(search.models, search.fits(fit.optima[0].x), strict=True)
     ]
     faster = Search(search.tips, search.terms, search.known, models)

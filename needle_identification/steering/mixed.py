@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import FloatArray
 import numpy as np
 from scipy.special import logsumexp
 
@@ -74,20 +74,12 @@ class MixedModel:
         self._half = np.zeros((len(each), len(depths), 1, rows, rows))
         self._logs = np.zeros(len(each))
         for k, ratio in enumerate(each):
-            known = {depth.tobytes(): _whitening(covariance(depth, ratio)) for depth in depths}
+            unique = {depth.tobytes(): depth for depth in depths}
+            known = {key: _whitening(covariance(one, ratio)) for key, one in unique.items()}
             for i, depth in enumerate(depths):
                 half, log = known[depth.tobytes()]
                 self._half[k, i, 0, : len(half), : len(half)] = half
                 self._logs[k] += 2.0 * log
-
-    def only(self, kept: BoolArray) -> MixedModel:
-        """Return the model with a part of the ratios."""
-        return MixedModel(self.depths, self.ratios[kept])
-
-    def without(self, recording: int) -> MixedModel:
-        """Return the model without a recording."""
-        depths = [*self.depths[:recording], *self.depths[recording + 1 :]]
-        return MixedModel(depths, self.ratios)
 
     def likelihood(
         self, columns: Sequence[FloatArray], wanted: Sequence[FloatArray]

@@ -8,28 +8,22 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.steering.estimate import HeldOut
-from needle_identification.steering.mixed import covariance
+from needle_identification.steering.mixed import covariance, MixedModel
 from needle_identification.steering.search import Optimum, Search, Tips
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, stdtrit
 
 #: Depth of the measurements that determine offset and slope, below the first of them [m].
 _START: Final = 0.015
 
 _ANY: Final = 1.0  # standard deviation of the offset [m]
-_NORMAL: Final = 1.96  # quantile of the 95 % interval
 
 
 class Prediction(NamedTuple):
-    """Measured minus predicted tips beyond the first depths, and their deviations (n, 2) [m]."""
+    """Measured minus predicted tips beyond the first depths, and whether they are expected."""
 
-    errors: FloatArray
-    deviations: FloatArray
-
-    @property
-    def held(self) -> BoolArray:
-        """Whether the 95 % interval contains the tip, shape (n, 2)."""
-        return np.asarray(np.abs(self.errors) <= _NORMAL * self.deviations)
+    errors: FloatArray  # (n, 2) [m]
+    held: BoolArray  # (n, 2) within the 95 % interval
 
 
 def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
@@ -42,11 +36,11 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
         rest = [own for each in search.members.values() for own in each if own != at]
         others = [search.tips.recordings[own] for own in rest]
         models = list(search.models)
-        models[medium] = models[medium].without(k)
+        depths = [*models[medium].depths[:k], *models[medium].depths[k + 1 :]]
+        models[medium] = MixedModel(depths, models[medium].ratios)
         fitted = Search(Tips(others, search.tips.order), search.terms, search.known, models)
         found.append(predict(search, fitted, fitted.descend(best.x), medium, at))
     rms, freedom = rms_of([one.errors for one in found]), 2 * len(found)
-    # The errors along a path are alike: each recording has one error in each plane.
     low, high = (rms * sqrt(freedom / float(chdtri(freedom, p))) for p in (0.025, 0.975))
     coverage = float(np.mean(np.concatenate([one.held for one in found])))
     return HeldOut(rms=rms, interval=(low, high), coverage=coverage)
@@ -74,8 +68,11 @@ def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int)
         square = mean**2 + np.diag(total)[rest]
         square -= np.einsum('ij,ji->i', gain, total[np.ix_(first, rest)])
         means, squares = means + weight * mean, squares + weight * square
-    deviations = np.sqrt(squares - means**2)
-    return Prediction(means.reshape(2, -1).T, deviations.reshape(2, -1).T)
+    # The errors along a path are alike: each fitted recording has one error in each plane.
+    freedom = max(1, 2 * len(fitted.models[medium].depths) - len(fit.drift))
+    half = stdtrit(freedom, 0.975) * np.sqrt(squares - means**2)
+    held = np.abs(means) <= half
+    return Prediction(means.reshape(2, -1).T, held.reshape(2, -1).T)
 
 
 def rms_of(errors: Sequence[FloatArray]) -> float:

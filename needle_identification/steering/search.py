@@ -12,7 +12,7 @@ from needle_identification.steering.mixed import Likelihood, MixedModel
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import drift, responses, TipResponses
 import numpy as np
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import least_squares
 
 #: Bounds of free length, bending length and skin [m].
 FREE: Final = (1e-3, 0.3)
@@ -32,7 +32,7 @@ _STEP: Final = 1e-4  # step of a derivative
 _ROLLED: Final = 0.1  # roll that excites the bevel [rad]
 _NOTHING: Final = 1e-4  # weight of a ratio without effect on a search
 _APART: Final = 0.05  # least difference between the variables of different optima
-_STRIDES: Final = 24  # largest number of steps to bracket an end of an interval
+_NEAR: Final = 0.02  # relative tolerance of the ends of intervals
 
 
 class Tips:
@@ -271,12 +271,18 @@ def _end(
         seeds[0] = found.x
         return found.deviance - level
 
-    near, step = float(start.x[k]), sqrt(start.spread[k, k] * (level - start.deviance))
-    for _ in range(_STRIDES):
+    near, low, high = float(start.x[k]), start.deviance - level, -1.0
+    step, far = sqrt(-start.spread[k, k] * low), near
+    while high < 0.0:
+        near, low = (far, high) if far != near else (near, low)
         far = near + copysign(min(step, 0.5, abs(bound - near)), sign)
         if far == near:
-            break
-        if above(far) >= 0.0:
-            return float(brentq(above, near, far, xtol=0.02 * abs(far - near)))
-        near, step = far, 1.5 * step
-    return copysign(inf, sign)
+            return copysign(inf, sign)
+        high, step = above(far), 1.5 * step
+    width = abs(far - near)
+    while abs(far - near) > _NEAR * width and high > _NEAR * (level - start.deviance):
+        # A secant that shortens the bracket from both ends.
+        middle = near + min(max(low / (low - high), 0.1), 0.9) * (far - near)
+        now = above(middle)
+        near, low, far, high = (near, low, middle, now) if now >= 0.0 else (middle, now, far, high)
+    return far

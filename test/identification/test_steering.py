@@ -406,7 +406,8 @@ def test_a_bag_of_the_plant_is_read_without_options(
     # 2.4 %, times four.
     assert gel['rms'] == pytest.approx(NOISE / sqrt(5.0), rel=0.1)
     assert gel['noise'] == pytest.approx(NOISE / sqrt(5.0), rel=0.1)
-    assert gel['held_out']['rms'] == pytest.approx(gel['rms'], rel=0.1)
+    # Offset and slope from 15 readings have errors, too.
+    assert gel['rms'] < gel['held_out']['rms'] < 1.3 * gel['rms']
     assert gel['recordings'] == 10
     assert 10 * 80 < gel['samples'] <= 10 * 100
     # The file starts a plant with the result, and a controller with the same tissue.
