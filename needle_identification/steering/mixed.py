@@ -3,12 +3,14 @@ Likelihood of the tips of a medium in a linear mixed model.
 
 In each plane of each recording, the tip minus its response to the guide is
 
-.. math:: X \beta + o + s d + w(d) + e
+.. math:: X \beta + o + s d + w(d) + v(g) + e
 
 with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the depth d, the path
-noise w, an integrated Wiener process of intensity q, and white noise e of deviation sigma. The
+noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
+whose variance grows with its travel, and white noise e of deviation sigma. The
 likelihood is restricted [Patterson1971]_ [Harville1974]_: o, beta and sigma are integrated out.
-The ratios of q and tau to sigma are summed over a grid: a few recordings hardly determine them.
+The ratios of the other deviations to sigma are summed over a grid: a few recordings hardly
+determine them.
 
 References
 ----------
@@ -22,6 +24,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -30,9 +33,12 @@ from scipy.special import logsumexp
 
 _REACH: Final = 0.1  # depth at which path noise and slopes have the deviations of the grid [m]
 
-#: Grid of the deviations of path noise and slopes at this depth, over sigma.
-_WANDERS: Final = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-_SLOPES: Final = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+_TRAVEL: Final = 1e-3  # motion of the guide whose response has the deviation of the grid [m]
+
+#: Grid of the deviations of path noise and slopes at this depth, and of responses, over sigma.
+_WANDERS: Final = (0.0, 1.0, 4.0, 16.0, 64.0, 256.0)
+_SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
+_RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
 
@@ -58,18 +64,18 @@ class Likelihood(NamedTuple):
 
 
 class MixedModel:
-    """Covariances of the recordings of a medium, by the depths of their readings."""
+    """Covariances of the recordings of a medium, by depth and guide (n, 3) of their readings."""
 
     def __init__(self, depths: Sequence[FloatArray], ratios: FloatArray | None = None) -> None:
         if ratios is None:
             # The drift of a single recording contains its slope.
             slopes = _SLOPES if len(depths) > 1 else (0.0,)
-            ratios = np.array([(q, s) for q in _WANDERS for s in slopes])
+            ratios = np.array(list(product(_WANDERS, slopes, _RESPONSES)))
         self.ratios, self.depths = ratios, depths
         self.samples = 2 * sum(map(len, depths))
         self.freedom = self.samples - 2 * len(depths)  #: samples minus offsets
         # The contrasts are normalized by white noise, the last ratios.
-        each = [*ratios, np.zeros(2)]
+        each = [*ratios, np.zeros(3)]
         rows = max(map(len, depths))
         self._half = np.zeros((len(each), len(depths), 1, rows, rows))
         self._logs = np.zeros(len(each))
@@ -112,17 +118,21 @@ class MixedModel:
         )
 
 
-def covariance(depth: FloatArray, ratio: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of a recording in a plane, over that of the white noise."""
-    d = (depth - depth.min()) / _REACH
+def covariance(moved: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) in a plane over sigma^2, from depth and guide (n, 3) [m]."""
+    d = (moved[:, 0] - moved[:, 0].min()) / _REACH
     low, high = np.minimum(d[:, np.newaxis], d), np.maximum(d[:, np.newaxis], d)
     wander = 0.5 * low**2 * (3.0 * high - low)
-    return np.asarray(np.eye(len(d)) + ratio[0] ** 2 * wander + ratio[1] ** 2 * np.outer(d, d))
+    steps = np.diff(moved[:, 1:], axis=0, prepend=moved[:1, 1:])
+    travel = np.cumsum(np.hypot(*steps.T)) / _TRAVEL
+    response = np.minimum(travel[:, np.newaxis], travel)
+    parts = zip(ratio, (wander, np.outer(d, d), response), strict=True)
+    return np.asarray(np.eye(len(d)) + sum(one**2 * part for one, part in parts))
 
 
 def variances(ratios: FloatArray) -> FloatArray:
-    """Return path noise [rad^2/m] and variance of slopes [rad^2], per variance of noise [m^2]."""
-    return np.asarray(ratios**2 * np.array([3.0 / _REACH**3, 1.0 / _REACH**2]))
+    """Return path noise [rad^2/m] and variance of slopes [rad^2], over sigma^2 [m^2]."""
+    return np.asarray(ratios[:, :2] ** 2 * np.array([3.0 / _REACH**3, 1.0 / _REACH**2]))
 
 
 def _whitening(covariance: FloatArray) -> tuple[FloatArray, float]:

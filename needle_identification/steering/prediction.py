@@ -48,8 +48,9 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
 
 def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int) -> Prediction:
     """Predict a recording of a search from its first depths, by a fit to others."""
-    one, fit = search.tips.recordings[at], fitted.fits(best.x)[medium]
-    depth, tip = one.depth[one.known], search.tips.measured[at]
+    fit = fitted.fits(best.x)[medium]
+    moved, tip = search.tips.moved[at], search.tips.measured[at]
+    depth = moved[:, 0]
     guide, columns = search.design(at, *search.lengths(best.x)[medium])
     changes = search.changes(best.x, medium, at, fit.drift)
     columns, changes = (a.reshape(2 * len(depth), -1) for a in (columns, changes))
@@ -60,7 +61,7 @@ def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int)
         fit.weights, fit.variances, fit.values, fit.covariances,
         fitted.models[medium].ratios, strict=True,
     ):  # fmt: skip
-        total = np.kron(np.eye(2), variance * covariance(depth, ratio) + _ANY**2)
+        total = np.kron(np.eye(2), variance * covariance(moved, ratio) + _ANY**2)
         total += columns @ own @ columns.T + changes @ best.spread @ changes.T
         left = (tip - guide).ravel() - columns @ values
         gain = np.linalg.solve(total[np.ix_(first, first)], total[np.ix_(first, rest)]).T

@@ -40,6 +40,7 @@ class Tips:
 
     def __init__(self, recordings: Sequence[SteeringRecording], order: str) -> None:
         self.recordings, self.order = recordings, order
+        self.moved = [np.column_stack([one.depth, one.guide])[one.known] for one in recordings]
         self.measured = [one.tip[one.known].T for one in recordings]  # (2, n) [m]
         self.of = lru_cache(maxsize=8000)(self._responses)
 
@@ -82,8 +83,7 @@ class Search:
             for medium in dict.fromkeys(media)
         }
         self.models = models or [
-            MixedModel([one.depth[one.known] for one in map(tips.recordings.__getitem__, members)])
-            for members in self.members.values()
+            MixedModel([tips.moved[at] for at in members]) for members in self.members.values()
         ]
         ends = zip(FREE, LENGTH, SKIN, strict=True)
         self.bounds = np.array([self.variables(*end, len(self.members)) for end in ends])
