@@ -10,7 +10,7 @@ from typing import Final
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
-from needle_identification.estimation.formatting import UNKNOWN
+from needle_identification.estimation.formatting import between, UNKNOWN
 from needle_identification.friction.estimate import FrictionSummary
 from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.stiffness.estimate import StiffnessSummary
@@ -18,6 +18,10 @@ from needle_ros.files import write_whole
 import yaml
 
 NODES: Final = ('plant', 'controller')  #: nodes that use the result
+
+#: Least path noise [rad^2/m] and noise [m] of a prior: a few recordings may have none by chance.
+_LEAST_PATH_NOISE: Final = 1e-6
+_LEAST_NOISE: Final = 1e-5
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
@@ -116,14 +120,22 @@ def steering_yaml(found: SteeringEstimate) -> str:
     lines = ['# Steered needle, identified by needle_identification.']
     for one in (found.free_length, *medium.parameters):
         unit = '' if one.unit == '1' else f' {one.unit}'
-        value = f'{one.value:.6g}{unit}, SE {one.error:.2g}' if one.determined else UNKNOWN
-        lines.append(f'# {one.symbol} ({one.name}) = {value}')
+        known = f'SE {one.error:.2g}' if one.determined else UNKNOWN
+        lines.append(f'# {one.symbol} ({one.name}) = {one.value:.6g}{unit}, {known}')
     lines.append(f'# E I = {stiffness:g} N m^2 of the preset {DEFAULT_PRESET}')
+    if medium.held_out is not None:
+        lines.append(
+            f'# error of predicted recordings {medium.held_out.rms:.3g} m, '
+            f'{between(medium.held_out.interval)}'
+        )
+    prior = {
+        'prior.path_noise': _short(max(medium.path_noise, _LEAST_PATH_NOISE)),
+        'prior.noise': _short(max(medium.noise, _LEAST_NOISE)),
+    }
     lengths: dict[str, object] = {}
-    if found.free_length.determined and isfinite(found.free_length.value):
-        lengths['steering.free_length'] = _short(found.free_length.value)
-    if medium['skin'].determined:
-        lengths['steering.skin_stiffness'] = _short(max(0.0, medium['skin'].value) * tissue)
+    # Also if they are not determined: the bending length is for these values.
+    lengths['steering.free_length'] = _short(found.free_length.value)
+    lengths['steering.skin_stiffness'] = _short(medium['skin'].value * tissue)
     steering = {'steered': True, **lengths}
     if 'bevel' in found.terms:
         z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
@@ -133,7 +145,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
     sections = {
         '/**/plant': {'ros__parameters': {**model, **steering}},
         '/**/controller': {'ros__parameters': model},
-        '/**/steering': {'ros__parameters': {**model, **lengths}},
+        '/**/steering': {'ros__parameters': {**model, **lengths, **prior}},
     }
     return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
 

@@ -199,6 +199,8 @@ def _identification_bars(rows: Sequence[Mapping[str, Any]]) -> list[Bar]:
         Bar('frames above the prior without a warning', frames, 0.0),
     ]
     for one in rows:
+        if one['coverage'] is None:
+            continue
         held = 100.0 * one['coverage']
         bars.append(Bar(f'held-out coverage, {one["medium"]}', held, 90.0, '%', at_least=True))
         bars.append(Bar(f'held-out coverage, {one["medium"]}', held, 98.0, '%'))

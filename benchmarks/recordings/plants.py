@@ -22,7 +22,8 @@ from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 from needle_identification import SteeringRecording
-from needle_identification.steering.search import Search
+from needle_identification.steering.prediction import rms_of
+from needle_identification.steering.search import Search, Tips
 import numpy as np
 
 #: Order of guide motion and insertion of the recordings, and of the simulated insertion.
@@ -110,12 +111,11 @@ class BeamMedium:
     @classmethod
     def fit(cls, recordings: Sequence[SteeringRecording]) -> BeamMedium:
         """Fit bending length, skin, tilt, and an offset of each recording."""
-        search = Search(recordings, _TERMS, ORDER, FREE)
-        x, cost = search.best()
-        _, [(length, skin)] = search.lengths(x)
-        [(columns, left)] = search.design(x)
-        tilt_x, tilt_z = np.linalg.lstsq(columns, left)[0][:2].tolist()
-        rms = float(np.sqrt(2.0 * cost / len(left)))
+        search = Search(Tips(recordings, ORDER), _TERMS, FREE)
+        x = search.optima()[0].x
+        [(_, length, skin)] = search.lengths(x)
+        tilt_x, tilt_z = search.fits(x)[0].drift.tolist()
+        rms = rms_of(search.residuals(x))
         return cls(length=length, skin=skin, tilt=(tilt_x, tilt_z), rms=rms)
 
     def plant(self, recording: SteeringRecording) -> SteeringPlant:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import named, ParameterEstimate
@@ -24,6 +25,14 @@ CONSTANTS: Mapping[str, tuple[str, str]] = {
 }
 
 
+class HeldOut(NamedTuple):
+    """Errors of recordings that are predicted from the others of their medium."""
+
+    rms: float  #: root mean square beyond the first depths, which determine the offset [m]
+    interval: tuple[float, float]  #: 95 % interval of the rms [m]
+    coverage: float  #: fraction of tips within their predicted 95 % interval
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MediumEstimate:
     """Constants of the needle in a medium; ``estimate[name]`` is a parameter."""
@@ -31,7 +40,11 @@ class MediumEstimate:
     medium: str  #: name of the medium
     parameters: tuple[ParameterEstimate, ...]  #: bending length, skin, and drift constants
     rms: float  #: root mean square of the residuals, per axis [m]
-    samples: int  #: number of samples
+    noise: float  #: standard deviation of the white noise of a reading [m]
+    path_noise: float  #: growth of the variance of the path direction per length [rad^2/m]
+    slope: float  #: standard deviation of the slope of a recording [rad]
+    held_out: HeldOut | None  #: prediction from other recordings; None for a single one
+    samples: int  #: number of readings; successive rows at rest are one reading
     recordings: int  #: number of recordings
 
     def __getitem__(self, name: str) -> ParameterEstimate:
@@ -51,6 +64,7 @@ class SteeringEstimate:
     #: Measured minus fitted tip positions of each recording, without missing measurements,
     #: shape (samples, 2) [m].
     residuals: tuple[FloatArray, ...]
+    optima: int  #: number of distinct optima
     warnings: tuple[str, ...] = ()  #: warnings about the validity of the values
 
     def __getitem__(self, medium: str) -> MediumEstimate:

@@ -12,9 +12,10 @@ terms:
               roll
 ============  =================================================================================
 
-The lengths are estimated by variable projection: the linear constants are solved for at each step
-[Golub2003]_. Intervals of the lengths are profile likelihood intervals, which are far from
-symmetric with few samples.
+Each recording has its own slope and path noise (`needle_identification.steering.mixed`), so that
+the readings of a recording are not independent. The search for the lengths starts from a grid
+(variable projection [Golub2003]_). Their intervals are profile likelihood intervals, and contain
+all optima that fit alike.
 
 References
 ----------
@@ -27,23 +28,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import exp, inf, isfinite, nan, sqrt
+from math import inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
-from needle_identification.steering.recording import SteeringRecording
+from needle_identification.steering.mixed import MixedModel, variances
+from needle_identification.steering.prediction import held_out, rms_of
+from needle_identification.steering.recording import readings, SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_identification.steering.search import FREE, Search, SKIN_SCALE
+from needle_identification.steering.search import FREE, interval, Optimum, Search, shown, Tips
 from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import stdtrit
 
-_SEVERAL: Final = 8  # smallest number of recordings of a medium whose spread determines the errors
 _AS_GOOD: Final = 0.02  # relative difference of residuals below which fits are equivalent
+_WORSE: Final = 1.5  # smallest ratio of held-out errors and residuals that is reported
 _LENGTHS: Final = 2  # number of nonlinear constants of a medium
+_LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and predictions
+_ROTATED: Final = 0.06  # rotation between frames that is reported [rad]
+_LARGEST: Final = 0.5  # largest error of a drift constant that is determined [rad or 1/m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,12 +99,12 @@ def identify_steering(
     settings : SteeringSettings, optional
         Drift terms, order and free length.
     progress : callable, optional
-        Called after each fit.
+        Called after each search.
 
     Returns
     -------
     SteeringEstimate
-        Constants with intervals, and warnings about equivalent drift terms.
+        Constants with intervals, prediction errors, and warnings about equivalent fits.
 
     Raises
     ------
@@ -112,177 +117,166 @@ def identify_steering(
         raise IdentificationError('no recordings to identify from')
     sets = [(term,) for term in TERMS] if settings.terms is None else [settings.terms]
     orders = ORDERS if settings.order is None else (settings.order,)
+    read = [readings(one) for one in recordings]
     fits: list[_Fit] = []
-    for terms in sets:
-        for order in orders:
-            search = Search(recordings, terms, order, settings.free_length)
-            _check(search)
+    for order in orders:
+        tips, optima = Tips(read, order), list[Optimum]()
+        for terms in sets:
+            _check(read, terms)
+            search = Search(tips, terms, settings.free_length)
             # The lengths hardly depend on the drift terms.
-            fits.append(_Fit(search, *search.best(fits[0].x if fits else None)))
+            optima = search.optima([one.x for one in optima])
+            fits.append(_Fit(search, optima))
             if progress is not None:
                 progress()
-    best = min(fits, key=lambda fit: fit.cost)
-    samples = 2 * sum(one.samples for one in recordings)
+    best = min(fits, key=lambda fit: fit.selection)
     alternatives = {
-        fit.search.terms: sqrt(2.0 * fit.cost / samples)
+        fit.search.terms: rms_of(fit.search.residuals(fit.optima[0].x))
         for fit in fits
-        if fit.search.order == best.search.order
+        if fit.search.tips.order == best.search.tips.order
     }
-    return _estimate(best, alternatives)
+    return _estimate(_refined(best), alternatives)
 
 
 class _Fit(NamedTuple):
     search: Search
-    x: FloatArray
-    cost: float
+    optima: list[Optimum]
+
+    @property
+    def selection(self) -> float:
+        return sum(one.selection for one in self.search.fits(self.optima[0].x))
 
 
-def _check(search: Search) -> None:
-    for one in search.recordings:
+def _check(recordings: Sequence[SteeringRecording], terms: tuple[str, ...]) -> None:
+    for one in recordings:
         if not one.samples:
             raise IdentificationError(f'{one.name}: no valid sample of the tip')
-    for medium, members in search.members.items():
-        samples = 2 * sum(search.recordings[k].samples for k in members)
-        unknown = _LENGTHS + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in search.terms)
-        if samples <= unknown:
+    for medium in dict.fromkeys(one.medium for one in recordings):
+        members = [one.samples for one in recordings if one.medium == medium]
+        unknown = _LENGTHS + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in terms)
+        if 2 * sum(members) <= unknown:
             raise IdentificationError(
                 f'{unknown} constants of {medium or "these recordings"} need more than '
-                f'{unknown // 2} samples of the tip, got {samples // 2}'
+                f'{unknown // 2} samples of the tip, got {sum(members)}'
             )
 
 
-class _Errors(NamedTuple):
-    """Errors of the search variables, then of the linear constants of each medium."""
-
-    errors: FloatArray  # (k,) standard errors
-    units: FloatArray  # (k,) the same for unit variance of the samples
-    freedom: list[int]  # degrees of freedom by medium
-    values: list[FloatArray]  # linear constants by medium
-    left: list[FloatArray]  # residuals by medium [m]
-
-
-def _errors(search: Search, x: FloatArray) -> _Errors:
-    """Return the errors of the fit, with independent recordings or white noise."""
-    parts = search.design(x)
-    slopes = search.slopes(x)
-    total = len(x) + sum(a.shape[1] for a, _ in parts)
-    normal, even, middle = np.zeros((3, total, total))
-    freedom, values, left = [], [], []
-    row, column = 0, len(x)
-    for (columns, wanted), members in zip(parts, search.members.values(), strict=True):
-        own = np.asarray(np.linalg.lstsq(columns, wanted)[0])
-        rest = wanted - columns @ own
-        jacobian = np.zeros((len(rest), total))
-        jacobian[:, : len(x)] = slopes[row : row + len(rest)]
-        jacobian[:, column : column + len(own)] = columns
-        squares = jacobian.T @ jacobian
-        normal += squares
-        free = len(rest) - len(own) - _LENGTHS
-        even += squares * float(rest @ rest) / free
-        if len(members) >= _SEVERAL:
-            # Differences between insertions are correlated within each insertion.
-            starts = np.cumsum([0, *(2 * search.recordings[k].samples for k in members[:-1])])
-            scores = np.add.reduceat(jacobian * rest[:, np.newaxis], starts, axis=0)
-            middle += scores.T @ scores * len(scores) / (len(scores) - 1)
-            free = len(scores) - 1
-        else:
-            middle += squares * float(rest @ rest) / free
-        freedom.append(free)
-        values.append(own)
-        left.append(rest)
-        row, column = row + len(rest), column + len(own)
-    scale = np.sqrt(np.diag(normal))
-    scale[scale == 0.0] = 1.0
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-    inverse = inverse / np.outer(scale, scale)
-    # The spread of few recordings may be small by chance.
-    both = [np.diag(inverse @ one @ inverse) for one in (even, middle)]
-    errors = np.asarray(np.sqrt(np.maximum(*both)))
-    return _Errors(errors, np.sqrt(np.diag(inverse)), freedom, values, left)
+def _refined(fit: _Fit) -> _Fit:
+    """Return the fit with the probable ratios of variances alone, which is faster."""
+    search = fit.search
+    models = [
+        MixedModel(model.depths, model.ratios[one.weights > _LEAST])
+        for model, one in zip(search.models, search.fits(fit.optima[0].x), strict=True)
+    ]
+    faster = Search(search.tips, search.terms, search.known, models)
+    return _Fit(faster, faster.optima([one.x for one in fit.optima]))
 
 
 def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> SteeringEstimate:
-    """Compute errors and intervals, and assemble the result."""
-    search, x, cost = fit
-    e = _errors(search, x)
-    quantiles = stdtrit(np.array(e.freedom), 0.975).tolist()
+    """Compute errors, intervals and predictions, and assemble the result."""
+    search, best = fit.search, fit.optima[0]
+    fits, residuals = search.fits(best.x), search.residuals(best.x)
+    information = search.information(best.x)
+    freedom = [
+        model.freedom - len(one.drift) - _LENGTHS - 1
+        for model, one in zip(search.models, fits, strict=True)
+    ]
+    rises = [log1p(stdtrit(free, 0.975) ** 2 / free) * (free + 1.0) for free in freedom]
 
-    def length(name: str, at: int, quantile: float) -> ParameterEstimate:
-        """Return a search variable as a constant with a profile interval."""
-        width = quantile * float(e.errors[at])
-        rise = quantile * float(e.errors[at] / e.units[at]) if e.units[at] > 0.0 else inf
-        if not isfinite(rise):
-            return _constant(name)
-        low, high = search.interval(x, cost, at, width, rise)
-        value, error = float(x[at]), float(e.errors[at])
+    def length(name: str, at: int, rise: float) -> ParameterEstimate:
+        """Return a length with its profile interval, if guide or roll alone determine it."""
+        x, step = float(best.x[at]), 1e-6
+        if np.ptp(search.bounds[:, at]) ** 2 * information[at] <= 4.0 * rise:
+            return _constant(name, shown(name, x))
+        low, high = interval(search, fit.optima, at, rise)
         if name == 'skin':
-            low, value, high = (SKIN_SCALE * one for one in (low, value, high))
             # The lower bound of the skin is zero.
-            return _constant(name, value, SKIN_SCALE * error, max(0.0, low), high)
+            low = max(low, 0.0)
         if not (isfinite(low) and isfinite(high)):
-            return _constant(name)
-        value = exp(value)
-        return _constant(name, value, value * error, exp(low), exp(high))
+            return _constant(name, shown(name, x))
+        error = sqrt(best.spread[at, at]) * (shown(name, x + step) - shown(name, x)) / step
+        return _constant(name, shown(name, x), error, shown(name, low), shown(name, high))
 
     if search.known is None:
-        free = length('free_length', 0, max(quantiles))
+        free = length('free_length', 0, min(rises))
     else:
         free = _constant('free_length', search.known, 0.0, search.known, search.known)
-    media, column = [], len(x)
+    media = []
     for k, (medium, members) in enumerate(search.members.items()):
-        at = len(x) - _LENGTHS * (len(search.media) - k)
-        found = [length('bending_length', at, quantiles[k]), length('skin', at + 1, quantiles[k])]
-        names = [name for term in search.terms for name in TERMS[term]]
-        for j, name in enumerate(names):
-            value, error = float(e.values[k][j]), float(e.errors[column + j])
-            half = quantiles[k] * error
-            found.append(_constant(name, value, error, value - half, value + half))
-        column += len(e.values[k])
+        at = len(best.x) - _LENGTHS * (len(fits) - k)
+        one, left = fits[k], [residuals[own] for own in members]
+        paths = variances(search.models[k].ratios) * one.variances[:, np.newaxis]
+        path_noise, slopes = (one.weights @ paths).tolist()
         media.append(
             MediumEstimate(
                 medium=medium,
-                parameters=tuple(found),
-                rms=float(np.sqrt(np.mean(e.left[k] ** 2))),
-                samples=len(e.left[k]) // 2,
+                parameters=(
+                    length('bending_length', at, rises[k]),
+                    length('skin', at + 1, rises[k]),
+                    *_drift(search, best, k, float(stdtrit(freedom[k], 0.975))),
+                ),
+                rms=rms_of(left),
+                noise=sqrt(float(one.weights @ one.variances)),
+                path_noise=path_noise,
+                slope=sqrt(slopes),
+                held_out=held_out(search, best, k),
+                samples=sum(map(len, left)),
                 recordings=len(members),
             )
         )
+    alike = [one for one in fit.optima if one.deviance - best.deviance <= max(rises)]
     return SteeringEstimate(
         free_length=free,
         media=tuple(media),
         terms=search.terms,
-        order=search.order,
+        order=search.tips.order,
         alternatives=alternatives,
-        residuals=tuple(_residuals(search, e.left)),
-        warnings=tuple(_warnings(search, alternatives)),
+        residuals=tuple(residuals),
+        optima=len(fit.optima),
+        warnings=tuple(_warnings(search, alike, alternatives, media)),
     )
 
 
-def _residuals(search: Search, left: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return the residuals of each recording, in input order."""
-    found = {}
-    for members, rest in zip(search.members.values(), left, strict=True):
-        ends = np.cumsum([2 * search.recordings[at].samples for at in members])
-        for at, own in zip(members, np.split(rest, ends[:-1]), strict=True):
-            found[at] = own.reshape(2, -1).T
-    return [found[at] for at in sorted(found)]
+def _drift(
+    search: Search, best: Optimum, medium: int, quantile: float
+) -> Iterator[ParameterEstimate]:
+    """Return the drift constants, with the errors of the lengths and of the ratios."""
+    one = search.fits(best.x)[medium]
+    values = one.drift
+    apart = one.values - values
+    covariance = np.einsum('k,kij->ij', one.weights, one.covariances)
+    covariance += (one.weights * apart.T) @ apart
+    slopes = [
+        (search.fits(there)[medium].drift - values) / step for step, there in search.steps(best.x)
+    ]
+    covariance += np.transpose(slopes) @ best.spread @ np.array(slopes)
+    names = [name for term in search.terms for name in TERMS[term]]
+    for name, value, variance in zip(names, values.tolist(), np.diag(covariance), strict=True):
+        error = sqrt(variance)
+        half = quantile * error if error < _LARGEST else inf
+        yield _constant(name, value, error, value - half, value + half)
 
 
 def _constant(
-    name: str, value: float = nan, error: float = inf, low: float = -inf, high: float = inf
+    name: str, value: float, error: float = inf, low: float = -inf, high: float = inf
 ) -> ParameterEstimate:
-    """Return a constant; it is undetermined if its interval is unbounded."""
+    """Return a constant; without a bounded interval it is undetermined, with the value used."""
     symbol, unit = CONSTANTS[name]
     if not (isfinite(low) and isfinite(high)):
-        return ParameterEstimate(name=name, symbol=symbol, unit=unit)
+        return ParameterEstimate(name=name, symbol=symbol, unit=unit, value=value)
     return ParameterEstimate(
         name=name, symbol=symbol, unit=unit, value=value, error=error, interval=(low, high),
         determined=True,
     )  # fmt: skip
 
 
-def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> Iterator[str]:
-    """Warn of drift terms that the recordings cannot distinguish."""
+def _warnings(
+    search: Search,
+    alike: Sequence[Optimum],
+    alternatives: Mapping[tuple[str, ...], float],
+    media: Sequence[MediumEstimate],
+) -> Iterator[str]:
+    """Warn of fits that the recordings cannot distinguish, and of poor predictions."""
     best = min(alternatives.values())
     equal = [terms for terms, rms in alternatives.items() if rms <= (1.0 + _AS_GOOD) * best]
     if len(equal) > 1:
@@ -292,3 +286,23 @@ def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> 
             f'{search.terms[0]}. A motion of the guide in air identifies the frame, a rotation of '
             'the needle at half the depth identifies the bevel'
         )
+    if len(alike) > 1:
+        each = ' or '.join(
+            f'{1e3 * length:.1f} mm with skin {1e3 * skin:.1f} mm'
+            for one in alike
+            for _, length, skin in search.lengths(one.x)
+        )
+        yield f'{len(alike)} sets of lengths fit alike, the intervals contain all: lambda {each}'
+    for one in media:
+        name = one.medium or 'these recordings'
+        if one.held_out is not None and one.held_out.rms > _WORSE * one.rms:
+            yield (
+                f'{name}: a recording is predicted from the others with an error of '
+                f'{1e3 * one.held_out.rms:.3f} mm, the residuals have {1e3 * one.rms:.3f} mm'
+            )
+        for constant in one.parameters:
+            if constant.name.startswith('frame') and abs(constant.value) > _ROTATED:
+                yield (
+                    f'{name}: the frames of guide and tip differ by {constant.symbol} = '
+                    f'{constant.value:.2f} rad: check the registration of the sensor'
+                )

@@ -8,7 +8,6 @@ from the previous row: ``guide_x=base.x[mm]@1``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import ceil
 from pathlib import Path
 import re
 from typing import Final
@@ -50,10 +49,6 @@ _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
 _MOVED: Final = 1e-4  # largest change of a constant tilt [rad]
-
-#: Largest number of tip samples; denser samples are averaged. The spacing over a path of 100 mm
-#: is then 0.2 mm.
-_MOST: Final = 500
 
 #: Roles of the columns; without a roll column the roll is zero.
 STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
@@ -146,20 +141,7 @@ def read_steering_recording(
     both = np.hstack([tips, moved[:, : len(joints)]])
     signs = [sign for sign, _ in (*axes.values(), *joints.values())]
     values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
-    return recorded_insertion(path, medium, _thinned(values, losses), losses)
-
-
-def _thinned(values: Mapping[str, FloatArray], losses: list[str]) -> dict[str, FloatArray]:
-    """Average neighboring samples down to the largest number for a fit."""
-    count = len(values['depth'])
-    group = ceil(count / _MOST)
-    if group == 1:
-        return dict(values)
-    losses.append(f'{count} samples of the tip averaged in groups of {group}')
-    whole = count - count % group
-    return {
-        role: column[:whole].reshape(-1, group).mean(axis=1) for role, column in values.items()
-    }
+    return recorded_insertion(path, medium, values, losses)
 
 
 def read_steering_table(

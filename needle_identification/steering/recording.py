@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,14 @@ _FROZEN: Final = 3  # number of equal consecutive tip measurements that indicate
 
 #: Change of depth over these measurements [m]; above the position noise of robots.
 _GONE: Final = 5e-4
+
+_REST: Final = 1e-5  # largest motion between rows at rest [m]
+_LEVER: Final = 0.01  # motion for a roll of 1 rad [m]
+
+#: Largest number of readings of a recording: with a path of 100 mm, one for each millimeter.
+_MOST: Final = 100
+
+_JUMP: Final = 0.01  # smallest guide position after rows of zeros that is no motion [m]
 
 _AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
 _JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
@@ -66,6 +75,25 @@ class SteeringRecording:
         return int(np.count_nonzero(self.known))
 
 
+def readings(recording: SteeringRecording) -> SteeringRecording:
+    """Average successive rows at rest, and as many other rows as needed for at most 100."""
+    moved = np.column_stack([recording.depth, recording.guide, _LEVER * recording.roll])
+    starts = [0]
+    for k, row in enumerate(moved):
+        if np.abs(row - moved[starts[-1]]).max() > _REST:
+            starts.append(k)
+    starts = starts[:: ceil(len(starts) / _MOST)]
+    known = recording.known[:, np.newaxis]
+    count = np.add.reduceat(known.astype(np.float64), starts)
+    sums = np.add.reduceat(np.where(known, recording.tip, 0.0), starts)
+    tip = np.divide(sums, count, out=np.full_like(sums, np.nan), where=count > 0)
+    rows = np.diff([*starts, len(moved)])[:, np.newaxis]
+    means = np.add.reduceat(moved, starts) / rows
+    return replace(
+        recording, depth=means[:, 0], guide=means[:, 1:3], roll=means[:, 3] / _LEVER, tip=tip
+    )
+
+
 def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """Return which tip samples (n,) are neither frozen nor implausible, and messages."""
     # Guide and tip (n, 2) are x and z [m] relative to their start, NaN if missing.
@@ -92,11 +120,23 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
     return there & ~frozen & ~wild, losses
 
 
+def _unset(values: Mapping[str, FloatArray]) -> int:
+    """Return the number of first rows of zeros before a jump of the guide."""
+    moved = np.column_stack([values[role] for role in ('depth', 'guide_x', 'guide_z')])
+    (there,) = np.nonzero((moved != 0.0).any(axis=1))
+    jumps = len(there) and np.abs(moved[there[0], 1:]).max() > _JUMP
+    return int(there[0]) if jumps else 0
+
+
 def recorded_insertion(
     path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
 ) -> SteeringRecording:
     """Create a recording from values of a file by role, (n,) each, without implausible samples."""
-    losses, depth = list(losses), values['depth']
+    losses, zeros = list(losses), _unset(values)
+    if zeros:
+        losses.append(f'{zeros} rows of zeros before the first position of the guide, left out')
+        values = {role: column[zeros:] for role, column in values.items()}
+    depth = values['depth']
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')
         depth = depth - depth[0]

@@ -1,15 +1,16 @@
-"""Nonlinear least squares search for the lengths, and their profile intervals."""
+"""Search for the lengths with the highest likelihood, and their profile intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
 from math import copysign, exp, inf, log, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.steering.mixed import Likelihood, MixedModel
 from needle_identification.steering.recording import SteeringRecording
-from needle_identification.steering.response import drift, responses
+from needle_identification.steering.response import drift, responses, TipResponses
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -18,165 +19,270 @@ FREE: Final = (1e-3, 0.3)
 LENGTH: Final = (4e-3, 0.5)
 SKIN: Final = (0.0, 0.5)
 
-#: Start values of the search: bending lengths, free length [m] and scaled skin.
-_STARTS: Final = (0.018, 0.035, 0.07)
-_START_FREE, _START_SKIN = 0.03, 0.1
+_SCALE: Final = 0.02  # the search variable of the skin is skin / (skin + scale) [m]
 
-SKIN_SCALE: Final = 0.02  #: the scale of the skin in the search [m]
-_UNIT: Final = 1e-4  # unit of the residuals in the search [m], for values of order 1
+#: Grid of the global search: free lengths, bending lengths and skins [m].
+_FREES: Final = (0.006, 0.016, 0.04, 0.1, 0.25)
+_LENGTHS: Final = (0.006, 0.01, 0.016, 0.025, 0.04, 0.065, 0.11, 0.2, 0.4)
+_SKINS: Final = (0.0, 0.006, 0.02, 0.08, 0.5)
 
-#: Finite difference step [search variables]; the responses are exact to rounding.
-_STEP: Final = 1e-5
+_ROUNDS: Final = 12  # largest number of rounds of a search
+_SETTLED: Final = 1e-3  # gain of the deviance in the last round
+_STEP: Final = 1e-4  # step of a derivative
+_ROLLED: Final = 0.1  # roll that excites the bevel [rad]
+_NOTHING: Final = 1e-4  # weight of a ratio without effect on a search
+_APART: Final = 0.05  # least difference between the variables of different optima
+_NEAR: Final = 0.02  # relative tolerance of the ends of intervals
 
-#: Largest number of iterations for an end of an interval, and relative tolerance.
-_TRIALS, _NEAR = 12, 0.01
 
-_KEPT: Final = 256  # size of the cache of media at given lengths
+class Tips:
+    """Tip responses of recordings at given lengths, in one order of guide and insertion."""
+
+    def __init__(self, recordings: Sequence[SteeringRecording], order: str) -> None:
+        self.recordings, self.order = recordings, order
+        self.moved = [np.column_stack([one.depth, one.guide])[one.known] for one in recordings]
+        self.measured = [one.tip[one.known].T for one in recordings]  # (2, n) [m]
+        self.of = lru_cache(maxsize=8000)(self._responses)
+
+    def _responses(self, at: int, free: float, length: float, skin: float) -> TipResponses:
+        return responses(self.recordings[at], free, length, skin, self.order)
+
+
+class Optimum(NamedTuple):
+    """Best lengths as search variables (k,), with -2 log likelihood and its curvature (k, k)."""
+
+    x: FloatArray
+    deviance: float
+    curvature: FloatArray
+
+    @property
+    def spread(self) -> FloatArray:
+        """Covariance of the variables, with a deviation of 1 if they are not determined."""
+        return np.asarray(np.linalg.inv(0.5 * self.curvature + np.eye(len(self.x))))
 
 
 class Search:
     """
-    Tip residuals of recorded insertions as a function of the lengths (variable projection).
+    Likelihood of recorded insertions as a function of the lengths.
 
     The variables are the logarithm of the free length, unless ``free`` [m] is given, and for each
-    medium the logarithm of the bending length, and the skin over its scale.
+    medium the logarithm of the bending length, and skin / (skin + scale).
     """
 
     def __init__(
         self,
-        recordings: Sequence[SteeringRecording],
+        tips: Tips,
         terms: tuple[str, ...],
-        order: str,
         free: float | None,
+        models: Sequence[MixedModel] = (),
     ) -> None:
-        self.recordings, self.terms, self.order = recordings, terms, order
-        self.known = free
-        self.media = tuple(dict.fromkeys(one.medium for one in recordings))
+        self.tips, self.terms, self.known = tips, terms, free
+        media = [one.medium for one in tips.recordings]
         self.members = {
-            medium: [k for k, one in enumerate(recordings) if one.medium == medium]
-            for medium in self.media
+            medium: [k for k, other in enumerate(media) if other == medium]
+            for medium in dict.fromkeys(media)
         }
-        low = [log(LENGTH[0]), SKIN[0] / SKIN_SCALE] * len(self.media)
-        high = [log(LENGTH[1]), SKIN[1] / SKIN_SCALE] * len(self.media)
-        if free is None:
-            low, high = [log(FREE[0]), *low], [log(FREE[1]), *high]
-        self._bounds = np.array([low, high])
-        # The columns of a medium depend on its lengths only.
-        self._part = lru_cache(maxsize=_KEPT)(self._columns)
-        self._left = lru_cache(maxsize=_KEPT)(self._rest)
+        self.models = models or [
+            MixedModel([tips.moved[at] for at in members]) for members in self.members.values()
+        ]
+        ends = zip(FREE, LENGTH, SKIN, strict=True)
+        self.bounds = np.array([self.variables(*end, len(self.members)) for end in ends])
+        self._part = lru_cache(maxsize=64)(self._fit)
 
-    def lengths(self, x: FloatArray) -> tuple[float, list[tuple[float, float]]]:
-        """Return the free length [m], and bending length and skin of each medium [m]."""
+    def variables(self, free: float, length: float, skin: float, media: int = 1) -> FloatArray:
+        """Return the search variables for the same lengths [m] of all media."""
+        own = [log(length), skin / (skin + _SCALE)] * media
+        return np.array(own if self.known is not None else [log(free), *own])
+
+    def lengths(self, x: FloatArray) -> list[tuple[float, float, float]]:
+        """Return free length, bending length and skin of each medium [m]."""
         own = x.tolist()
         free = self.known if self.known is not None else exp(own.pop(0))
         pairs = zip(own[::2], own[1::2], strict=True)
-        return free, [(exp(length), SKIN_SCALE * skin) for length, skin in pairs]
+        return [(free, exp(length), _SCALE * u / (1.0 - u)) for length, u in pairs]
 
-    def design(self, x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """Return linear columns (2 n, c) and the tip without guide response, by medium."""
-        free, lengths = self.lengths(x)
-        return [self._part(k, free, *own) for k, own in enumerate(lengths)]
-
-    def _columns(
-        self, medium: int, free: float, length: float, skin: float
+    def design(
+        self, at: int, free: float, length: float, skin: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return linear columns of a medium, and the tip without guide response."""
-        rows, left = [], []
-        members = self.members[self.media[medium]]
-        for k, at in enumerate(members):
-            one = self.recordings[at]
-            r = responses(one, free, length, skin, self.order)
-            n, known = len(one.depth), np.tile(one.known, 2)
-            offsets = np.zeros((2 * n, 2 * len(members)))
-            offsets[:n, 2 * k] = offsets[n:, 2 * k + 1] = 1.0
-            columns = np.hstack([*(drift(term, one, r) for term in self.terms), offsets])
-            rows.append(columns[known])
-            left.append((one.tip - r.guide).T.ravel()[known])
-        return np.vstack(rows), np.concatenate(left)
+        """Return the response to the guide (2, n), and to the drift constants (2, n, c)."""
+        one = self.tips.recordings[at]
+        r = self.tips.of(at, free, length, skin)
+        columns = np.hstack([drift(term, one, r) for term in self.terms])
+        columns = columns.reshape(2, len(one.depth), -1)
+        return r.guide[one.known].T, columns[:, one.known]
 
-    def _rest(self, medium: int, free: float, length: float, skin: float) -> FloatArray:
-        """Return the residuals of a medium at the best linear constants."""
-        columns, left = self._part(medium, free, length, skin)
-        return np.asarray(left - columns @ np.linalg.lstsq(columns, left)[0])
+    def fits(self, x: FloatArray) -> list[Likelihood]:
+        """Return the fit of each medium."""
+        return [self._part(k, *own) for k, own in enumerate(self.lengths(x))]
 
-    def residual(self, x: FloatArray) -> FloatArray:
-        """Return the residuals of all media at the best linear constants [m]."""
-        free, lengths = self.lengths(x)
-        return np.concatenate([self._left(k, free, *own) for k, own in enumerate(lengths)])
+    def _fit(self, medium: int, free: float, length: float, skin: float) -> Likelihood:
+        members = list(self.members.values())[medium]
+        parts = [self.design(at, free, length, skin) for at in members]
+        left = [
+            self.tips.measured[at] - guide for at, (guide, _) in zip(members, parts, strict=True)
+        ]
+        return self.models[medium].likelihood([columns for _, columns in parts], left)
 
-    def _search(self, first: FloatArray, free: Sequence[int]) -> tuple[FloatArray, float]:
-        """Search over variables with these indices; return all variables and the cost [m^2]."""
-        at = list(free)
-        x = first.copy()
+    def deviance(self, x: FloatArray) -> float:
+        """Return -2 log likelihood of all media."""
+        return sum(one.deviance for one in self.fits(x))
 
-        def residual(values: FloatArray) -> FloatArray:
-            x[at] = values
-            return self.residual(x) / _UNIT
+    def descend(self, first: FloatArray, free: Sequence[int] | None = None) -> Optimum:
+        """Search over variables with these indices: least squares by the weights of each round."""
+        at = list(range(len(first)) if free is None else free)
+        low, high = self.bounds
+        x = np.clip(first, low, high)
+        now, jacobian = self.deviance(x), np.zeros((1, len(at)))
+        for _ in range(_ROUNDS if at else 0):
+            trial = x.copy()
+            residual = partial(self._residual, self._weights(x), trial, at)
+            found = least_squares(
+                residual, x[at], bounds=(low[at], high[at]), x_scale='jac', max_nfev=6
+            )
+            trial[at] = found.x
+            gain, jacobian = now - self.deviance(trial), found.jac
+            if gain > 0.0:
+                x, now = trial, now - gain
+            if gain < _SETTLED:
+                break
+        return Optimum(x, now, 2.0 * jacobian.T @ jacobian)
 
-        low, high = self._bounds[:, at]
-        start = np.clip(first[at], low, high)
-        found = least_squares(residual, start, bounds=(low, high), x_scale='jac', xtol=1e-8)
-        x[at] = found.x
-        return x, _UNIT**2 * float(found.cost)
+    def steps(self, x: FloatArray) -> Iterator[tuple[float, FloatArray]]:
+        """Return a small step of each variable within the bounds, and the variables after it."""
+        for k in range(len(x)):
+            there = x.copy()
+            there[k] += _STEP if x[k] + _STEP < self.bounds[1, k] else -_STEP
+            yield float(there[k] - x[k]), there
 
-    def best(self, near: FloatArray | None = None) -> tuple[FloatArray, float]:
-        """Return the best variables (k,) and half their sum of squares [m^2]."""
-        if near is not None:
-            return self._search(near, range(len(near)))
-        found = []
-        for start in _STARTS:
-            first = [log(start), _START_SKIN] * len(self.media)
-            if self.known is None:
-                first = [log(_START_FREE), *first]
-            found.append(self._search(np.array(first), range(len(first))))
-        return min(found, key=lambda one: one[1])
+    def changes(self, x: FloatArray, medium: int, at: int, drift: FloatArray) -> FloatArray:
+        """Return derivatives (2, n, k) of the tip by the variables, for a constant drift."""
 
-    def slopes(self, x: FloatArray) -> FloatArray:
-        """Return derivatives of the fitted tip by the variables at fixed linear constants [m]."""
-        values = [np.linalg.lstsq(a, y)[0] for a, y in self.design(x)]
+        def tip(there: FloatArray) -> FloatArray:
+            guide, columns = self.design(at, *self.lengths(there)[medium])
+            return np.asarray(guide + columns @ drift)
 
-        def fitted(at: FloatArray) -> FloatArray:
-            parts = zip(self.design(at), values, strict=True)
-            return np.concatenate([a @ v - y for (a, y), v in parts])
+        each = [(tip(there) - tip(x)) / step for step, there in self.steps(x)]
+        return np.stack(each, axis=-1)
 
-        steps = _STEP * np.eye(len(x))
-        return np.array([(fitted(x + h) - fitted(x - h)) / (2.0 * _STEP) for h in steps]).T
+    def information(self, x: FloatArray) -> FloatArray:
+        """Return the information (k,) of the motions of guide and roll on each variable."""
+        found = np.zeros(len(x))
+        for medium, (one, members) in enumerate(
+            zip(self.fits(x), self.members.values(), strict=True)
+        ):
+            rolls = [np.ptp(self.tips.recordings[at].roll) for at in members]
+            drift = one.drift * (max(rolls) > _ROLLED)
+            columns = [self.design(at, *self.lengths(x)[medium])[1] for at in members]
+            changes = [self.changes(x, medium, at, drift) for at in members]
+            for k in range(len(x)):
+                own = [change[..., k] for change in changes]
+                left = self.models[medium].likelihood(columns, own).residuals
+                found[k] += one.weights @ ((left**2).sum(axis=1) / one.variances)
+        return found
 
-    def interval(
-        self, x: FloatArray, cost: float, k: int, width: float, rise: float
-    ) -> tuple[float, float]:
-        """Return the profile likelihood interval of variable k; infinite at a search bound."""
-        return (
-            float(x[k]) - self._end(x, cost, k, -width, rise),
-            float(x[k]) + self._end(x, cost, k, width, rise),
+    def residuals(self, x: FloatArray) -> list[FloatArray]:
+        """Return measured minus fitted tips of each recording (n, 2) [m]."""
+        found = {}
+        for one, lengths, members in zip(
+            self.fits(x), self.lengths(x), self.members.values(), strict=True
+        ):
+            for at in members:
+                guide, columns = self.design(at, *lengths)
+                left = self.tips.measured[at] - guide - columns @ one.drift
+                found[at] = left.T - left.mean(axis=1)
+        return [found[at] for at in sorted(found)]
+
+    def _weights(self, x: FloatArray) -> list[FloatArray]:
+        """Return the factors (K, 1) of the residuals of each medium for least squares near x."""
+        each = [(one, one.weights > _NOTHING) for one in self.fits(x)]
+        return [np.sqrt(one.weights * kept / one.variances)[:, np.newaxis] for one, kept in each]
+
+    def _residual(
+        self, factors: list[FloatArray], x: FloatArray, at: list[int], values: FloatArray
+    ) -> FloatArray:
+        """Return weighted residuals after a change of variables, in place."""
+        x[at] = values
+        parts = zip(factors, self.fits(x), strict=True)
+        return np.concatenate(
+            [(own * one.residuals)[own[:, 0] > 0.0].ravel() for own, one in parts]
         )
 
-    def _end(self, x: FloatArray, cost: float, k: int, first: float, rise: float) -> float:
-        """Return the distance from the best value to an end of the interval."""
-        others = [i for i in range(len(x)) if i != k]
-        bound = float(self._bounds[int(first > 0.0), k])
-        reach = abs(bound - float(x[k]))
-        start = x.copy()
-        trial, near, near_rise, far, far_rise = abs(first), 0.0, 0.0, inf, inf
-        for _ in range(_TRIALS):
-            trial = min(trial, reach)
-            start[k] = bound if trial == reach else x[k] + copysign(trial, first)
-            if others:
-                start, there = self._search(start, others)
-            else:
-                there = 0.5 * float(np.sum(self.residual(start) ** 2))
-            now = sqrt(max(0.0, 2.0 * (there - cost)))
-            if abs(now - rise) <= _NEAR * rise:
-                return trial
-            if now > rise:
-                far, far_rise = trial, now
-            elif trial == reach:
-                return inf
-            else:
-                near, near_rise = trial, now
-            # The root of the rise is nearly linear: secant steps.
-            if far < inf:
-                trial = near + (far - near) * (rise - near_rise) / (far_rise - near_rise)
-            else:
-                trial *= min(max(rise / max(now, 1e-3 * rise), 1.1), 4.0)
-        return trial
+    def optima(self, near: Sequence[FloatArray] = ()) -> list[Optimum]:
+        """Return distinct optima, the best first; from a grid without near points."""
+        found: list[Optimum] = []
+        for one in sorted(map(self.descend, near or self._starts()), key=lambda one: one.deviance):
+            if all(np.abs(one.x - other.x).max() > _APART for other in found):
+                found.append(one)
+        return found
+
+    def _starts(self) -> list[FloatArray]:
+        """Return the best point of a grid for each skin."""
+        starts = []
+        for skin in _SKINS:
+            trials = []
+            for free in _FREES if self.known is None else [self.known]:
+                x, total = self.variables(free, 1.0, skin)[:-2], 0.0
+                for k in range(len(self.members)):
+                    each = {one: self._part(k, free, one, skin).deviance for one in _LENGTHS}
+                    best = min(_LENGTHS, key=each.__getitem__)
+                    x = np.append(x, self.variables(free, best, skin)[-2:])
+                    total += each[best]
+                trials.append((total, x))
+            starts.append(min(trials, key=lambda one: one[0])[1])
+        return starts
+
+
+def shown(name: str, variable: float) -> float:
+    """Return the length [m] with this name and search variable."""
+    return _SCALE * variable / (1.0 - variable) if name == 'skin' else exp(variable)
+
+
+def interval(
+    search: Search, optima: Sequence[Optimum], k: int, rise: float
+) -> tuple[float, float]:
+    """
+    Return the profile likelihood interval of variable k; infinite at a bound of the search.
+
+    It contains all optima whose deviance is within `rise` of the first, which is the best.
+    """
+    alike = [one for one in optima if one.deviance - optima[0].deviance <= rise]
+    level = optima[0].deviance + rise
+    alike.sort(key=lambda one: float(one.x[k]))
+    return (
+        _end(search, optima, alike[0], k, -1.0, level),
+        _end(search, optima, alike[-1], k, 1.0, level),
+    )
+
+
+def _end(
+    search: Search, optima: Sequence[Optimum], start: Optimum, k: int, sign: float, level: float
+) -> float:
+    """Return the end of an interval in a direction from an optimum."""
+    others = [i for i in range(len(start.x)) if i != k]
+    bound = float(search.bounds[int(sign > 0.0), k])
+    seeds = [start.x, *(one.x for one in optima)]
+
+    def above(value: float) -> float:
+        """Search over the other variables, from the best of several starts."""
+        trials = [np.array(seed) for seed in seeds]
+        for trial in trials:
+            trial[k] = value
+        found = search.descend(min(trials, key=search.deviance), others)
+        seeds[0] = found.x
+        return found.deviance - level
+
+    near, low, high = float(start.x[k]), start.deviance - level, -1.0
+    step, far = sqrt(-start.spread[k, k] * low), near
+    while high < 0.0:
+        near, low = (far, high) if far != near else (near, low)
+        far = near + copysign(min(step, 0.5, abs(bound - near)), sign)
+        if far == near:
+            return copysign(inf, sign)
+        high, step = above(far), 1.5 * step
+    width = abs(far - near)
+    while abs(far - near) > _NEAR * width and high > _NEAR * (level - start.deviance):
+        # A secant that shortens the bracket from both ends.
+        middle = near + min(max(low / (low - high), 0.1), 0.9) * (far - near)
+        now = above(middle)
+        near, low, far, high = (near, low, middle, now) if now >= 0.0 else (middle, now, far, high)
+    return far

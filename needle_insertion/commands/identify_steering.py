@@ -14,7 +14,7 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
-from needle_identification.steering.estimate import SteeringEstimate
+from needle_identification.steering.estimate import HeldOut, SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
@@ -25,6 +25,12 @@ from needle_ros.files import write_whole
 from tqdm import tqdm
 
 _ONE = 'all'  #: name of a medium without a name
+
+#: Columns of the table of media.
+_FITS = (
+    'medium', 'recordings', 'samples', 'rms per axis [mm]', 'rms of a predicted recording [mm]',
+    'noise [mm]', 'path noise [rad^2/m]',
+)  # fmt: skip
 
 
 def add_steering(what: Any) -> None:
@@ -194,6 +200,13 @@ def _cell(one: ParameterEstimate) -> str:
     return measured(one.value, one.error) if one.determined else 'not determined'
 
 
+def _predicted(one: HeldOut | None) -> str:
+    if one is None:
+        return ''
+    low, high = (1e3 * end for end in one.interval)
+    return f'{1e3 * one.rms:.3f} ({between((low, high))})'
+
+
 def steering_text(found: SteeringEstimate) -> str:
     """Return a result as tables for the terminal."""
     rows = []
@@ -212,6 +225,9 @@ def steering_text(found: SteeringEstimate) -> str:
             f'{medium.recordings}',
             f'{medium.samples}',
             f'{1e3 * medium.rms:.3f}',
+            _predicted(medium.held_out),
+            f'{1e3 * medium.noise:.3f}',
+            f'{medium.path_noise:.1e}',
         )
         for medium in found.media
     ]
@@ -223,7 +239,7 @@ def steering_text(found: SteeringEstimate) -> str:
         [
             table(rows, ('medium', 'parameter', 'value ± SE', '95 % interval')),
             '',
-            table(fits, ('medium', 'recordings', 'samples', 'rms per axis [mm]')),
+            table(fits, _FITS),
             '',
             f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {motion}',
         ]
@@ -237,7 +253,7 @@ def steering_document(
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
         if not one.determined:
-            return {'unit': one.unit, 'determined': False}
+            return {'used': one.value, 'unit': one.unit, 'determined': False}
         return {
             'value': one.value,
             'error': one.error,
@@ -252,6 +268,10 @@ def steering_document(
             medium.medium or _ONE: {
                 'parameters': {one.name: entry(one) for one in medium.parameters},
                 'rms': medium.rms,
+                'noise': medium.noise,
+                'path_noise': medium.path_noise,
+                'slope': medium.slope,
+                'held_out': None if medium.held_out is None else medium.held_out._asdict(),
                 'samples': medium.samples,
                 'recordings': medium.recordings,
             }
@@ -259,6 +279,7 @@ def steering_document(
         },
         'terms': list(found.terms),
         'order': found.order,
+        'optima': found.optima,
         'rms_by_terms': {'+'.join(terms): rms for terms, rms in found.alternatives.items()},
         'recordings': [
             {'name': one.name, 'medium': one.medium, 'losses': list(one.losses)}

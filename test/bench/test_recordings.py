@@ -10,7 +10,6 @@ from pathlib import Path
 
 from benchmarks.recordings.__main__ import main
 from benchmarks.recordings.folder import read_folder, read_insertion
-from benchmarks.recordings.identification import predict, rms_of
 from benchmarks.recordings.plants import (
     BeamMedium,
     disturbance_of,
@@ -24,6 +23,8 @@ from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 from needle_identification import RecordingError, SteeringRecording
+from needle_identification.steering.prediction import predict, Prediction, rms_of
+from needle_identification.steering.search import Search, Tips
 from needle_ros.errors import ParameterError
 import numpy as np
 import pytest
@@ -198,13 +199,18 @@ def test_laws_steer_a_medium_within_the_prior(recordings: list[SteeringRecording
 
 
 def test_prediction_of_a_recording_that_is_not_fitted(recordings: list[SteeringRecording]) -> None:
-    found = predict(recordings[:-1], recordings[-1:], ('tilt',), 'guide first')
-    assert rms_of(found) < 1e-5
+    fitted = Search(Tips(recordings[:-1], 'guide first'), ('tilt',), None)
+    best = fitted.optima()[0]
+
+    def predicted(one: SteeringRecording) -> Prediction:
+        search = Search(Tips([*recordings[:-1], one], 'guide first'), ('tilt',), None)
+        return predict(search, fitted, best, 0, len(recordings) - 1)
+
+    assert rms_of([predicted(recordings[-1]).errors]) < 1e-5
     # A recording of another medium is not predicted.
-    other = replace(recordings[-1], tip=0.5 * recordings[-1].tip)
-    wrong = predict(recordings[:-1], [other], ('tilt',), 'guide first')
-    assert rms_of(wrong) > 1e-4
-    assert wrong[0].held.mean() < 0.5
+    wrong = predicted(replace(recordings[-1], tip=0.5 * recordings[-1].tip))
+    assert rms_of([wrong.errors]) > 1e-4
+    assert wrong.held.mean() < 0.5
 
 
 def test_command_prints_tables_and_writes_json(

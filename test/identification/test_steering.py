@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 import json
-from math import pi
+from math import pi, sqrt
 from pathlib import Path
 
 from benchmarks.steering_fit import FitTruth, insertion, NOISE
@@ -24,7 +24,7 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
 from needle_identification.result import steering_yaml
 from needle_identification.steering.reading import STEERING_ROLES
-from needle_identification.steering.recording import credible
+from needle_identification.steering.recording import credible, readings
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -144,13 +144,97 @@ def test_a_given_free_length_is_used() -> None:
     assert width(known['bending_length'].interval) < width(unknown['bending_length'].interval)
 
 
-def test_a_straight_insertion_determines_no_length() -> None:
-    """Straight insertion with a guide at rest: no length is determined."""
-    still = insertion(1)
-    still = replace(still, guide=np.zeros_like(still.guide))
-    found = identify_steering([still], TILTED)
-    [gel] = found.media
-    assert not gel['bending_length'].determined
+def test_a_guide_at_rest_determines_no_length() -> None:
+    """The shape of the drift alone determines no length, with noise and without."""
+    for noise in (NOISE, 0.0):
+        still = insertion(1, replace(PLAIN, noise=noise), steer=0.0)
+        found = identify_steering([still])
+        [gel] = found.media
+        assert not gel['bending_length'].determined
+        assert not gel['skin'].determined
+        assert not found.free_length.determined
+        with pytest.raises(IdentificationError, match='do not determine the bending length'):
+            steering_yaml(found)
+
+
+def test_a_simulated_needle_with_a_guide_at_rest_is_not_identified(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = str(tmp_path / 'insertion.csv')
+    words = ['--set', 'bevel_load=0.4', '--set', 'cutting_force=0.8', '-o', table]
+    assert main(['simulate', '--model', 'steering', *words]) == 0
+    capsys.readouterr()
+    assert main(['identify', 'steering', table, '--json']) == 0
+    [medium] = json.loads(capsys.readouterr().out)['media'].values()
+    assert not medium['parameters']['bending_length']['determined']
+
+
+def test_rows_at_rest_are_one_reading() -> None:
+    """Ten readings at each depth with their own noise: as one reading with their mean."""
+    one = insertion(1)
+    rng = np.random.default_rng(1)
+    noise = 1e-4 * rng.standard_normal((10 * len(one.depth), 2))
+    rows = np.repeat(np.arange(len(one.depth)), 10)
+    often = replace(
+        one,
+        depth=one.depth[rows],
+        guide=one.guide[rows],
+        roll=one.roll[rows],
+        tip=one.tip[rows] + noise,
+    )
+    mean = replace(one, tip=one.tip + noise.reshape(-1, 10, 2).mean(axis=1))
+    [found], [wanted] = (identify_steering([r], TILTED).media for r in (often, mean))
+    assert found.samples == wanted.samples == len(one.depth)
+    # Rounding of the means, and the end of the search.
+    assert_allclose(found['bending_length'].interval, wanted['bending_length'].interval, rtol=1e-3)
+
+
+def test_readings_of_a_dense_recording_are_averages() -> None:
+    depth = np.linspace(0.0, 0.1, 1000)
+    tip = np.column_stack([depth, -depth])
+    tip[::2] = np.nan
+    dense = SteeringRecording(
+        depth=depth, guide=0.1 * np.column_stack([depth, depth]), roll=20.0 * depth, tip=tip
+    )
+    found = readings(dense)
+    assert found.samples == 100
+    assert_allclose(found.depth, depth.reshape(100, 10).mean(axis=1))
+    assert_allclose(found.guide[:, 0], 0.1 * found.depth)
+    assert_allclose(found.roll, 20.0 * found.depth)
+    assert_allclose(found.tip[:, 0], depth[1::2].reshape(100, 5).mean(axis=1))
+
+
+def test_intervals_contain_the_differences_between_insertions() -> None:
+    """Paths wander and frames differ: intervals are wider, and contain the true values."""
+    real = replace(PLAIN, path_noise=1e-3, slope=0.02)
+    found = identify_steering([insertion(k, real) for k in range(6)], TILTED)
+    plain = identify_steering([insertion(k) for k in range(6)], TILTED)
+    [gel], [known] = found.media, plain.media
+    low, high = gel['bending_length'].interval
+    assert low < real.length < high
+    narrow = known['bending_length'].interval
+    assert high - low > 1.5 * (narrow[1] - narrow[0])
+    # Twelve slopes: an error of a fifth, times three; path noise from twelve paths.
+    assert gel.slope == pytest.approx(real.slope, rel=0.6)
+    assert 1e-4 < gel.path_noise < 1e-2
+    assert known.path_noise < 1e-4
+    assert gel.held_out is not None
+    # Predicted tips of twelve paths, whose errors are correlated within a path.
+    assert 0.8 <= gel.held_out.coverage <= 1.0
+
+
+def test_poor_prediction_of_another_recording_is_reported() -> None:
+    """Two tissues by the same name."""
+    two = [insertion(1), insertion(2, replace(PLAIN, length=0.015))]
+    found = identify_steering(two, TILTED)
+    assert any('is predicted from the others with an error of' in one for one in found.warnings)
+    alike = identify_steering([insertion(1), insertion(2)], TILTED)
+    assert not any('is predicted' in one for one in alike.warnings)
+
+
+def test_a_single_insertion_is_not_predicted() -> None:
+    [gel] = identify_steering([insertion(1)], TILTED).media
+    assert gel.held_out is None
 
 
 def test_a_table_of_another_laboratory_is_read_with_options(
@@ -167,7 +251,8 @@ def test_a_table_of_another_laboratory_is_read_with_options(
     assert 'run_2.csv: 8 samples of the tip repeated during the insertion' in said.err
     assert 'depths relative to the first depth, 200 mm, at the skin' in said.err
     [medium] = found['media'].values()
-    assert medium['samples'] == 4 * 22 - 8
+    # The row at rest before the first step is no reading of its own.
+    assert medium['samples'] == 4 * 21 - 8
     low, high = medium['parameters']['bending_length']['interval']
     assert low < PLAIN.length < high
     assert medium['rms'] == pytest.approx(NOISE, rel=0.15)
@@ -209,6 +294,18 @@ def test_frozen_and_implausible_readings_are_discarded() -> None:
     # A needle at rest may have repeated readings.
     rest = np.zeros((10, 2))
     assert credible(np.full(10, 0.05), guide, rest)[0].all()
+
+
+def test_rows_of_zeros_before_the_guide_moves_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / 'run.csv'
+    rows = ['0,0,0,0,0', '0,0,0,0,0', '0,25,-22,1,1', '5,25,-22,1,2', '10,26,-22,2,2']
+    path.write_text('\n'.join(['depth_mm,guide_x_mm,guide_z_mm,tip_x_mm,tip_z_mm', *rows]))
+    one = read_steering_recording(path)
+    assert_allclose(one.guide[:, 0], [0.025, 0.025, 0.026])
+    assert any('2 rows of zeros before the first position of the guide' in w for w in one.losses)
+    # A guide that starts at zero.
+    path.write_text(path.read_text().replace('25,-22', '1,0').replace('26,-22', '2,0'))
+    assert len(read_steering_recording(path).depth) == 5
 
 
 def test_columns_may_be_delayed_by_rows(tmp_path: Path) -> None:
@@ -305,10 +402,14 @@ def test_a_bag_of_the_plant_is_read_without_options(
     assert high - low < 2e-3
     low, high = found['free_length']['interval']
     assert low < 0.04 < high
-    # 4,500 readings of both axes: a deviation has an error of 1.1 %, times four.
-    assert gel['rms'] == pytest.approx(NOISE, rel=0.044)
+    # Readings are averages of five samples. 900 readings of both axes: a deviation has an error of
+    # 2.4 %, times four.
+    assert gel['rms'] == pytest.approx(NOISE / sqrt(5.0), rel=0.1)
+    assert gel['noise'] == pytest.approx(NOISE / sqrt(5.0), rel=0.1)
+    # Offset and slope from 15 readings have errors, too.
+    assert gel['rms'] < gel['held_out']['rms'] < 1.3 * gel['rms']
     assert gel['recordings'] == 10
-    assert 10 * 400 < gel['samples'] < 10 * 480
+    assert 10 * 80 < gel['samples'] <= 10 * 100
     # The file starts a plant with the result, and a controller with the same tissue.
     sections = yaml.safe_load(result.read_text())
     values = sections['/**/plant']['ros__parameters']
@@ -325,6 +426,9 @@ def test_a_bag_of_the_plant_is_read_without_options(
     assert constants.steering.skin_stiffness == pytest.approx(
         gel['parameters']['skin']['value'] * tissue, rel=1e-6
     )
+    prior = sections['/**/steering']['ros__parameters']
+    assert prior['prior.noise'] == pytest.approx(gel['noise'], rel=1e-6)
+    assert prior['prior.path_noise'] >= 1e-6
     assert sections['/**/controller']['ros__parameters'] == {
         name: value for name, value in values.items() if name.startswith('model.')
     }

@@ -1,0 +1,145 @@
+r"""
+Likelihood of the tips of a medium in a linear mixed model.
+
+In each plane of each recording, the tip minus its response to the guide is
+
+.. math:: X \beta + o + s d + w(d) + v(g) + e
+
+with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the depth d, the path
+noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
+whose variance grows with its travel, and white noise e of deviation sigma. The
+likelihood is restricted [Patterson1971]_ [Harville1974]_: o, beta and sigma are integrated out.
+The ratios of the other deviations to sigma are summed over a grid: a few recordings hardly
+determine them.
+
+References
+----------
+.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
+   sizes are unequal", Biometrika 58, 1971.
+.. [Harville1974] D. A. Harville, "Bayesian inference for variance components using only error
+   contrasts", Biometrika 61, 1974.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+import numpy as np
+from scipy.special import logsumexp
+
+_REACH: Final = 0.1  # depth at which path noise and slopes have the deviations of the grid [m]
+
+_TRAVEL: Final = 1e-3  # motion of the guide whose response has the deviation of the grid [m]
+
+#: Grid of the deviations of path noise and slopes at this depth, and of responses, over sigma.
+_WANDERS: Final = (0.0, 1.0, 4.0, 16.0, 64.0, 256.0)
+_SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
+_RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
+
+_FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
+
+#: Constants without effect are 0 +- 1 rad or 1/m, for this deviation of the white noise [m].
+_WEAK: Final = 1e-4
+
+
+class Likelihood(NamedTuple):
+    """Fit at given lengths: K ratios, c drift constants and N residuals."""
+
+    deviance: float  #: -2 log restricted likelihood
+    selection: float  #: -2 log likelihood, with a penalty of 2 for each constant
+    weights: FloatArray  #: (K,) posterior probabilities of the ratios
+    variances: FloatArray  #: (K,) of the white noise [m^2]
+    values: FloatArray  #: (K, c) drift constants
+    covariances: FloatArray  #: (K, c, c) of the drift constants
+    residuals: FloatArray  #: (K, N) residuals, whitened to the variance of the white noise [m]
+
+    @property
+    def drift(self) -> FloatArray:
+        """Mean drift constants (c,)."""
+        return np.asarray(self.weights @ self.values)
+
+
+class MixedModel:
+    """Covariances of the recordings of a medium, by depth and guide (n, 3) of their readings."""
+
+    def __init__(self, depths: Sequence[FloatArray], ratios: FloatArray | None = None) -> None:
+        if ratios is None:
+            # The drift of a single recording contains its slope.
+            slopes = _SLOPES if len(depths) > 1 else (0.0,)
+            ratios = np.array(list(product(_WANDERS, slopes, _RESPONSES)))
+        self.ratios, self.depths = ratios, depths
+        self.samples = 2 * sum(map(len, depths))
+        self.freedom = self.samples - 2 * len(depths)  #: samples minus offsets
+        # The contrasts are normalized by white noise, the last ratios.
+        each = [*ratios, np.zeros(3)]
+        rows = max(map(len, depths))
+        self._half = np.zeros((len(each), len(depths), 1, rows, rows))
+        self._logs = np.zeros(len(each))
+        for k, ratio in enumerate(each):
+            unique = {depth.tobytes(): depth for depth in depths}
+            known = {key: _whitening(covariance(one, ratio)) for key, one in unique.items()}
+            for i, depth in enumerate(depths):
+                half, log = known[depth.tobytes()]
+                self._half[k, i, 0, : len(half), : len(half)] = half
+                self._logs[k] += 2.0 * log
+
+    def likelihood(
+        self, columns: Sequence[FloatArray], wanted: Sequence[FloatArray]
+    ) -> Likelihood:
+        """Fit the drift, (2, n, c) for each recording, to what the guide leaves, (2, n) [m]."""
+        c = columns[0].shape[-1]
+        both = np.zeros((len(wanted), 2, self._half.shape[-1], c + 1))
+        for at, column, one in zip(both, columns, wanted, strict=True):
+            at[:, : one.shape[1], :c], at[:, : one.shape[1], c] = column, one
+        rows = (self._half @ both).reshape(len(self._half), -1, c + 1)
+        design, tips = rows[..., :c], rows[..., c]
+        normal = np.swapaxes(design, 1, 2) @ design + _WEAK**2 * np.eye(c)
+        inverse = np.linalg.inv(normal)
+        values = (inverse @ np.swapaxes(design, 1, 2) @ tips[..., np.newaxis])[..., 0]
+        left = tips - (design @ values[..., np.newaxis])[..., 0]
+        free = self.freedom - c
+        variances = np.einsum('kn,kn->k', left, left) / free + _FINEST**2
+        logs = np.linalg.slogdet(normal)[1]
+        each = free * np.log(variances) + self._logs + logs - logs[-1]
+        whole = self.samples * np.log(variances) + self._logs + 2.0 * c
+        total = logsumexp(-0.5 * each[:-1])
+        return Likelihood(
+            deviance=-2.0 * float(total),
+            selection=-2.0 * float(logsumexp(-0.5 * whole[:-1])),
+            weights=np.exp(-0.5 * each[:-1] - total),
+            variances=variances[:-1],
+            values=values[:-1],
+            covariances=(variances[:, np.newaxis, np.newaxis] * inverse)[:-1],
+            residuals=left[:-1],
+        )
+
+
+def covariance(moved: FloatArray, ratio: FloatArray) -> FloatArray:
+    """Return the covariance (n, n) in a plane over sigma^2, from depth and guide (n, 3) [m]."""
+    d = (moved[:, 0] - moved[:, 0].min()) / _REACH
+    low, high = np.minimum(d[:, np.newaxis], d), np.maximum(d[:, np.newaxis], d)
+    wander = 0.5 * low**2 * (3.0 * high - low)
+    steps = np.diff(moved[:, 1:], axis=0, prepend=moved[:1, 1:])
+    travel = np.cumsum(np.hypot(*steps.T)) / _TRAVEL
+    response = np.minimum(travel[:, np.newaxis], travel)
+    parts = zip(ratio, (wander, np.outer(d, d), response), strict=True)
+    return np.asarray(np.eye(len(d)) + sum(one**2 * part for one, part in parts))
+
+
+def variances(ratios: FloatArray) -> FloatArray:
+    """Return path noise [rad^2/m] and variance of slopes [rad^2], over sigma^2 [m^2]."""
+    return np.asarray(ratios[:, :2] ** 2 * np.array([3.0 / _REACH**3, 1.0 / _REACH**2]))
+
+
+def _whitening(covariance: FloatArray) -> tuple[FloatArray, float]:
+    """Return the matrix (n, n) to white residuals without offset, and its log determinant."""
+    lower = np.linalg.cholesky(covariance)
+    half = np.linalg.inv(lower)
+    one = half.sum(axis=1)
+    square = float(one @ one)
+    log = 2.0 * float(np.log(np.diag(lower)).sum()) + float(np.log(square))
+    return half - np.outer(one / square, one @ half), log
