@@ -99,7 +99,8 @@ def test_construction_reports_progress_and_can_be_cancelled() -> None:
 
     with pytest.raises(CancelledError):
         SteeringModel(NEEDLE, STEERING, DEPTHS, progress=progress)
-    assert seen == [(k, 52) for k in range(4)]
+    # A grid of 13 x 4, and 2 x 3 kinematic points.
+    assert seen == [(k, 58) for k in range(4)]
     seen.clear()
     SteeringModel(NEEDLE, STEERING, DEPTHS, EXACT, progress=progress)
     assert seen == [(0, 1)]
