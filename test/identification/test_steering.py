@@ -214,10 +214,11 @@ def test_intervals_contain_the_differences_between_insertions() -> None:
     assert low < real.length < high
     narrow = known['bending_length'].interval
     assert high - low > 1.5 * (narrow[1] - narrow[0])
-    # Twelve slopes: an error of a fifth, times three; path noise from twelve paths.
-    assert gel.slope == pytest.approx(real.slope, rel=0.6)
-    assert 1e-4 < gel.path_noise < 1e-2
-    assert known.path_noise < 1e-4
+    # Slopes and path noise both change the direction at 100 mm. Twelve directions: an error of a
+    # fifth, times three.
+    direction = sqrt(real.slope**2 + 0.1 * real.path_noise)
+    assert sqrt(gel.slope**2 + 0.1 * gel.path_noise) == pytest.approx(direction, rel=0.6)
+    assert known.path_noise < 0.1 * gel.path_noise
     assert gel.held_out is not None
     # Predicted tips of twelve paths, whose errors are correlated within a path.
     assert 0.8 <= gel.held_out.coverage <= 1.0
