@@ -189,7 +189,7 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
 def _tip_roll(c: Steering, g: int, base: float) -> float:
     """Return the roll of the tip at a point of the grid for a roll of the base [rad]."""
     lag = c.responses.lags[g, c.counts[STEP]]
-    return min(max(c.roll[g], base - lag), base + lag)
+    return float(min(max(c.roll[g], base - lag), base + lag))
 
 
 @inlined

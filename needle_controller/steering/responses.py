@@ -204,9 +204,9 @@ class SteeringModel:
             if grid[axis] > 1:
                 whole = np.gradient(guide[:beams].reshape(grid), axis=axis)
                 change[:beams] = whole.reshape(beams, n + 1, n)
-        lags = np.outer([0.0] * beams + [windup for _, windup in arcs], at)
-        later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
-        self.responses = HypothesisResponses(*arrays, between, lags, *later)
+        arrays += [between, np.outer([0.0] * beams + [windup for _, windup in arcs], at)]
+        arrays += [_sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)]
+        self.responses = HypothesisResponses(*arrays)
         grid_lengths = np.append(grid_lengths, np.ones(len(arcs)))
         grid_skins = np.append(grid_skins, np.full(len(arcs), nominal))
         kinds = [(q * b.path_noise, drift) for drift in sorted({0.0, b.drift}) for q in _PATHS]
