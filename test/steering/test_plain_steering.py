@@ -61,7 +61,7 @@ class Plain:
                 for name, one in model.responses._asdict().items()
             }
         )
-        self.logs = np.zeros(h)
+        self.logs = np.where(model.rolled, -3.0, 0.0)
 
     @property
     def weights(self) -> FloatArray:

@@ -62,11 +62,12 @@ def test_known_needle_and_trocar_have_no_kinematic_hypotheses() -> None:
 
 
 def test_needle_that_is_not_turned_is_steered_by_the_guide() -> None:
-    """Without turns kinematic hypotheses have no weight, with turns the weight of the others."""
+    """Without turns kinematic hypotheses have no weight, with turns a twentieth of the others."""
     fixed = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), SteeringLimits())
     assert_array_equal(fixed.weights > 0.0, ~MODEL.rolled)
     turned = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), SteeringLimits(turns=3))
-    assert_allclose(turned.weights, 1.0 / len(MODEL.rolled))
+    relative = np.where(MODEL.rolled, np.exp(-3.0), 1.0)
+    assert_allclose(turned.weights, relative / relative.sum())
 
 
 @pytest.mark.parametrize('world', ['unicycle', 'bicycle'])

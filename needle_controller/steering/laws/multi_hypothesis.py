@@ -70,6 +70,9 @@ from numpy.typing import ArrayLike
 #: insertion.
 _REFUSED, _WARNED = 0.05, 0.5
 
+#: Logarithm of the weight of a kinematic hypothesis at the start, over the others, with turns.
+_ROLLED = -3.0
+
 
 class Reach(NamedTuple):
     """Reachable set of the tip, for each hypothesis."""
@@ -162,8 +165,7 @@ class MultiHypothesisLaw(SteeringLaw):
             target=np.zeros(2),
             mean=mean,
             covariance=np.repeat(prior.astype(np.complex128), points, axis=0),
-            # A needle that is not turned is steered by the guide.
-            logs=np.where(model.rolled & (turns == 0), -np.inf, 0.0),
+            logs=np.where(model.rolled, _ROLLED if turns else -np.inf, 0.0),
             guide=np.zeros(model.steps, dtype=np.complex128),
             turned=np.full((points, model.steps + 1), complex(cos(roll), -sin(roll))),
             roll=np.full(points + 1, roll),
