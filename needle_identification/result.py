@@ -19,9 +19,9 @@ import yaml
 
 NODES: Final = ('plant', 'controller')  #: nodes that use the result
 
-#: Least path noise [rad^2/m] and noise [m] of a prior: a few recordings may have none by chance.
-_LEAST_PATH_NOISE: Final = 1e-6
-_LEAST_NOISE: Final = 1e-5
+#: Limits of the path noise of a prior [rad^2/m]: a few recordings may have none by chance, and the
+#: controller considers up to 100 times as much.
+_PATH_NOISE: Final = (1e-6, 1e-4)
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
@@ -128,10 +128,11 @@ def steering_yaml(found: SteeringEstimate) -> str:
             f'# error of predicted recordings {medium.held_out.rms:.3g} m, '
             f'{between(medium.held_out.interval)}'
         )
-    prior = {
-        'prior.path_noise': _short(max(medium.path_noise, _LEAST_PATH_NOISE)),
-        'prior.noise': _short(max(medium.noise, _LEAST_NOISE)),
-    }
+    lines.append(
+        f'# path noise {medium.path_noise:.3g} rad^2/m, noise of a reading {medium.noise:.3g} m'
+    )
+    low, high = _PATH_NOISE
+    prior = {'prior.path_noise': _short(min(max(medium.path_noise, low), high))}
     lengths: dict[str, object] = {}
     # Also if they are not determined: the bending length is for these values.
     lengths['steering.free_length'] = _short(found.free_length.value)
