@@ -47,7 +47,7 @@ def test_identification_recovers_the_constants(
     # the corners of the guide motion.
     assert medium['parameters']['bending_length']['value'] == pytest.approx(0.035, rel=5e-3)
     assert identified['free_length']['value'] == pytest.approx(0.04, rel=5e-3)
-    # Readings are averages of rows, also across the corners; the fit takes the difference for noise.
+    # Readings are averages of rows, also across the corners: this is taken for noise.
     curvature = medium['parameters']['curvature_z']
     low, high = curvature['interval']
     assert low < 0.4 * 0.035 / 0.0256 < high
