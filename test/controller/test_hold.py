@@ -71,10 +71,12 @@ def insert_with(law: str, **friction: float) -> tuple[StalledLoop, float]:
 @pytest.mark.parametrize('law', LAWS)
 def test_reference_waits_for_a_force_at_its_limit(law: str) -> None:
     """Of a needle that slides slowly: no stop, and the distance remains small."""
-    # At 15 N this is half of the velocity of the reference: 10 mm in 2 s.
     loop, begin = insert_with(law, viscous=3000.0)
     assert loop.supervisor.authority.reason == ''
-    assert loop.depth - begin == pytest.approx(10e-3, rel=0.5)
+    # The limit of 15 N less dry friction, over 2 s. While the reference waits, the force is at its
+    # limit; it falls below the limit for less than a quarter of the time after that.
+    most = (15.0 - PHANTOM.coulomb_friction) / 3000.0 * 2.0
+    assert 0.75 * most < loop.depth - begin < most
     # The distance at which the law reaches the force limit: 15 N over the stiffness of PID.
     assert abs(loop.references[-1][0] - loop.depth) < 15.0 / 6000.0 + 1e-4
 
