@@ -19,6 +19,7 @@ from typing import Any, Final, NoReturn
 from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, NeedleError
+from needle_ros.signals import ENDINGS
 
 #: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
 COMMANDS: Final[Mapping[str, str]] = {
@@ -52,8 +53,6 @@ _ROOT: Final = Path(__file__).parents[1]
 #: ASCII substitutes of table characters, by character.
 _PLAIN: Final = {'±': '+-', '−': '-', '–': '-'}
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with the words after the program name; return the exit status."""
@@ -66,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors='plain')
     # Imports take up to a second and need no clean-up: a signal ends the process at once.
-    previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
+    previous = {name: signal.signal(name, signal.SIG_DFL) for name in ENDINGS}
     try:
         return _run(words)
     finally:
@@ -101,7 +100,7 @@ def _run(words: list[str]) -> int:
         announce_compilation()
     try:
         # From here on a signal must end the nodes that the command has started.
-        for name in _SIGNALS:
+        for name in ENDINGS:
             signal.signal(name, _interrupt)
         status: int = command.run(options)  # type: ignore[union-attr]
     except JobError as error:
@@ -118,7 +117,7 @@ def _run(words: list[str]) -> int:
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     # A second signal must not interrupt the clean-up.
-    for name in _SIGNALS:
+    for name in ENDINGS:
         signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
 

@@ -18,6 +18,7 @@ from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError
 from needle_ros.network import LOCAL, RANGE, stay_local
 from needle_ros.parameter_files import sections, shared_names, unmatched_files
+from needle_ros.signals import ENDINGS
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
@@ -29,9 +30,6 @@ from rclpy.utilities import remove_ros_args
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
 
 _PR_SET_PDEATHSIG = 1
-
-#: Signals that end a node; closing a terminal sends SIGHUP.
-_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _USAGE = '%(prog)s [-h] [--ros-args [-p NAME:=VALUE ...] [--params-file FILE] ...]'
 _WIDTH, _DEEP = 99, 6 * ' '
@@ -56,7 +54,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
 
     if parent := os.environ.get(END_WITH_PARENT):
         _end_with_parent(parent)
-    for one in _ENDINGS:
+    for one in ENDINGS:
         signal.signal(one, stop)
     stay_local(os.environ)
     try:
@@ -105,7 +103,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
     finally:
         rclpy.utilities.try_shutdown()
         # A second Ctrl-C must not change the exit status.
-        for one in _ENDINGS:
+        for one in ENDINGS:
             signal.signal(one, signal.SIG_IGN)
 
 

@@ -42,9 +42,10 @@ class TimingMonitor:
         return None if warned else line
 
     def warning(self, now: int) -> str | None:
-        """Return a warning of the latency at a time [ns], or of the rate, or None."""
+        """Return a warning of the rate or, at the correct rate, of the latency at a time [ns]."""
+        # At a wrong rate commands are late, too.
         rate = self._rate.warning() if self._rate is not None else None
-        return self._latency.warning(now) or rate
+        return rate or self._latency.warning(now)
 
     def status(self) -> LatencyStatus:
         """Return the status of the latency."""

@@ -6,18 +6,16 @@ import argparse
 import asyncio
 from contextlib import suppress
 from pathlib import Path
-import signal
 import sys
 from typing import TYPE_CHECKING
 
 from needle_insertion.commands.common import print_each, Subcommand
 from needle_ros.errors import ParameterError
+from needle_ros.signals import ENDINGS
 
 if TYPE_CHECKING:
     # Takes long to import.
     from needle_insertion.watch.server import Server
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  #: signals that end the server
 
 #: Default address and port, as in `watch.server`, which takes long to import.
 HOST, PORT = '127.0.0.1', 8642
@@ -88,7 +86,7 @@ async def _live(options: argparse.Namespace) -> None:
 async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> None:
     """Serve the page until a signal arrives; raise the error of the frame loop if it ends."""
     loop, ending = asyncio.get_running_loop(), asyncio.Event()
-    for one in _SIGNALS:
+    for one in ENDINGS:
         loop.add_signal_handler(one, ending.set)
     await server.start()
     try:

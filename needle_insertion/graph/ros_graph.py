@@ -20,6 +20,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
 from needle_ros.run_node import END_WITH_PARENT
+from needle_ros.signals import DeferredSignals
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -224,16 +225,18 @@ class Graph:
         process of the graph has ended.
         """
         deadline, last = time.monotonic() + timeout, sign()
-        while not condition():
-            if (now := sign()) != last:
-                deadline, last = time.monotonic() + timeout, now
-            for started in self._processes:
-                started.check()
-            if time.monotonic() > deadline:
-                lines = [f'{one.name}: {one.last_line}' for one in self._processes]
-                waiting = f'timeout after {timeout:g} s: waiting for {what}'
-                raise GraphError('; '.join([waiting, *lines]))
-            if period:
-                self.executor.spin_until_future_complete(Future(), timeout_sec=period)
-            else:
-                self.executor.spin_once(timeout_sec=0.05)
+        with DeferredSignals() as signals:
+            while not condition():
+                if (now := sign()) != last:
+                    deadline, last = time.monotonic() + timeout, now
+                for started in self._processes:
+                    started.check()
+                if time.monotonic() > deadline:
+                    lines = [f'{one.name}: {one.last_line}' for one in self._processes]
+                    waiting = f'timeout after {timeout:g} s: waiting for {what}'
+                    raise GraphError('; '.join([waiting, *lines]))
+                if period:
+                    self.executor.spin_until_future_complete(Future(), timeout_sec=period)
+                else:
+                    self.executor.spin_once(timeout_sec=0.05)
+                signals.handle()

@@ -1,9 +1,14 @@
 """Private ROS graph of tests, demo and experiments."""
 
+import os
 from pathlib import Path
+import signal
+from threading import Timer
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph.ros_graph import Graph
+import pytest
 from std_srvs.srv import Trigger
 
 
@@ -30,3 +35,24 @@ def test_graph_leaves_no_nodes_or_threads(tmp_path: Path) -> None:
             use(graph)
         counts.append(threads())
     assert counts[2] <= counts[0]
+
+
+def test_signal_at_any_time_is_an_interrupt(tmp_path: Path) -> None:
+    """Also during the conversion of a message, where rclpy would raise RuntimeError."""
+    status = DiagnosticStatus(values=20 * [KeyValue()])
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with Graph(tmp_path) as graph:
+            node = graph.node('user')
+            publisher = node.create_publisher(DiagnosticArray, 'load', 1)
+            node.create_subscription(DiagnosticArray, 'load', lambda _message: None, 1)
+
+            def publish() -> None:
+                publisher.publish(DiagnosticArray(status=20 * [status]))
+
+            for number in range(40):
+                Timer(0.02 + 1e-4 * number, os.kill, (os.getpid(), signal.SIGINT)).start()
+                with pytest.raises(KeyboardInterrupt):
+                    graph.spin_until(publish, 'a signal')
+    finally:
+        signal.signal(signal.SIGINT, previous)

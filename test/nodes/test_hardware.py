@@ -580,7 +580,6 @@ def test_ended_process_leaves_zero_effort(
 def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
     """With both rates and the parameter; no warning at the correct rate."""
     bench = Bench(ros_graph, rate=1000.0)
-    # A busy machine has other warnings, too: late commands.
     words = r'joint_states is received at .* Hz, rate is 1000 Hz: set rate to '
     bench.until(lambda: re.match(words, bench.status.warning), 'the rate')
 
