@@ -176,9 +176,9 @@ def tip_distribution(
     c: Steering, at: int, guide: ComplexArray, seen: float = 0.0
 ) -> TipDistribution:
     """
-    Return the distribution of the tip at a depth by hypothesis; 0 for discarded ones.
+    Return the distribution of the tip at a depth by hypothesis; 0 for discarded hypotheses.
 
-    With ``seen`` = 1 it is that of the measured tip, with the slow error of the sensor.
+    With ``seen`` = 1: distribution of the measured tip, with the slow error of the sensor.
     """
     h, m = c.mean.shape
     means, variances = np.zeros(h, np.complex128), np.zeros(h)

@@ -12,7 +12,7 @@ class SteeringPrior:
     """Prior uncertainty of needle, tissue, guide, path and sensor."""
 
     spread: float = constant(
-        0.3, '1', 'relative uncertainty of the bending length; 0: it and the skin are known',
+        0.3, '1', 'relative uncertainty of the bending length; 0: bending length and skin known',
         high=0.9,
     )  # fmt: skip
     skin: float = constant(
