@@ -53,7 +53,7 @@ def measure(folder: Path, rate: float, duration: float) -> Answer:
     both, port = {**_NEEDLE, 'rate': rate}, free_port()
     given: Mapping[str, dict[str, object]] = {
         'recorder': {'path': str(folder / 'bag')},
-        'controller': {**both, 'retract_depth': _RETRACTED},
+        'controller': {**both, 'retract_depth': _RETRACTED, 'steered': True},
         'steering': _NEEDLE,
         'slicer': {'port': port},
         'plant': {**both, 'steered': True, 'depth': _RETRACTED},
@@ -70,6 +70,7 @@ def measure(folder: Path, rate: float, duration: float) -> Answer:
             try:
                 pids['watch'] = watch
                 insertions = Insertions(graph, operator)
+                insertions.until(lambda: {*given} <= {*operator.states}, 'a status of each node')
                 insertions.until(lambda: connections(watched) >= 2, 'the pages')
                 insertions.until(lambda: peer.told('NeedleShapeHeader'), 'the peer')
                 begin = time.monotonic()
@@ -167,12 +168,6 @@ class Insertions:
             self.until(lambda pending=pending: pending.done, f'the answer to {what}')  # type: ignore[misc]
             accepted, line = pending.outcome
             sys.stderr.write(f'{line}\n')
-
-    def _is_done(self) -> bool:
-        return self.status('steering', SteeringStatus).phase is SteeringPhase.DONE
-
-    def _is_withdrawn(self) -> bool:
-        return (self.status('plant', PlantStatus).insertion_depth or 0.0) < _AWAY
 
     def status(self, name: str, kind: type[_Status]) -> _Status:
         """Return the latest status of a node."""
