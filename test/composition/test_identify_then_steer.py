@@ -1,0 +1,76 @@
+"""Insert three times, identify the needle, and steer it with the parameter file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from benchmarks.steering_fit import FitTruth, insertion, NEEDLE
+from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw
+from needle_controller.steering.limits import SteeringLimits
+from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.simulation import simulate_steering, SteeringPlant
+from needle_dynamics import SteeredNeedle, SteeringParameters
+from needle_dynamics.steering.parameters import STEERING_PRESETS, tissue_of
+from needle_identification import identify_steering
+from needle_identification.result import steering_yaml
+import numpy as np
+import yaml
+
+#: A needle that bends over half the length of the default one, behind a skin.
+TRUTH = FitTruth(
+    length=0.018, skin=0.02, tilt=(0.02, -0.01), path_noise=1e-5, noise=6e-5, guide_first=True
+)
+
+DEPTHS = 5e-3 * np.arange(21.0)
+
+#: Standard deviation of the tracker [m].
+SENSOR = 4e-5
+
+
+def model(parameters: Mapping[str, float | str]) -> SteeringModel:
+    """Return the model of a law with the default needle and these parameters of the node."""
+    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    groups: dict[str, dict[str, float]] = {'model': {}, 'steering': {}, 'prior': {}}
+    for name, value in parameters.items():
+        group, _, key = name.partition('.')
+        if isinstance(value, float):
+            groups[group][key] = value
+    return SteeringModel(
+        replace(needle, **groups['model']),  # type: ignore[arg-type]
+        replace(steering, **groups['steering']),  # type: ignore[arg-type]
+        DEPTHS,
+        SteeringPrior(**groups['prior']),
+    )
+
+
+def miss(steered: SteeringModel, target: tuple[float, float], seed: int) -> float:
+    """Steer the true needle to a target; return the distance of its tip [m]."""
+    tissue = tissue_of(NEEDLE.bending_stiffness, TRUTH.length)
+    steering = SteeringParameters(
+        free_length=TRUTH.free,
+        skin_stiffness=TRUTH.skin * tissue,
+        path_noise=TRUTH.path_noise,
+    )
+    true = replace(NEEDLE, tissue_stiffness=tissue)
+    needle = SteeredNeedle(true, steering, tilt=TRUTH.tilt, seed=seed)
+    plant, rng = SteeringPlant(needle, DEPTHS, np.zeros(2)), np.random.default_rng(seed)
+    law = MultiHypothesisLaw(steered, np.array(target), SteeringLimits())
+    simulate_steering(law, plant, lambda tip: tip + SENSOR * rng.standard_normal(2))
+    return float(np.hypot(*(plant.tip - target)))
+
+
+def test_an_identified_needle_is_steered_better() -> None:
+    """Without a stop, which would raise."""
+    found = identify_steering([insertion(seed, TRUTH) for seed in range(3)])
+    parameters = yaml.safe_load(steering_yaml(found))['/**/steering']['ros__parameters']
+    identified, default = model(parameters), model({})
+    targets = [(3e-3, 0.0), (-2e-3, 2e-3), (0.0, -3e-3), (-1e-3, -2e-3)]
+    misses = [
+        [miss(one, target, seed) for seed, target in enumerate(targets)]
+        for one in (identified, default)
+    ]
+    better, worse = np.mean(misses, axis=1)
+    assert better < worse
+    assert max(misses[0]) < 1e-3
