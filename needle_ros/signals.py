@@ -31,7 +31,9 @@ class DeferredSignals:
         return self
 
     def __exit__(self, *_raised: object) -> None:
-        for one, handler in self._handlers.items():
+        # Once: a handler that raises may have replaced the handlers.
+        handlers, self._handlers = self._handlers, {}
+        for one, handler in handlers.items():
             signal.signal(one, handler)
         arrived, self._arrived = self._arrived, []
         for number in arrived:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from benchmarks.steering_fit import FitTruth, insertion, NEEDLE
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw
@@ -12,7 +13,8 @@ from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import SteeredNeedle, SteeringParameters
-from needle_dynamics.steering.parameters import STEERING_PRESETS, tissue_of
+from needle_dynamics.simulated.assembly import defaults_of
+from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, tissue_of
 from needle_identification import identify_steering
 from needle_identification.result import steering_yaml
 import numpy as np
@@ -29,17 +31,16 @@ DEPTHS = 5e-3 * np.arange(21.0)
 SENSOR = 4e-5
 
 
-def model(parameters: Mapping[str, float | str]) -> SteeringModel:
+def model(parameters: Mapping[str, Any]) -> SteeringModel:
     """Return the model of a law with the default needle and these parameters of the node."""
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
-    groups: dict[str, dict[str, float]] = {'model': {}, 'steering': {}, 'prior': {}}
+    groups: dict[str, dict[str, Any]] = {'model': {}, 'steering': {}, 'prior': {}}
     for name, value in parameters.items():
         group, _, key = name.partition('.')
-        if isinstance(value, float):
-            groups[group][key] = value
+        groups[group][key] = value
+    preset = groups['model'].pop('preset', DEFAULT_STEERING_PRESET)
     return SteeringModel(
-        replace(needle, **groups['model']),  # type: ignore[arg-type]
-        replace(steering, **groups['steering']),  # type: ignore[arg-type]
+        replace(defaults_of('model.', preset), **groups['model']),
+        replace(defaults_of('steering.', preset), **groups['steering']),
         DEPTHS,
         SteeringPrior(**groups['prior']),
     )
@@ -73,4 +74,5 @@ def test_an_identified_needle_is_steered_better() -> None:
     ]
     better, worse = np.mean(misses, axis=1)
     assert better < worse
+    # Each within the radius of a hit.
     assert max(misses[0]) < 1e-3

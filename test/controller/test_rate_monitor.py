@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+from needle_controller import ControllerSettings
+from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.rate_monitor import RateMonitor
+from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.random import Generator
@@ -68,3 +71,19 @@ def test_rate_monitor_needs_a_second_of_samples() -> None:
     assert pace.warning() == (
         'joint_states is received at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
     )
+
+
+def test_wrong_rate_is_reported_before_the_late_commands_that_it_causes() -> None:
+    """A command after 3 ms is late at the rate in the settings, not at the rate of the robot."""
+    for rate in (1000.0, 200.0):
+        monitor = TimingMonitor(ControllerSettings(rate=rate), stamped=True)
+        joints = InputMonitor('joint_states', 0.1)
+        for stamp in range(NANOSECONDS, 4 * NANOSECONDS, NANOSECONDS // 200):
+            now = stamp + 3_000_000
+            assert joints.check(stamp, now) is None
+            monitor.add(stamp, now)
+            monitor.compare_rate(joints)
+        wrong = rate == 1000.0
+        said = monitor.warning(now)
+        assert (monitor.status().late > 0) == wrong
+        assert ('is received at 200 Hz' in said) if said else not wrong
