@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Bare rclpy nodes for comparison: they publish the same messages without any computation.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Batches of insertions: gain over single runs and by a second thread, and memory.
 

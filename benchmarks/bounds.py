@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 True parameters of simulated recordings, and the Cramer-Rao bound of their estimates.
 

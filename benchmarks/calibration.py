@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Coverage of the confidence intervals, and efficiency of the estimates.
 

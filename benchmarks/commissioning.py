@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Random errors in `hardware.*`, on three simulated robots: motion of the needle before a refusal.
 

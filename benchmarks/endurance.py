@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message losses of the recorder at a high rate, and memory growth of the nodes."""
 
 from __future__ import annotations

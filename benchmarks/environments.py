@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steps per second of the Gymnasium environments, compared with two built-in environments."""
 
 from __future__ import annotations

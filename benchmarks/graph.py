@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Cost of the nodes compared with bare rclpy nodes with the same messages and rates.
 

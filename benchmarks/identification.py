@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Time and memory from a bag to a result, compared with other bag readers.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenIGTLink peer in place of 3D Slicer, by pyigtl in a separate process that can be killed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Studies that are killed repeatedly: lost samples, repeated samples and remaining processes.
 

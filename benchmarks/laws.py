@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Control laws on needles, robots and tissues with unknown parameters.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measure the least times of jobs that take turns, and compare results with bars."""
 
 from __future__ import annotations

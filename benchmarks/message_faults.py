@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the messages of a steered insertion, by message."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Coverage and suggested terms for recordings of an independent simulator, with many kinds of noise.
 

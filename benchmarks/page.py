@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Format the result of a benchmark as one Markdown page."""
 
 from __future__ import annotations

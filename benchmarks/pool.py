@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Studies with workers killed at random times, also during their start, on a busy machine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated robots with their own joints and units, which know nothing about the controller."""
 
 from __future__ import annotations

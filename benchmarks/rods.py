@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Vibration of a needle with fixed base: the integrator of this package, MuJoCo and PyElastica.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Effect of faults on a motion: each kind, on each topic, at each phase.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Open-loop run of the paper: the integrator of this package and SciPy solvers, at equal error.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Effect of faults on a steered insertion: each message and node, each kind, each phase.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of simulated steered insertions: errors and coverage of the constants."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steered insertion in simulated time: nodes connected by messages, without ROS.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Cost of an integration step, and a lower bound from its arithmetic.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Studies of populations: insertions per second, memory, and identical tables for all workers.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The documentation site: `make docs` writes it to docs/_build/html, without the network."""
 
 from pathlib import Path

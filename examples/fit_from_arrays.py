@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Estimate friction from NumPy arrays, without a bag.
 

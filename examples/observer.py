@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Estimate the deflection of the needle from measurements of encoders and a slow tip sensor.
 

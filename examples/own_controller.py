@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Close the loop with the simulated needle and your own control law.
 

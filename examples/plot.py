@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Plot depth and tip deflection of an insertion over time, and the shape of the needle.
 

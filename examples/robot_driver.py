@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Simulate two robot drivers with their own topics, joints and units, for `hardware.*` parameters.
 

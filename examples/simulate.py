@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Simulate the insertion of a needle into tissue with a constant force.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering law outside the package: bring the tip to a line to the target, four steps ahead.
 

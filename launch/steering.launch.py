@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Launch a steered insertion: `insertion.launch.py` with the node `steering`."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Control of a flexible needle: laws, references, observer, stability, safety, and closed loops.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Admittance: converts the force of a law to positions, for a position-controlled robot."""
 
 from __future__ import annotations

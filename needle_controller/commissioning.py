@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commissioning: compare a robot and its first motion with its configuration."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Force command of the axial supervisor."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Adapter for robot drivers with their own topics, joints and units."""
 
 from __future__ import annotations

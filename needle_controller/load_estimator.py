@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Load of the bent needle on the insertion axis, from an observer or from the simulation."""
 
 from __future__ import annotations

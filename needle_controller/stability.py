@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Poles of the sampled control loops, and rejection of unstable gains.
 

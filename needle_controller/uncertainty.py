@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Uncertainty of the true axis about the nominal one, and limit cycles of dry friction."""
 
 from __future__ import annotations

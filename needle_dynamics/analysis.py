@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Controllability and observability analysis of the linearized model.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Array types shared by all packages."""
 
 from __future__ import annotations

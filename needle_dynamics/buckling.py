@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Euler buckling loads of the part of the needle outside the tissue."""
 
 from __future__ import annotations

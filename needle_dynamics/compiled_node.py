@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base class of nodes that call compiled functions."""
 
 from __future__ import annotations

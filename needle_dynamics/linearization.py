@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Linearization (19) of the model at an operating point, with natural units.
 

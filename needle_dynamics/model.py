@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Equations of motion of a flexible needle in soft tissue, one method per equation.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Shape modes of the needle, equations (10)-(11), and their integrals over the inserted part.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command topics of the node `plant`, and the number of nodes that publish on them."""
 
 from __future__ import annotations

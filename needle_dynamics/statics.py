@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 States and shapes of a flexible needle in soft tissue, and the stiffness against its bending.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tissue model along the needle: layered elastic foundation, swelling, damping; equation (7)."""
 
 from __future__ import annotations

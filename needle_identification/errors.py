@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors of recordings and of identification."""
 
 from needle_ros.errors import NeedleError

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the command ``needle`` by ``python -m needle_insertion``."""
 
 import sys

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile the kernels of all packages for this machine, on all processors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parse axes and names with a sign, such as ``-x`` or ``-slide``, in options and parameters."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Service calls with repetition until a response."""
 
 from __future__ import annotations

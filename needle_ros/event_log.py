@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Event log of a node: log lines, and changes of /diagnostics."""
 
 from __future__ import annotations

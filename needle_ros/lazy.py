@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lazy import of the public names of a package (PEP 562)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lifecycle service: reject invalid transitions, and defer `configure` until preparation ends."""
 
 from __future__ import annotations

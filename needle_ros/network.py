@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Network range of DDS: restrict nodes to this machine unless the environment opens it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Match the sections of ROS parameter files to nodes; rcl reports no unused section."""
 
 from __future__ import annotations

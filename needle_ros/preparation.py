@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Preparation of a node in a thread before `configure`."""
 
 from __future__ import annotations

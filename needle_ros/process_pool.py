@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Process pool without shared queues, robust against killed workers.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Detection of duplicate publishers and of their liveliness."""
 
 from __future__ import annotations

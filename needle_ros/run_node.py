@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Main function of a node process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Schedule of simulation samples, on a clock that may differ from simulated time."""
 
 from __future__ import annotations

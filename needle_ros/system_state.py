@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 State of the whole system: running, paused, retracting or stopped, equal in all its nodes.
 

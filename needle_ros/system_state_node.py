@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """System state of a node: its topic, the services of a user, and the emergency topic."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time stamps in integer nanoseconds, and event rates."""
 
 from __future__ import annotations

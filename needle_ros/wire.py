@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Parsing and serialization of CDR messages: stamp and numbers of a message or of a batch.
 

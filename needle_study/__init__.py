@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulate populations of insertions and estimate the distribution of their metrics."""

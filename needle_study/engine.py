@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Compute a study on any executor; it is resumed after an interruption.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check the content of a study file."""
 
 from __future__ import annotations

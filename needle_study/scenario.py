@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Interface of a scenario: variables, metrics, and the simulation of samples."""
 
 from __future__ import annotations

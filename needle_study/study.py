@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Define a study: a population, a scenario, and the columns of each sample."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable."""
 
 from __future__ import annotations

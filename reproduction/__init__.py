@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reproduction of the figures, tables and claims of the paper."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finite element beam of the whole needle, to test the model assumption about the outer part."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated robot in each repeat of an experiment."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle reproduce`: compute the paper's results again and compare them with the paper."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the demo: insertions, identification of friction and stiffness, and one report."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle demo`: insertion, recording and identification, with one report."""
 
 from __future__ import annotations

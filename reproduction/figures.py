@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Draw figures 4 to 8 of the paper from the runs of `runs`."""
 
 from __future__ import annotations

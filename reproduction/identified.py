@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables 1 and 2 of the paper, identified from recordings of a simulated robot."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Constants of the needle, Table 3, compared with a round wire."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Sample true values of simulated needles and tissues that represent Tables 1 and 2.
 

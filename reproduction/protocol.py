@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commanded motion and force in the experiments of sections 3.2.2.2 and 3.2.2.3."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Record the runs of a campaign with real nodes, one bag each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reproduce the results of the paper as text, as JSON, and as a page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Runs for figures 4 to 8: both readings of Table 1 and both formulations.
 

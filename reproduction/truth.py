@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compare estimates with the true values of the simulated robot that was recorded."""
 
 from __future__ import annotations

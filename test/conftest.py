@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Common test configuration: settings, time limits, and test distribution (``pytest -n``)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Architecture rules: package dependencies, and separation of mathematics and middleware."""
 
 from __future__ import annotations

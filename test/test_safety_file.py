@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Safety file: every sentence has an ID, every requirement a test and a cause."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Termination of hanging tests, with the stacks of all processes."""
 
 from __future__ import annotations

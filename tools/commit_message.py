@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check a commit message: subject of at most 60 characters, blank line, body with the reason."""
 
 from __future__ import annotations

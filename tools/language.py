@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Count private idioms in the text of the project, per 1000 words.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Safety file: hazards, causes, controls, requirements, their tests and the last results.
 

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering laws and identification on recorded insertions, from a folder outside of this one."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Read recorded insertions in steps from the tables of a folder.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of each medium from recorded insertions, and its prediction of others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Kinematic needles that are steered by roll: unicycle and bicycle, with windup of the shaft.
 

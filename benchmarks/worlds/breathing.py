@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Beam by its flexibility in tissue that moves sideways with breathing.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 All steering laws in all scenarios, on the same needles, targets and noise.
 

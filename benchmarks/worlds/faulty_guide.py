@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Guide with backlash, a wrong gain, or turned frames, on the beam of `stiffness_field`.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Beam of Legendre polynomials in tissue with stiff inclusions and membranes.
 

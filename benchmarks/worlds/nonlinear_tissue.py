@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Beam of Hermite elements in tissue that hardens or yields, and relaxes.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Beam whose tip cuts in the direction in which it points, as the front wheel of a bicycle.
 

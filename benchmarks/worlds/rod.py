@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Geometrically exact rod on a foundation along its recorded path, by shooting.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios by name: a needle, a guide, a sensor, and what the laws are given."""
 
 from __future__ import annotations

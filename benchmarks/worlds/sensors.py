@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Tip sensors with errors beyond white noise: distorted, colored, and lost in bursts.
 

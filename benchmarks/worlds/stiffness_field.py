@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Beam of finite differences in tissue whose stiffness varies at random along the path.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Interface of the simulated needles, and the constants that one of them has."""
 
 from __future__ import annotations

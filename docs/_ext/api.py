@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generate one page in docs/api for each public module of the packages, before Sphinx reads."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Render equations as MathML, which browsers display without script and network."""
 
 import re

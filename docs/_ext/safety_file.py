@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generate the safety file, and show the IDs of requirements in its source pages."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Draw convergence.png: convergence of n modes to a clamped beam on an elastic foundation.
 

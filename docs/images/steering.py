@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Draw steering.png: needles that bend in tissue, to scale, and the authority of the guide.
 

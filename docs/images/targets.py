@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Draw targets.png: distribution of the final distance from the target, by controller.
 

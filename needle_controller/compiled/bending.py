@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Bending of the inserted part in the coordinates of the observer.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Filter of the observer: history, step of one sample, and estimate at the present depth.
 

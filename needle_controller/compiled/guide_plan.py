@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Reachable set of the tip, and the next position of the guide.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Hypotheses of the steering controller: state, and update by tip measurements.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steps of a Kalman filter in which every measurement is a reading of one entry of the state.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Friction adaptation: corrections of the friction model by recursive least squares.
 

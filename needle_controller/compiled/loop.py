@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Extreme values of polynomials of fifth order."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Continuous closed loop, with dry friction as a set-valued law.
 

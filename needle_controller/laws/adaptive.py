@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics with friction adaptation."""
 
 from __future__ import annotations

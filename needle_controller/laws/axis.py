@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Model of one axis in a sampled law: a mass with friction."""
 
 from __future__ import annotations

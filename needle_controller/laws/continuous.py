@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Continuous-time control laws of section 3.2.7 of the paper, for analysis."""
 
 from __future__ import annotations

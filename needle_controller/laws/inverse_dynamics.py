@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics control, section 3.2.7.1 of the paper, in sampled form, with feedback."""
 
 from __future__ import annotations

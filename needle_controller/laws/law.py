@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sampled control laws on one axis, and their loop with delay, limit and memory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """PID control, section 3.2.7.2 of the paper, in implicit sampled form."""
 
 from __future__ import annotations

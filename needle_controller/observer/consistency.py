@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chi-squared consistency test of estimation errors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Kalman filter of the bending with the measurements of a robot: encoders, tip deflection, wrench.
 

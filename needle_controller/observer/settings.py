@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the observer: assumed sensor noise and model uncertainty."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Path through given points, and a motion that joins it from any setpoint."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motions of least integrated squared jerk: polynomials of fifth order in time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Setpoints over time and their limits: the interface of all references."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fastest motion within the limits, and the target as a step."""
 
 from __future__ import annotations

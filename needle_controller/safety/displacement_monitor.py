@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Displacement monitor: compare measured displacements with measured velocities."""
 
 from __future__ import annotations

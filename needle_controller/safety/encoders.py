@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encoder measurements of the needle from joint states."""
 
 from __future__ import annotations

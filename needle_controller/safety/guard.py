@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparison of measurements with their limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Latency monitor: compare the latency of the commands with the configured delay."""
 
 from __future__ import annotations

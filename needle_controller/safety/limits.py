@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits of the measurements, as parameters."""
 
 from __future__ import annotations

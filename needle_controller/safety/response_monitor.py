@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Response monitor: check that plant and encoders follow the commands."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs of a controller, the latched stop, and duplicate publishers."""
 
 from __future__ import annotations

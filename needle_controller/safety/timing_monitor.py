@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Timing monitor: rate of the measurements, and latency of the commands."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering law: interface to the executive and the simulation, and construction by name."""
 
 from __future__ import annotations

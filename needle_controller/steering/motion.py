@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joint motions of needle and guide from rest to rest."""
 
 from __future__ import annotations

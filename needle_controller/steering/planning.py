@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jobs that compute a plan: synchronously, or in a thread that can be cancelled."""
 
 from __future__ import annotations

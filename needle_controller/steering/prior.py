@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prior uncertainty of needle, tissue, path and sensor for a steering law."""
 
 from __future__ import annotations

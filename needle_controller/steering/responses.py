@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Linear responses of the tip to guide, tilt, bevel and path noise, for each hypothesis.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Retraction of a steered needle: the guide returns to its zero as the needle is withdrawn."""
 
 from __future__ import annotations

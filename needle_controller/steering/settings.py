@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steps, tip measurements and limits of a steered insertion, as parameters."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated needle that differs from the nominal model, and its insertion under a steering law."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stepped insertion: the guide moves while the needle rests, then the needle moves."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Averaged tip measurement: one position from many readings, at rest or during motion."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion along the insertion axis: friction per length, cutting force, and membranes."""
 
 from __future__ import annotations

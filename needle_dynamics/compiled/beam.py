@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Needle as a beam on an elastic foundation about the path cut by its tip.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion of a bevel-tip needle: cutting, rest, withdrawal, reinsertion along the cut path."""
 
 from __future__ import annotations

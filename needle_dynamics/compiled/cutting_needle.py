@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Needle in the path that its tip has cut: state, load on the tip, tip position and shape."""
 
 from __future__ import annotations

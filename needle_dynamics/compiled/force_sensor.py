@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Force sensor samples: offset, noise, saturation, filters, quantization."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Shape modes at the tip and their integrals over the inserted part.
 

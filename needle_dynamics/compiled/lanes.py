@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Simulation of many needles in parallel, in the lanes of the processor's vector registers.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small dense matrices: Cholesky factor, triangular solutions, eigenvalues by Jacobi rotations."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Exact flow of the deflections at a frozen depth, between two half steps of tissue damping.
 

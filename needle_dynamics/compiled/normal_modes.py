@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Normal modes of the inserted part at a frozen depth.
 

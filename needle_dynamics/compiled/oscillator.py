@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Damped oscillator, and first-order lag under a constant force; both exact."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Sequences of intervals with steps adapted to the vibration of the needle.
 

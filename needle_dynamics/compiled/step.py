@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Step of the integrator, and sequences of steps under constant inputs.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planar insertion of a needle for many load cases (causes) at once."""
 
 from __future__ import annotations

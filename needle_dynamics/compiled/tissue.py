@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tissue layers along the needle."""
 
 from __future__ import annotations

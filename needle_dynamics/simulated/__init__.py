@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated needle, tissue and sensors, advanced in simulated time."""

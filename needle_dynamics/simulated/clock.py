@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Clock of a simulated plant, from its constants."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Selection of the commanded force that acts on the needle from one sample to the next."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated measurement faults of a sensor, its cable or its driver."""
 
 from __future__ import annotations

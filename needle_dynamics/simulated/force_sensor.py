@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Force-torque sensor at the base (JR3 in the source): noise, drift, filters, resolution, tare."""
 
 from __future__ import annotations

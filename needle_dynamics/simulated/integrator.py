@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Structure-preserving integrator of the needle: frozen-depth modal flow, exact friction flow.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parser of `joint_commands` messages from ros2_control."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Common base of all simulated plants, and their measurements."""
 
 from __future__ import annotations

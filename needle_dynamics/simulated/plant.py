@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated plant: needle, base and force sensor, advanced one sample at a time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated plant with a steered needle, needle guide and sensors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tip sensor: a tracker or imager with exposure time, noise, delay and its own frame."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering models from the literature, for comparison with `SteeredNeedle`.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read topics and messages of bags, also of incomplete or damaged bags."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Batches of messages of one topic as arrays, and counts of the messages read from a file."""
 
 from __future__ import annotations

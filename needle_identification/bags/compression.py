@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decompress files and messages (zstd, lz4), also truncated data, within limits of their size."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read messages of MCAP files chunk by chunk, also of truncated or damaged files."""
 
 from __future__ import annotations

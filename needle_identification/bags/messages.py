@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message definitions, and serialization of messages, without ROS."""
 
 from __future__ import annotations

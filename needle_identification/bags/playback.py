@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Play back a bag: schedule its messages in recorded time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read ROS 1 recordings, with messages converted to ROS 2."""
 
 from __future__ import annotations

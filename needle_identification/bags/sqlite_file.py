@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read messages of sqlite3 files, also of damaged files."""
 
 from __future__ import annotations

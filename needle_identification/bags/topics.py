@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Topics of a bag, and the quality of service (QoS) that their publishers offered."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Linear regression with standard errors, residual tests, and parameter estimates."""
 
 from __future__ import annotations

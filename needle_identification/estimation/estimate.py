@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameter estimates from one recording, and their mean over several recordings."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Format numbers with the digits that are significant for their error."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Estimate the autocorrelation of noise and its effect on the errors of a regression.
 

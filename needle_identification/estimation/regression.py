@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Linear regression with standard errors for autocorrelated noise.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Test the residuals of a fit, with validity for correlated noise."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Screen additional columns for a least squares fit at little cost.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Estimate the breakaway force of the needle, section 3.2.2.2 of the paper.
 

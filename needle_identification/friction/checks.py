@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plausibility checks of a friction estimate: errors and warnings."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparison with sets that have one term more or less, or two more."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Select samples and regressors for the friction regression.
 

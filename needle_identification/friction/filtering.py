@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Resample force and motion of a recording and apply a zero-phase low-pass filter.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Compute friction parameters with standard errors and confidence intervals.
 

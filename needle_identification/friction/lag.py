@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Estimate the lag of the force behind the motion by sensor filters or clock offsets.
 

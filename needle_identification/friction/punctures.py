@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Detect punctures: drops of the force while the needle enters new tissue.
 

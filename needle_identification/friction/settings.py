@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of friction identification."""
 
 from __future__ import annotations

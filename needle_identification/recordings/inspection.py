@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inspect a recording: list its content, find force and motion, suggest a command."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Read recordings from bags: force and motion as arrays on the time base of the force.
 

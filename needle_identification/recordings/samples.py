@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gather the samples of one topic while its bag is read."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sort samples by time, in bounded memory."""
 
 from __future__ import annotations

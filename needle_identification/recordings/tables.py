@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Read tables with named columns: text (CSV and similar) and MATLAB files.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Synchronize force and motion on the time base of the force.
 

@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering identification: needle bending from depth, guide, roll and tip positions."""

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Likelihood of the tips of a medium in a linear mixed model.
 

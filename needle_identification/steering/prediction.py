@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prediction of recordings by a fit to the others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Read steered insertions from bags, and from tables with named columns.
 

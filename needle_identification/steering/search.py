@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the lengths with the highest likelihood, and their profile intervals."""
 
 from __future__ import annotations

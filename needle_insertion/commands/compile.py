@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle compile`: compile all functions for this machine, once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle verify`: compute recorded runs again and compare them with the recordings."""
 
 from __future__ import annotations

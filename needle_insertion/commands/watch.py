@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle watch`: show a live insertion or a recorded bag on a page in a browser."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a node of the suite as a process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a private ROS graph: nodes as processes on their own domain, and nodes of this process."""
 
 from __future__ import annotations

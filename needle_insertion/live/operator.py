@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Send requests of a person to running nodes: target, pause, retraction, stop."""
 
 from __future__ import annotations

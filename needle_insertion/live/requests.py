@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Services of the nodes by operator command."""
 
 from __future__ import annotations

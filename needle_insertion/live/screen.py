@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read lines from a terminal or a script, and write lines to it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Take messages from the queue of the middleware on demand."""
 
 from __future__ import annotations

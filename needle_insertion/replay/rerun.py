@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recompute a recorded run sample by sample, and compare it with the recording."""
 
 from __future__ import annotations

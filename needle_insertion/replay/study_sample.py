@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compute one sample of a study again and record it to a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Interactive animation of a needle for report pages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Content of pages as plain data: pictures, tables and sections."""
 
 from __future__ import annotations

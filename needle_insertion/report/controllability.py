@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Report controllability and observability at operating points as tables, JSON and a map."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of identified friction and stiffness."""
 
 from __future__ import annotations

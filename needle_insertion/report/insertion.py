@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Report a simulated steered insertion as summary, CSV and figures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Version, command and date of a report page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Write self-contained HTML pages from the templates of this folder.
 

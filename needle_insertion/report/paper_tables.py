@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Values of the paper's Tables 1 and 2, in SI units.
 

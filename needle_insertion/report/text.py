@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Format tables and checks as text for the terminal."""
 
 from __future__ import annotations

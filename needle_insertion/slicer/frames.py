@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Split a byte stream into OpenIGTLink messages, in bounded memory."""
 
 from __future__ import annotations

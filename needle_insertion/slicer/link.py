@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 TCP connection to a peer, as server or as client, without threads and without blocking calls.
 

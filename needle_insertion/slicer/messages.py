@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Conversion between OpenIGTLink messages and the quantities of the ROS interface.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Present state of the needle: its measured shape, or a line to its tip."""
 
 from __future__ import annotations

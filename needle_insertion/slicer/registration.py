@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transformation between the frame of the needle and the frame of the images."""
 
 from __future__ import annotations

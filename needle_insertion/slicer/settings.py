@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings of the connection and of targets, as parameters."""
 
 from __future__ import annotations

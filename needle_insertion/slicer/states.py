@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """States of the nodes, as lines for 3D Slicer."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON frames of live nodes and of a recording for the readers of the page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Needle, tissue and limits for the page, from the configurations of the nodes."""
 
 from __future__ import annotations

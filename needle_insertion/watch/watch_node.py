@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `watch`: subscriptions of the page, with minimum load on the other nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Register the reinforcement learning environments `NeedleInsertion-v0`, `NeedleSteering-v0`.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Claims of the paper with computed verdict and evidence."""
 
 from reproduction.claims.claim import Claim, FAILS, HOLDS, ONLY_IF, Tables

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Claim of the paper, and the statistics for its verdict."""
 
 from __future__ import annotations

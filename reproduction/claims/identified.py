@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about Tables 1 and 2, section 3.2.2."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compute the verdicts on all claims of ``claims.yaml`` in the order of the paper."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about mismatch between needle and model, section 3.2.8."""
 
 from __future__ import annotations

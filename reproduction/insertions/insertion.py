@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Record, read, check and draw a controlled insertion of the simulated needle."""
 
 from __future__ import annotations

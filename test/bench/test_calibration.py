@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration study: bounds, coverage and report."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark of the control step: equality of the compared laws; times are not tested."""
 
 from itertools import pairwise

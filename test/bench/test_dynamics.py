@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark of the dynamics: equality of the compared models; times are not tested."""
 
 from __future__ import annotations

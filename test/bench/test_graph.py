@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark of the nodes: metrics and loss counts; times are not tested."""
 
 from __future__ import annotations

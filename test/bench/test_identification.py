@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark of identification: equality of the read data; times are not tested."""
 
 from __future__ import annotations

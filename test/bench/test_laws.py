@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Study of the control laws: evaluation of runs; its metrics are not tested here."""
 
 from benchmarks import laws as study_of_laws

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Noise simulator and damaged files: generated data and reports."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Common parts of the benchmarks: timing, bars, and report with verdict."""
 
 from __future__ import annotations

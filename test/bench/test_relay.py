@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steered insertions through real nodes, with a relay that drops or delays a message."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fault injection of `needle bench safety` and its results."""
 
 from __future__ import annotations

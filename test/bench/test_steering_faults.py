@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fault injection into steered insertions of `needle bench safety`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Benchmark of studies: reported metrics; times are not tested."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decompression bombs and malicious documents are rejected in one line with little memory."""
 
 from __future__ import annotations

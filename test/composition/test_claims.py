@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Claims: each verdict, and each number of the evidence against an independent computation."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figure of the convergence with the number of modes."""
 
 from __future__ import annotations

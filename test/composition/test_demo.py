@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks of the demo, each of which can fail."""
 
 from dataclasses import replace

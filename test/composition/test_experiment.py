@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Experiments: commands, recordings, and resumption after an interruption."""
 
 from collections.abc import Callable, Iterator

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Statements of figures 4 to 8 hold in the runs."""
 
 from math import exp, sqrt

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mismatch study: sampling, convergence and reproducibility."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle steer`, a study, an environment and the steering executive steer a needle alike."""
 
 from __future__ import annotations

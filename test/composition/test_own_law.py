@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A steering law in a file outside the package: in the executive, `needle steer` and a study."""
 
 from __future__ import annotations

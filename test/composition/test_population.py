@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Samples of the population represent the tables."""
 
 from hypothesis import given, settings

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Alignment of text tables, and complete self-contained pages."""
 
 import asyncio

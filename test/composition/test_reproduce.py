@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of the paper from the shipped recordings, and verdicts that can fail."""
 
 from functools import cache

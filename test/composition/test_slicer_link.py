@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """OpenIGTLink connection: recovery from lost, silent, slow and invalid peers."""
 
 from __future__ import annotations

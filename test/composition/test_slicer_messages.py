@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Targets and needle as OpenIGTLink messages: round trip, and invalid messages."""
 
 from __future__ import annotations

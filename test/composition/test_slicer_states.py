@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """States of the nodes for 3D Slicer: lines, ages, and times of transmission."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of steering match the code that draws them, and its results."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Adaptive friction: accurate, bounded, and without effect on stability."""
 
 from dataclasses import replace

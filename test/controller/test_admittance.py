@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Laws of the admittance, a virtual base that converts forces to positions."""
 
 from __future__ import annotations

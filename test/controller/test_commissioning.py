@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Check of a robot before its first motion, on simulated robots that know only their driver."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Continuous-time laws of the paper, and convergence of the sampled laws to them."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller as an object, in a loop around the simulated needle."""
 
 from math import inf, nan

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conversion between the messages of a robot driver and the contract."""
 
 from __future__ import annotations

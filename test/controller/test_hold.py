@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The reference waits for the needle: stalls, commands without effect, force at its limit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Control laws in the simulation: set-valued friction, sampled loops, and batches."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any finite floats on any input: limited force, and motion after one clear_stop."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every parameter has effect: each is read, and each friction constant changes the command."""
 
 import ast

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The observer against exact conditional means, its own statistics, and the simulated needle."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The rate monitor detects a wrong rate, without false alarms."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """References keep their limits, are continuous with the state before, and reach their target."""
 
 from collections.abc import Callable

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Input monitor, limits and the latched stop."""
 
 from math import inf, nan

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The stability check accepts stable gains and rejects unstable gains."""
 
 from contextlib import nullcontext

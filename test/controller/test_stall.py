@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encoders that freeze in motion and report no velocity, and needles with other friction."""
 
 from __future__ import annotations

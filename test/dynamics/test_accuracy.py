@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Error estimate of `simulate` over depths, forces, modes, tissues and friction laws."""
 
 from __future__ import annotations

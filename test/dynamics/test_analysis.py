@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Linearization (19), controllability and observability."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Batch simulation: bitwise independent of the number of threads and equal to single runs."""
 
 from __future__ import annotations

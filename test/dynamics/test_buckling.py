@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Euler buckling loads against an energy method."""
 
 from math import inf, nan

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Zero-order hold, timeout and limits of force commands."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compiled functions: types, cache files and concurrent processes."""
 
 from __future__ import annotations

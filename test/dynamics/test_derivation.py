@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Derivation of the equations of motion with SymPy: Euler-Lagrange on T and V of (12)."""
 
 from __future__ import annotations

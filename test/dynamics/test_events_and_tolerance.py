@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hub contact as an event, dense output, and tolerance-controlled steps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Effect of faults on measurements."""
 
 from collections.abc import Sequence

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Force-torque sensor: noise, drift, filters, resolution, range and tare."""
 
 from __future__ import annotations

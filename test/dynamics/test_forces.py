@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics, friction power and base reaction, for every formulation."""
 
 from __future__ import annotations

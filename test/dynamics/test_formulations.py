@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The formulations `complete` and `as_printed`: common terms, omitted terms and their effect."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Indenter: end-effector that presses the tissue, section 3.2.2.3."""
 
 from __future__ import annotations

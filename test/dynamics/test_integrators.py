@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Integrator: conservation laws, order, friction, stops, and sensor signals."""
 
 from __future__ import annotations

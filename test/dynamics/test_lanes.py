@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Needles in the lanes of vector registers: each equals a single simulation."""
 
 from __future__ import annotations

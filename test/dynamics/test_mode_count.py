@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Any number of modes: integrals, both compiled paths, convergence to the exact beam, limits."""
 
 from __future__ import annotations

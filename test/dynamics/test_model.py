@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Equations of motion (12)-(18) against the Lagrangian."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shape modes (10)-(11) and their integrals."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small matrices, normal modes of the inserted part, and the damped oscillator."""
 
 from __future__ import annotations

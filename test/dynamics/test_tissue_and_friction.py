@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Layers, swelling and friction laws: limiting cases, balances, exact thresholds."""
 
 from __future__ import annotations

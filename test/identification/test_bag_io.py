@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags are read unchanged, compatible with other tools, and robust against damage."""
 
 from pathlib import Path

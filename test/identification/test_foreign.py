@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of other laboratories give correct results and warnings, or a one-line error."""
 
 from collections.abc import Callable

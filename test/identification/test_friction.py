@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction is recovered, with valid standard errors and confidence intervals."""
 
 from collections.abc import Callable

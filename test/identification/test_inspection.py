@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inspection lists the content of a recording and prints a valid command."""
 
 from __future__ import annotations

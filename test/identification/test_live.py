@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction from running topics: messages are paired by stamp, in any order."""
 
 from math import inf, nan

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Autocorrelated noise: its effect on errors is estimated from the noise."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Playback of bags: order of messages, their QoS, and schedule."""
 
 from itertools import pairwise

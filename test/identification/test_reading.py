@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of any laboratory give force and motion, or a one-line error."""
 
 from collections.abc import Sequence

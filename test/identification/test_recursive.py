@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recursive friction estimates equal the batch estimate and track changes."""
 
 from dataclasses import replace

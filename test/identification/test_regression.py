@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Regression recovers parameters with valid errors, and marks undetermined parameters."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Residual tests equal the tests of SciPy, and each detects its own fault."""
 
 from __future__ import annotations

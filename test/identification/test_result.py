@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The result is a complete parameter file, with numbers rounded to their errors."""
 
 from math import inf, nan

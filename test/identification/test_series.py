@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A series keeps samples or their means, in bounded memory."""
 
 from typing import Any

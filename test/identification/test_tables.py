@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables of other tools are read, or rejected by a one-line error with instructions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Private ROS graph of tests, demo and experiments."""
 
 import os

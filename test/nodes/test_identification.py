@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification node: results from bags and running topics, and parameters of other nodes."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages as bytes agree with rmw, and nodes offer the topics of the contract."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recording of messages byte for byte, with any end of the recorder."""
 
 from collections.abc import Callable, Iterator

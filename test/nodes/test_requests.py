@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Requests over DDS: repeated after a lost message, and executed once."""
 
 from __future__ import annotations

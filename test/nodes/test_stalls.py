@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes that are suspended during an insertion in real time do not cause a lunge."""
 
 from __future__ import annotations

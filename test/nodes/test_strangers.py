@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Unexpected other nodes: their commands and measurements do not move the needle."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The topic contract agrees with the documentation and the model."""
 
 from __future__ import annotations

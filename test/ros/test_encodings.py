@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Reading of CDR: every valid encoding of every type of the contract.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Process pool: results, errors, and killed workers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Schedule of simulation samples."""
 
 from itertools import pairwise

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Typed status of the nodes: mapping to and from key-value pairs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The system state: a stop has priority, and all nodes agree for any order of messages."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parsing and serialization of CDR messages, compared with rosbags."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steering executive with a simulated robot, with and without faults; without ROS."""
 
 from __future__ import annotations

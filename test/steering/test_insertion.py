@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Axial motion of a steered needle: friction, cutting, membranes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reference models of the literature, against their published values and laws."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stop, pause and retraction of a steered insertion by a user; without a graph."""
 
 from __future__ import annotations

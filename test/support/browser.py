@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Browser controlled over the Chrome DevTools protocol."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Continuous closed loop as the right-hand side of an ODE."""
 
 from __future__ import annotations

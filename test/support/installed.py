@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes installed by setup.py."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Jobs for worker processes, in an importable file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Content of a page, rendered by a browser if installed, else parsed from its tags."""
 
 from __future__ import annotations

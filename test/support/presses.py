@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Synthetic recordings of presses in a plane, from a stiffness matrix."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS graph of a test: nodes in the thread of the test, and processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated recordings for identification, and their bags."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Synthetic recordings of strokes: friction, a base with limits, and a sensor."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks of invalid studies."""
 
 from __future__ import annotations

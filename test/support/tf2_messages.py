@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Build the Python package `tf2_msgs`, which is not available as a wheel, with rosidl generators.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bag with all topics of the page of `needle watch`, and a browser to view it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering law of Bernardes et al.: tip motion is a matrix times the motion of guide and depth.
 

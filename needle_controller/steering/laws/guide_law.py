@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base class of laws that compute the guide from the newest tip measurement."""
 
 from __future__ import annotations

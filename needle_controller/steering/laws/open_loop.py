@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering law with a fixed guide, for comparison."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering law of Rucker et al.: a fixed guide, and a bevel that is turned towards the target.
 

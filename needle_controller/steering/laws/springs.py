@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering law of Glozman and Shoham: the inverse of a beam on springs that pull it to the axis.
 
