@@ -18,6 +18,8 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/python -m tools.language
 	$(BIN)/python -m tools.safety_file
+	$(BIN)/python -m tools.changelog --check
+	$(BIN)/python -m tools.license
 
 # Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs
@@ -41,8 +43,9 @@ wheel: setup
 
 # The marker is written last: an interrupted setup restarts.
 $(VENV)/.complete: requirements.lock setup.py package.xml
+	@echo 'installing 750 MB into $(VENV), a minute or two'
 	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 

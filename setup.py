@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Package needle_insertion for pip and ament; package.xml holds name and version."""
 
 from pathlib import Path
@@ -17,6 +18,8 @@ SLICER = ['pyigtl>=0.3.4']
 STUDY = ['pyarrow>=15']
 DASK = [*STUDY, 'distributed>=2024.5']
 GYM = ['gymnasium>=1.1']
+#: Results as a DataFrame, `to_dataframe`.
+PANDAS = ['pandas>=2.0']
 TEST = [
     'hypothesis>=6.100',
     'lxml>=5.0',
@@ -29,6 +32,7 @@ TEST = [
     *SLICER,
     *DASK,
     *GYM,
+    *PANDAS,
 ]
 
 
@@ -54,6 +58,8 @@ setup(
     version=MANIFEST.findtext('version'),
     description=MANIFEST.findtext('description'),
     license=MANIFEST.findtext('license'),
+    author=MANIFEST.findtext('author'),
+    author_email=MANIFEST.find('author').get('email'),
     maintainer=MANIFEST.findtext('maintainer'),
     maintainer_email=MANIFEST.find('maintainer').get('email'),
     long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
@@ -104,6 +110,14 @@ setup(
             'ros-jazzy-rclpy>=7.1.6',
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
         ],
+        # ROS 2 Kilted in place of Jazzy.
+        'kilted': [
+            'ros-domain-coordinator>=0.12',
+            'ros-kilted-common-interfaces>=5.5',
+            'ros-kilted-lifecycle-msgs>=2.3',
+            'ros-kilted-rclpy>=9.1',
+            'ros-kilted-rmw-fastrtps-cpp>=9.3',
+        ],
         'slicer': SLICER,
         # Name of the extra that colcon test expects for pytest.
         'test': TEST,
@@ -119,6 +133,7 @@ setup(
         'study': STUDY,
         'dask': DASK,
         'gym': GYM,
+        'pandas': PANDAS,
         # Reference tools of `needle bench`.
         'bench': [
             'mcap-ros2-support>=0.5.6',

@@ -1,8 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot description: valid URDF, existing files, and agreement with the plant."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from itertools import product
 from math import cos, sin
 from pathlib import Path
@@ -11,12 +13,11 @@ import struct
 from typing import Any
 import xml.etree.ElementTree as ET
 
-from needle_dynamics import FloatArray
+from needle_dynamics import FloatArray, NeedleParameters, NEEDLES
 from needle_dynamics.simulated.assembly import PlantSettings
 from needle_dynamics.simulated.base import BaseParameters
 from needle_dynamics.simulated.run import PlantRun
 from needle_dynamics.simulated.steered import GuideParameters
-from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
 from needle_ros.contract import (
     BASE,
     ENTRY,
@@ -107,9 +108,8 @@ def test_urdf_joints_equal_joint_states(mode: str, steered: bool) -> None:
 @pytest.mark.parametrize('preset', NEEDLES)
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
 def test_urdf_limits_equal_plant_limits(mode: str, steered: bool, preset: str) -> None:
-    needle = NEEDLES[preset]
-    known = STEERING_PRESETS.get(preset)
-    free = (known.steering if known else SteeringParameters()).free_length
+    needle, steering, _ = NEEDLES[preset]
+    free = steering.free_length
     lengths = {'length': needle.length, 'minimum_depth': needle.minimum_depth, 'free_length': free}
     joints = movable(described(mode, steered, **lengths))
     limits = {
@@ -131,7 +131,7 @@ def test_urdf_limits_equal_plant_limits(mode: str, steered: bool, preset: str) -
         assert limits['rotation']['effort'] == own.torque_limit
         return
     # The plant accepts positions within the limits, and rejects positions beyond them.
-    plant = PlantRun({'mode': mode, 'steered': True, 'model.preset': preset, 'depth': 0.05})
+    plant = PlantRun({'mode': mode, 'steered': True, 'needle': preset, 'depth': 0.05})
     plant.take(10**9)
     for name, limit in limits.items():
         assert limit['lower'] == -limit['upper']
@@ -149,6 +149,98 @@ def test_urdf_limits_equal_plant_limits(mode: str, steered: bool, preset: str) -
     }
 
 
+#: Mass of links that have none in the model [kg].
+LIGHT = 1e-6
+
+
+def inertia(link: ET.Element) -> tuple[float, FloatArray, FloatArray]:
+    """Return mass, center of mass and inertia matrix of a link."""
+    found = link.find('inertial')
+    values = {key: float(value) for key, value in found.find('inertia').attrib.items()}
+    matrix = np.array([[values[''.join(('i', *sorted(a + b)))] for b in 'xyz'] for a in 'xyz'])
+    center = numbers(found.find('origin').get('xyz'))
+    return float(found.find('mass').get('value')), center, matrix
+
+
+@pytest.mark.parametrize('carriage', [0.0, 0.7])
+@pytest.mark.parametrize('steered', [False, True])
+def test_urdf_masses_equal_the_model(steered: bool, carriage: float) -> None:
+    """Each moved link has a mass; those that the insertion moves have the mass of the model."""
+    needle = replace(NeedleParameters(), carriage_mass=carriage, length=0.25)
+    names = ('length', 'density', 'area', 'area_moment', 'rotary_inertia', 'carriage_mass')
+    urdf = described('robot', steered, **{name: getattr(needle, name) for name in names})
+    links = {link.get('name'): link for link in urdf.findall('link')}
+    assert links.pop(ENTRY).find('inertial') is None
+    bodies = {name: inertia(link) for name, link in links.items()}
+    for mass, _, matrix in bodies.values():
+        moments = np.sort(np.linalg.eigvalsh(matrix))
+        assert mass > 0.0
+        # Of a body with a positive mass everywhere.
+        assert moments[0] > 0.0
+        assert moments[2] <= moments[0] + moments[1]
+    moved = [BASE, *(['needle_carriage', 'needle_hub'] if steered else ['needle_clamp'])]
+    total = sum(bodies[name][0] for name in moved)
+    assert total == pytest.approx(needle.moving_mass, abs=2.1 * LIGHT)
+    if not steered:
+        clamp = bodies['needle_clamp'][2]
+        np.testing.assert_allclose(np.diag(clamp), needle.rotary_inertia)
+    # About the base: slices of the needle, and a cube.
+    rod = needle.moving_mass - carriage
+    along = (np.arange(10_000) + 0.5) / 10_000 * needle.length
+    second = {
+        'rod': float(rod * np.mean(along**2)),
+        # Edges of 3 cm, centered 3 cm behind the base.
+        'block': carriage * (0.03**2 / 6.0 + 0.03**2),
+    }
+    held = {BASE: ('rod', 'block')} if not steered else {
+        'needle_hub': ('rod',), 'needle_carriage': ('block',),
+    }  # fmt: skip
+    for name, parts in held.items():
+        mass, center, matrix = bodies[name]
+        expected = sum(second[part] for part in parts)
+        if expected:
+            about_base = matrix[0, 0] + mass * center[1] ** 2
+            # The slices have an error of 1e-8.
+            assert about_base == pytest.approx(expected, rel=1e-6)
+            assert matrix[2, 2] == matrix[0, 0]
+
+
+@pytest.mark.parametrize('steered', [False, True])
+def test_collision_bodies_equal_the_drawn_bodies(steered: bool) -> None:
+    """Within 0.1 mm: the needle has the area of the model."""
+    for link in described('robot', steered).findall('link'):
+        drawn, solid = (np.array([np.inf, -np.inf])[:, None] * np.ones(3) for _ in range(2))
+        for kind, extent in (('visual', drawn), ('collision', solid)):
+            for body in link.iter(kind):
+                low, high = box_of(body)
+                extent[0] = np.minimum(extent[0], low)
+                extent[1] = np.maximum(extent[1], high)
+        assert np.isfinite(drawn).all() == np.isfinite(solid).all()
+        if np.isfinite(drawn).all():
+            np.testing.assert_allclose(solid, drawn, atol=1e-4)
+
+
+def box_of(body: ET.Element) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest and highest corner of a visual or a collision body in its link [m]."""
+    origin, (geometry,) = body.find('origin'), body.find('geometry')
+    at = np.zeros(3) if origin is None else numbers(origin.get('xyz'))
+    if geometry.tag == 'mesh':
+        data = (FOLDER / 'meshes' / Path(geometry.get('filename')).name).read_bytes()
+        (count,) = struct.unpack_from('<I', data, 80)
+        corners = np.array(
+            [struct.unpack_from('<9f', data, 84 + 50 * k + 12) for k in range(count)]
+        ).reshape(-1, 3) * numbers(geometry.get('scale', '1 1 1'))
+        return at + corners.min(axis=0), at + corners.max(axis=0)
+    if geometry.tag == 'box':
+        half = numbers(geometry.get('size')) / 2.0
+    else:
+        # The axis of a cylinder is z, here rotated to y.
+        assert numbers(origin.get('rpy')) == pytest.approx([-np.pi / 2.0, 0.0, 0.0])
+        radius = float(geometry.get('radius'))
+        half = np.array([radius, float(geometry.get('length')) / 2.0, radius])
+    return at - half, at + half
+
+
 def test_urdf_base_position_equals_the_model() -> None:
     """At y = s - l, parallel to the entry frame."""
     urdf = described('simulation', False, length=0.25)
@@ -156,16 +248,16 @@ def test_urdf_base_position_equals_the_model() -> None:
         place, turned = pose(urdf, BASE, {INSERTION: depth, 'rotation': 1.0})
         np.testing.assert_allclose(place, [0.0, depth - 0.25, 0.0], atol=1e-15)
         np.testing.assert_array_equal(turned, np.eye(3))
-        plant = PlantRun({'model.preset': 'phantom', 'model.length': 0.25, 'depth': depth})
+        plant = PlantRun({'needle': 'phantom', 'model.length': 0.25, 'depth': depth})
         np.testing.assert_allclose(place, plant.plant.outline().base, atol=1e-15)
 
 
 def test_steered_urdf_base_position_equals_the_plant() -> None:
     """The plant linearizes the tilts, the URDF rotates."""
     preset, depth = 'bending_35mm', 0.06
-    free = STEERING_PRESETS[preset].steering.free_length
+    free = NEEDLES[preset].steering.free_length
     urdf = described('robot', True, free_length=free)
-    plant = PlantRun({'mode': 'robot', 'steered': True, 'model.preset': preset, 'depth': depth})
+    plant = PlantRun({'mode': 'robot', 'steered': True, 'needle': preset, 'depth': depth})
     goals = {'guide_x': 2e-3, 'guide_z': -1e-3, 'guide_tilt_x': 0.02, 'guide_tilt_z': -0.03}
     plant.take(10**9)
     reading = Reading(10**9, '', tuple(goals), (tuple(goals.values()), (), ()))
@@ -189,7 +281,7 @@ def test_steered_urdf_base_position_equals_the_plant() -> None:
 
 def test_tip_frame_equals_the_last_needle_pose() -> None:
     """In the base frame; the rotation aligns y with the needle."""
-    values = {'model.preset': 'phantom', 'depth': 0.12, 'tip_deflection': 5e-3}
+    values = {'needle': 'phantom', 'depth': 0.12, 'tip_deflection': 5e-3}
     outline = PlantRun(values).plant.outline()
     place, (i, j, k, w) = outline.tip
     np.testing.assert_allclose(outline.base + place, outline.points[-1], atol=1e-15)
@@ -231,7 +323,7 @@ def test_plant_accepts_messages_of_the_described_hardware(mode: str, steered: bo
         states = [item.get('name') for item in joint.iter('state_interface')]
         assert states == ['position', 'velocity', 'effort']
     # Message before a controller is active, at rest, without a force.
-    plant = PlantRun({'mode': mode, 'steered': steered, 'model.preset': 'bending_35mm'})
+    plant = PlantRun({'mode': mode, 'steered': steered, 'needle': 'bending_35mm'})
     names = tuple(commanded)
     sent = [
         tuple([np.nan] * len(names)) if k in interfaces else () for k in ('position', 'effort')

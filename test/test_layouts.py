@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Layouts of RViz, Foxglove and PlotJuggler, compared with the published topics."""
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import xml.etree.ElementTree as ET
 
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
-from needle_ros.status import RecorderStatus
+from needle_ros.status import node_of, RecorderStatus
 import pytest
 from rosbags.highlevel import AnyReader
 import yaml
@@ -60,7 +61,8 @@ class Recording:
                 if connection.topic == '/diagnostics':
                     for status in message.status:
                         values = {item.key: item.value for item in status.values}
-                        self.diagnostics.setdefault(status.name, {}).update(values)
+                        name = f'{status.hardware_id}/{status.name}'
+                        self.diagnostics.setdefault(name, {}).update(values)
 
     def number(self, topic: str, path: str) -> float:
         """Return a field of the last message by its path, ``a.b[0]``."""
@@ -76,8 +78,8 @@ class Recording:
         _, topic, path = name.split('/', 2)
         topic = f'/{topic}'
         if topic == '/diagnostics':
-            # With an empty hardware id, the path starts with the node name and its slash.
-            found = re.fullmatch(r'(/\w+)/(.+)', path)
+            # Hardware id, name with its slash, and key.
+            found = re.fullmatch(r'(\w+//\w+: \w+)/(.+)', path)
             assert found
             return float(self.diagnostics[found[1]][found[2]])
         if self.types[topic] == 'sensor_msgs/msg/JointState':
@@ -97,8 +99,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
     def hear(message: DiagnosticArray) -> None:
         for status in message.status:
-            heard.append(status.name)
-            if status.name == '/recorder':
+            heard.append(node_of(status.name))
+            if heard[-1] == '/recorder':
                 values = {item.key: item.value for item in status.values}
                 counts.update(RecorderStatus.from_values(values).recorded)
 
@@ -166,7 +168,9 @@ def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
             assert panel['followTf'] == recording.last['/tip_deflection'].header.frame_id
         if 'topicToRender' in panel:
             assert recording.types[panel['topicToRender']] == 'diagnostic_msgs/msg/DiagnosticArray'
-            assert panel.get('selectedName', '/plant') in recording.diagnostics
+            hardware = panel.get('selectedHardwareId', 'needle')
+            node = panel.get('selectedName', '/plant: state')
+            assert f'{hardware}/{node}' in recording.diagnostics
     assert set(STREAMS) - {'/ground_truth'} <= plotted
 
 

@@ -1,4 +1,5 @@
-"""Checks of language and commit messages."""
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of language, commit messages and licenses."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ from hypothesis import strategies as st
 import pytest
 from tools.commit_message import faults, LONGEST
 from tools.language import idioms, texts_of_code
+from tools.license import license_line, licensed
 
 
 @pytest.mark.parametrize(
@@ -59,3 +61,20 @@ def test_only_the_length_of_a_subject_is_limited(subject: str) -> None:
 )
 def test_invalid_commit_messages_are_rejected(message: str, fault: str) -> None:
     assert fault in faults(message)
+
+
+@pytest.mark.parametrize(
+    ('before', 'after'),
+    [
+        ('"""Page."""\n', '{}"""Page."""\n'),
+        ('#!/usr/bin/env python3\n"""Page."""\n', '#!/usr/bin/env python3\n{}"""Page."""\n'),
+        ('', '{}'),
+        ('# A comment.\n', '{}# A comment.\n'),
+    ],
+)
+def test_license_is_the_first_line_after_the_interpreter(before: str, after: str) -> None:
+    """Once."""
+    line = license_line()
+    assert line == '# SPDX-License-Identifier: Apache-2.0\n'
+    assert licensed(before, line) == after.format(line)
+    assert licensed(after.format(line), line) == after.format(line)
