@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Mathematics of a flexible needle in soft tissue, and the plant node around it.
 
@@ -6,6 +7,7 @@ Units are SI throughout; signs and frames are defined in docs/architecture.md.
 
 from typing import TYPE_CHECKING
 
+from needle_dynamics.compiled.cache import announce_compilation
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from needle_dynamics.compiled.integrals import ModeIntegrals as ModeIntegrals
     from needle_dynamics.errors import InsertionDepthError as InsertionDepthError
     from needle_dynamics.errors import ToleranceError as ToleranceError
+    from needle_dynamics.friction import add_friction_law as add_friction_law
     from needle_dynamics.friction import Friction as Friction
     from needle_dynamics.linearization import linearize as linearize
     from needle_dynamics.linearization import LinearSystem as LinearSystem
@@ -25,10 +28,12 @@ if TYPE_CHECKING:
     from needle_dynamics.model import NeedleModel as NeedleModel
     from needle_dynamics.modes import mode_shapes as mode_shapes
     from needle_dynamics.modes import ModeShapes as ModeShapes
-    from needle_dynamics.parameters import DEFAULT_PRESET as DEFAULT_PRESET
+    from needle_dynamics.needles import DEFAULT_NEEDLE as DEFAULT_NEEDLE
+    from needle_dynamics.needles import find_needle as find_needle
+    from needle_dynamics.needles import NeedlePreset as NeedlePreset
+    from needle_dynamics.needles import NEEDLES as NEEDLES
     from needle_dynamics.parameters import FORMULATIONS as FORMULATIONS
     from needle_dynamics.parameters import NeedleParameters as NeedleParameters
-    from needle_dynamics.parameters import PRESETS as PRESETS
     from needle_dynamics.simulated.batch import Batch as Batch
     from needle_dynamics.simulated.batch import simulate_batch as simulate_batch
     from needle_dynamics.simulated.force_sensor import ForceSensor as ForceSensor
@@ -48,13 +53,13 @@ if TYPE_CHECKING:
     from needle_dynamics.steering.needle import NeedleShape as NeedleShape
     from needle_dynamics.steering.needle import SteeredNeedle as SteeredNeedle
     from needle_dynamics.steering.parameters import bending_length as bending_length
-    from needle_dynamics.steering.parameters import STEERING_PRESETS as STEERING_PRESETS
     from needle_dynamics.steering.parameters import SteeringParameters as SteeringParameters
-    from needle_dynamics.steering.parameters import SteeringPreset as SteeringPreset
     from needle_dynamics.tissue import Tissue as Tissue
     from needle_ros.errors import JobError as JobError
     from needle_ros.errors import NeedleError as NeedleError
     from needle_ros.errors import ParameterError as ParameterError
     from needle_ros.errors import ShapeError as ShapeError
 else:
+    # The first simulation on a machine compiles for up to a minute.
+    announce_compilation()
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -1,18 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction between needle and tissue along the insertion axis, including equation (15)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
+from typing import Final
 
 from needle_dynamics.compiled.friction import (
-    dry_friction,
+    dry_slope,
     friction_force,
     FRICTION_LAWS,
     FrictionConstants,
 )
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
+import numpy as np
+
+#: Numbers of the friction laws for compiled functions, by name, with the laws of
+#: `add_friction_law`.
+LAW_NUMBERS: Final = {name: number for number, name in enumerate(FRICTION_LAWS)}
+
+#: Compiled functions of `add_friction_law`, which must not be deleted.
+_COMPILED: Final[list[object]] = []
+
+#: Speeds at which a new law is checked [m/s].
+_SPEEDS: Final = (0.0, *np.geomspace(1e-9, 1.0, 181).tolist())
+
+
+def add_friction_law(name: str, law: Callable[[float, float], float]) -> None:
+    """
+    Compile a friction law, and add it to the valid names of ``friction_law`` in this process.
+
+    Simulations, batches, closed loops, linearization and control laws use it like the laws of
+    `Friction`. It is not available in nodes and commands, in worker processes, and for a steered
+    needle.
+
+    Parameters
+    ----------
+    name : str
+        Name, other than those of the shipped laws; a law that was added under it is replaced.
+    law : callable
+        Function of Coulomb friction mu_s [N] and speed [m/s] that returns the dry friction [N]: a
+        Python function that Numba can compile, or a compiled function. The value at speed 0 is the
+        static friction limit. If it is zero, the law is smooth and must be continuous; otherwise
+        the friction must be positive at every speed. Viscous friction and the ratio on withdrawal
+        are added by the model.
+
+    Raises
+    ------
+    ParameterError
+        If the name is not valid, or the function cannot be compiled or returns an invalid value.
+
+    Examples
+    --------
+    >>> from needle_dynamics import add_friction_law, NeedleModel, NeedleParameters, simulate
+    >>> def fading(coulomb, speed):
+    ...     return coulomb * (1.0 + 0.5 / (1.0 + speed / 1e-3))
+    >>> add_friction_law('fading', fading)
+    >>> needle = NeedleParameters.preset('phantom', friction_law='fading')
+    >>> run = simulate(needle, NeedleModel(needle).state_at(0.05), 3.0, duration=0.5)
+    >>> bool(run.velocity[-1] > 0.0)
+    True
+
+    """
+    if not name.isidentifier() or name in FRICTION_LAWS:
+        raise ParameterError(
+            f'name of a friction law must be an identifier other than {", ".join(FRICTION_LAWS)}, '
+            f'got {name!r}'
+        )
+    if not callable(law):
+        raise ParameterError(f'friction law {name} must be a function, got {law!r}')
+    # Takes half a second to import.
+    from numba import cfunc
+    from numba.core.errors import NumbaError
+
+    try:
+        found = cfunc('float64(float64, float64)', error_model='numpy')(
+            getattr(law, 'py_func', law)
+        )
+    except (NumbaError, TypeError) as error:
+        lines = [line.strip() for line in str(error).splitlines()]
+        reason = next((line for line in lines if line and not line.startswith('Failed in')), '')
+        raise ParameterError(f'friction law {name} cannot be compiled: {reason}') from error
+    rest = found.ctypes(1.0, 0.0)
+    for speed in _SPEEDS:
+        value = found.ctypes(1.0, speed)
+        if not 0.0 <= value < inf or (rest > 0.0 and value == 0.0):
+            least = '> 0' if rest > 0.0 else '>= 0'
+            raise ParameterError(
+                f'friction law {name} must be finite and {least}, got {value:g} N at '
+                f'{speed:.3g} m/s for mu_s = 1 N'
+            )
+    _COMPILED.append(found)
+    LAW_NUMBERS[name] = int(found.address)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,16 +102,12 @@ class Friction:
     """
     A friction law with its constants; the defaults are those in (15).
 
-    Only the laws listed here exist: the integrator step is compiled and cannot call a Python
-    object. To add a law, add a branch to `dry_friction` in
-    ``needle_dynamics/compiled/friction.py``, which documents the steps.
-
     Attributes
     ----------
     law : str
         ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
         break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
-        velocity; a needle at rest creeps.
+        velocity; a needle at rest creeps. Or the name of an `add_friction_law`.
     coulomb, viscous : float
         Coulomb friction mu_s [N]; viscous friction mu_v [N s/m].
     withdrawal : float
@@ -57,7 +135,7 @@ class Friction:
     smoothing_speed: float = 1e-4
 
     def __post_init__(self) -> None:
-        check_choice('law', self.law, FRICTION_LAWS)
+        check_choice('law', self.law, LAW_NUMBERS)
         least = {'coulomb': 0.0, 'viscous': 0.0, 'withdrawal': 0.0, 'breakaway': 1.0}
         for name, low in least.items():
             value = getattr(self, name)
@@ -72,7 +150,7 @@ class Friction:
     def constants(self) -> FrictionConstants:
         """Constants in the layout of the compiled functions."""
         return FrictionConstants(
-            FRICTION_LAWS.index(self.law),
+            LAW_NUMBERS[self.law],
             float(self.coulomb),
             float(self.viscous),
             float(self.withdrawal),
@@ -117,5 +195,5 @@ class Friction:
             Derivative [N s/m].
 
         """
-        _, dry = dry_friction(self.constants, float(self.coulomb), abs(float(velocity)))
+        dry = dry_slope(self.constants, float(self.coulomb), abs(float(velocity)))
         return (1.0 if direction > 0.0 else self.withdrawal) * (self.viscous + dry)

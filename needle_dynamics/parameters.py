@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Constants of needle and tissue, validated at construction."""
 
 from __future__ import annotations
@@ -8,8 +9,7 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import Any, Final
 
-from needle_dynamics.compiled.friction import FRICTION_LAWS
-from needle_dynamics.friction import Friction
+from needle_dynamics.friction import Friction, LAW_NUMBERS
 from needle_dynamics.tissue import Tissue
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, choice, constant, flag, from_values
@@ -78,7 +78,7 @@ class NeedleParameters:
     tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
     coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
     viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
-    friction_law: str = choice('coulomb', FRICTION_LAWS)
+    friction_law: str = choice('coulomb', LAW_NUMBERS)
     withdrawal_friction: float = constant(
         1.0, '1', 'ratio of friction on withdrawal to friction on insertion'
     )
@@ -190,12 +190,12 @@ class NeedleParameters:
     @classmethod
     def preset(cls, name: str, **changes: Any) -> NeedleParameters:
         """
-        Return a preset of constants, with changed fields.
+        Return the constants of a needle by name, with changed fields.
 
         Parameters
         ----------
         name : str
-            Key of `PRESETS`.
+            Name or file of a needle, as `needle_dynamics.find_needle`.
         **changes : Any
             Fields to replace.
 
@@ -207,7 +207,7 @@ class NeedleParameters:
         Raises
         ------
         ParameterError
-            If the preset or a field is unknown, or a value is not valid.
+            If the needle or a field is unknown, or a value is not valid.
 
         Examples
         --------
@@ -223,9 +223,10 @@ class NeedleParameters:
         needle_ros.errors.ParameterError: length must be finite, > 0 m, got -0.2
 
         """
-        if name not in PRESETS:
-            raise ParameterError(f'unknown preset {name!r}; valid: {", ".join(PRESETS)}')
-        return from_values(cls, {**asdict(PRESETS[name]), **changes})
+        # Imported here: the needles that bend are above this module.
+        from needle_dynamics.needles import find_needle
+
+        return from_values(cls, {**asdict(find_needle(name).needle), **changes})
 
     def using(
         self, *, friction: Friction | None = None, tissue: Tissue | None = None
@@ -264,7 +265,7 @@ class NeedleParameters:
             if not isinstance(friction, Friction):
                 raise ParameterError(
                     f'friction must be a Friction, since only its laws '
-                    f'({", ".join(FRICTION_LAWS)}) are compiled, got {friction!r}'
+                    f'({", ".join(LAW_NUMBERS)}) are compiled, got {friction!r}'
                 )
             changes = {name: getattr(friction, of) for of, name in _FRICTION_FIELDS.items()}
         if tissue is not None:
@@ -297,7 +298,7 @@ _FRICTION_FIELDS: Final = {
 _PAPER_SI = NeedleParameters()
 _PAPER_MM = replace(_PAPER_SI, viscous_friction=300.0)
 
-#: Presets by name. Table 1 prints mu_v = 0.3 without a unit: `paper_si` assumes
+#: The paper's needle by name. Table 1 prints mu_v = 0.3 without a unit: `paper_si` assumes
 #: 0.3 N s/m, `paper_mm` 0.3 N s/mm. `phantom` adds the tissue damping that the paper
 #: omits: 30 % of critical for the first mode at full insertion (an assumption).
 PRESETS: Final[Mapping[str, NeedleParameters]] = {
@@ -306,4 +307,4 @@ PRESETS: Final[Mapping[str, NeedleParameters]] = {
     'phantom': replace(_PAPER_MM, tissue_damping=1.6),
 }
 
-DEFAULT_PRESET: Final = 'phantom'  #: default preset of nodes and commands
+PAPER_NEEDLE: Final = 'phantom'  #: needle of the model of the paper, if no other is named

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Visualization messages of the node `plant`: shape, path, poses and transform."""
 
 from __future__ import annotations
@@ -27,9 +28,8 @@ def time_message(stamp: int) -> TimeMessage:
 
 
 def _line(name: str, width: float, shade: float) -> Marker:
-    """Return a line marker in the frame of the entry point."""
+    """Return a line marker."""
     line = Marker(ns=name, type=Marker.LINE_STRIP)
-    line.header.frame_id = contract.ENTRY
     line.pose.orientation.w = 1.0
     line.scale.x = width
     line.color.r = line.color.g = line.color.b = shade
@@ -37,11 +37,11 @@ def _line(name: str, width: float, shade: float) -> Marker:
     return line
 
 
-def _transform(shape: MeasuredShape, stamp: int) -> TransformStamped:
-    """Return the transform from the base to the tip."""
+def _transform(shape: MeasuredShape, stamp: int, prefix: str) -> TransformStamped:
+    """Return the transform from the base to the tip, with the prefix of the frames."""
     (x, y, z), (i, j, k, w) = shape.tip
-    made = TransformStamped(child_frame_id=contract.TIP)
-    made.header.frame_id, made.header.stamp = contract.BASE, time_message(stamp)
+    made = TransformStamped(child_frame_id=prefix + contract.TIP)
+    made.header.frame_id, made.header.stamp = prefix + contract.BASE, time_message(stamp)
     made.transform.translation = Vector3(x=x, y=y, z=z)
     made.transform.rotation = Quaternion(x=i, y=j, z=k, w=w)
     return made
@@ -58,11 +58,19 @@ class PlantDisplay:
         self._shape = _line('needle', _WIDTH, 0.8)
         self._path = _line('path', _PATH_WIDTH, 0.4)
         self._poses = PoseArray()
-        self._poses.header.frame_id = contract.ENTRY
+        self._prefix = ''
 
     def begin(self, rate: float) -> None:
         """Restart the count of samples, of which there are ``rate`` per second [Hz]."""
         self._samples, self._every = 0, max(1, round(rate / _RATE))
+
+    def use_frames(self, prefix: str) -> None:
+        """Set the prefix of all frames, or raise ParameterError."""
+        if prefix.startswith('/'):
+            raise ParameterError(f'frame_prefix must not begin with a slash, got {prefix!r}')
+        self._prefix = prefix
+        for drawn in (self._shape, self._path, self._poses):
+            drawn.header.frame_id = prefix + contract.ENTRY
 
     def offer_transform(self, mode: str) -> None:
         """Create the publisher of transforms, or raise ParameterError if that is not possible."""
@@ -72,12 +80,6 @@ class PlantDisplay:
             self._tf = self._node.publisher(contract.TF)
         except MessageError as error:
             raise ParameterError(f'publish_tf must be false: {error}') from error
-
-    def cleanup(self) -> None:
-        """Destroy the publisher of transforms."""
-        if self._tf is not None:
-            self._node.destroy_publisher(self._tf)
-            self._tf = None
 
     def publish(self, plant: SimulatedPlant, stamp: int) -> None:
         """Publish the shape of the needle from base to tip, and the path that it cut, if due."""
@@ -92,7 +94,7 @@ class PlantDisplay:
             return
         if self._tf is not None:
             kind: Any = self._tf.msg_type
-            self._tf.publish(kind(transforms=[_transform(shape, stamp)]))
+            self._tf.publish(kind(transforms=[_transform(shape, stamp, self._prefix)]))
         if lines:
             self._publish_line(self._shape, [shape.base.tolist(), *shape.points.tolist()], stamp)
             if len(shape.path):

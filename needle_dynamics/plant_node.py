@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `plant`: simulated needle, optionally moved by a simulated robot, or simulated indenter."""
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from time import monotonic_ns
 from typing import Any
 
 from needle_dynamics.model_node import ModelNode
+from needle_dynamics.needles import usable_needle
 from needle_dynamics.plant_commanders_node import PlantCommanders
 from needle_dynamics.plant_display_node import PlantDisplay
 from needle_dynamics.plant_reports_node import SampleReports
@@ -18,7 +20,7 @@ from needle_dynamics.plant_trajectories_node import PlantTrajectories
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.clock import build_sample_clock
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
-from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
+from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE
 from needle_ros import contract
 from needle_ros.base_node import steady_timer
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
@@ -62,8 +64,8 @@ class PlantNode(ModelNode):
     visualization ``needle_shape`` and ``needle_poses``. With ``steered`` the needle bends and cuts
     its path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
     the end-effector presses the tissue according to ``joint_trajectory`` (efforts of the joints
-    `x` and `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory starts on
-    arrival, or at the activation if it arrived earlier. ``joint_commands`` are sent by a driver of
+    `x` and `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory starts at
+    its stamp, see `PlantTrajectories`. ``joint_commands`` are sent by a driver of
     ros2_control: efforts in mode `simulation`, positions in mode `robot`. Only one node may
     publish commands, on one of the two topics.
 
@@ -100,7 +102,7 @@ class PlantNode(ModelNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('plant', **node_options)
-        self.declare_text('mode', MODES[0], f'one of {", ".join(MODES)}')
+        self.declare_text('mode', MODES[0], f'one of {", ".join(MODES)}', MODES)
         self.declare_text('publish_clock', False, 'publish the simulated time on /clock')
         self.declare_text(
             'lockstep',
@@ -111,6 +113,9 @@ class PlantNode(ModelNode):
         self.declare_text('paused', False, 'start with time paused')
         self.declare_text(
             'publish_tf', False, f'publish {contract.TIP} in {contract.BASE} on {contract.TF.name}'
+        )
+        self.declare_text(
+            'frame_prefix', '', f'prefix of the frames on {contract.TF.name} and displays'
         )
         self.declare_parameter(
             'seed',
@@ -124,12 +129,17 @@ class PlantNode(ModelNode):
             'steered', False, 'the needle bends, cuts its own path, and has a movable guide'
         )
         self.declare_model()
-        preset = str(self.get_parameter('model.preset').value)
+        needle = usable_needle(self.text('needle'))
         for prefix in SETTINGS:
             if prefix != 'model.':
-                self.declare_settings(prefix, defaults_of(prefix, preset))
-        self.declare_text('fault.kind', _NO_FAULT, f'{_NO_FAULT}, or one of {", ".join(FAULTS)}')
-        self.declare_text('fault.topic', 'joint_states', f'one of {", ".join(FAULTY)}')
+                self.declare_settings(prefix, defaults_of(prefix, needle))
+        self.declare_text(
+            'fault.kind',
+            _NO_FAULT,
+            f'{_NO_FAULT}, or one of {", ".join(FAULTS)}',
+            (_NO_FAULT, *FAULTS),
+        )
+        self.declare_text('fault.topic', 'joint_states', f'one of {", ".join(FAULTY)}', FAULTY)
         self.declare_settings('fault.', FaultParameters())
 
         self._run: PlantRun | None = None
@@ -139,24 +149,8 @@ class PlantNode(ModelNode):
         #: Number of samples computed later than due.
         self._late = 0
 
-        offer_lease(self, contract.MEASURER)
-        self._samples = SamplePublishers(self)
-        self._display = PlantDisplay(self)
-        self._commanders = PlantCommanders(
-            self, self._on_command, self._on_joint_commands, self._check_commanders
-        )
-        self._trajectories = PlantTrajectories(
-            self, lambda: self._time.simulated(self.now()), self._follow
-        )
-        self._reports = SampleReports(self, self._on_timer)
-        self.create_service(Trigger, '~/tare', partial(self._answer, 'tare', self._tare))
-        self.create_service(
-            SetBool, '~/pause_time', partial(self._answer, 'pause_time', self._pause)
-        )
         self._authority, self._mode = Authority(), Mode.RUNNING
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
-        self.create_service(Trigger, '~/step', partial(self._answer, 'step', self._step))
-        self.create_service(Trigger, '~/reset', partial(self._answer, 'reset', self._reset))
 
     # Transitions.
 
@@ -172,10 +166,19 @@ class PlantNode(ModelNode):
             publish_clock=publishes,
             use_sim_time=bool(self.get_parameter('use_sim_time').value),
         )
-        self._set_fault({})
         # Load or compile functions before the first sample.
         constants.make().take(0.0, 0.0)
-        self._samples.configure(plant_run)
+        offer_lease(self, contract.MEASURER)
+        self._samples = SamplePublishers(self, plant_run)
+        self._set_fault({})
+        self._display = PlantDisplay(self)
+        self._display.use_frames(self.text('frame_prefix'))
+        self._trajectories = PlantTrajectories(
+            self, plant_run, lambda: self._time.simulated(self.now())
+        )
+        self._commanders = PlantCommanders(
+            self, self._on_command, self._on_joint_commands, self._check_commanders
+        )
         if self.get_parameter('publish_tf').value:
             self._display.offer_transform(constants.mode)
         self._run = plant_run
@@ -183,8 +186,16 @@ class PlantNode(ModelNode):
             self._samples.offer_clock()
         # With simulated time, the plant waits for recorders.
         recorded = publishes or own.real_time_factor != 1.0
-        self._reports.configure(self._time, processed=lockstep, recorded=recorded)
-        self._trajectories.configure(constants.mode, steered=constants.steered)
+        self._reports = SampleReports(
+            self, self._on_timer, self._time, processed=lockstep, recorded=recorded
+        )
+        for name, kind, act in (
+            ('tare', Trigger, self._tare),
+            ('pause_time', SetBool, self._pause),
+            ('step', Trigger, self._step),
+            ('reset', Trigger, self._reset),
+        ):
+            self.create_service(kind, f'~/{name}', partial(self._answer, name, act))
         self._mode = Mode.RUNNING
         self._obey()
 
@@ -193,10 +204,6 @@ class PlantNode(ModelNode):
         if self._run is not None:
             self._number = self._run.number
         self._run = None
-        self._samples.cleanup()
-        self._display.cleanup()
-        self._trajectories.cleanup()
-        self._reports.cleanup()
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply changed friction or fault parameters; the state is kept."""
@@ -243,13 +250,14 @@ class PlantNode(ModelNode):
             takes.append(contract.JOINT_COMMANDS.name)
         steered = ', steered' if values['steered'] else ''
         return (
-            f'mode {values["mode"]}{steered}, preset {values["model.preset"]}, '
+            f'mode {values["mode"]}{steered}, needle {values["needle"]}, '
             f'{values["rate"]:g} Hz; takes {" and ".join(takes)}, publishes '
             f'{", ".join(self._samples.topics)}'
         )
 
     def deactivate(self) -> None:
         """Stop sampling."""
+        self._trajectories.discard('the plant is not active')
         for timer in self._active_timers:
             self.destroy_timer(timer)
 
@@ -295,17 +303,13 @@ class PlantNode(ModelNode):
         self._trajectories.stopped = f'stopped: {reason}' if reason else ''
         if mode is Mode.STOPPED:
             self.get_logger().error(f'stopped: {reason}; no force or motion until ~/clear_stop')
+            self._trajectories.discard(self._trajectories.stopped)
             self._run.halt()
         elif mode is Mode.RETRACTING:
+            self._trajectories.discard('the needle is retracted')
             self._run.withdraw()
         self._run.commands.stopped = mode is Mode.STOPPED
         self.publish_diagnostics()
-
-    def _follow(self, content: dict[str, Any]) -> None:
-        """Execute a trajectory."""
-        if self._run is None:
-            raise ParameterError('the plant is not configured')
-        self._run.perform(Event(TRAJECTORY, content))
 
     # Services.
 
@@ -340,6 +344,7 @@ class PlantNode(ModelNode):
 
     def _reset(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
         plant_run.perform(Event(RESET))
+        self._trajectories.discard('the plant was reset')
         self._trajectories.requests.supersede(self._time.simulated(self.now()))
         self._halted = None
         self._set_fault({})
@@ -374,9 +379,9 @@ class PlantNode(ModelNode):
 
     def _check_commanders(self, new: int = 0) -> None:
         """Count the command publishers; no force acts while there are several."""
-        several = self._commanders.update(new)
         if self._run is None:
             return
+        several = self._commanders.update(new)
         # A publisher may have appeared and disappeared while this process was blocked.
         if several:
             self._run.commands.hush(self._time.simulated(self.now()))
@@ -409,6 +414,7 @@ class PlantNode(ModelNode):
             self._samples.publish_events(events, stamp, plant_run.number)
         self._display.publish(plant_run.plant, stamp)
         self._samples.publish(stamp, measured)
+        self._trajectories.sample(stamp)
 
     @property
     def _phase(self) -> PlantPhase:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reports of other nodes on processed and recorded samples, for the clock of the plant."""
 
 from __future__ import annotations
@@ -10,32 +11,28 @@ from needle_ros.base_node import BaseNode, profile
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import nanoseconds
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.subscription import Subscription
 from std_msgs.msg import Header
 
 
 class SampleReports:
     """Pass reports to a clock; ``checks`` counts the checks at which the same sample waited."""
 
-    def __init__(self, node: BaseNode, advance: Callable[[], None]) -> None:
-        self._node, self._advance = node, advance
-        self._subscriptions: list[Subscription] = []
+    def __init__(
+        self,
+        node: BaseNode,
+        advance: Callable[[], None],
+        clock: SampleClock,
+        *,
+        processed: bool,
+        recorded: bool,
+    ) -> None:
+        self._node, self._advance, self._clock = node, advance, clock
         self.checks = 0
         self._awaited: int | None = None
-
-    def configure(self, clock: SampleClock, *, processed: bool, recorded: bool) -> None:
-        """Subscribe to the reports of processed samples, of recorded samples, or both."""
-        self._clock = clock
         if processed:
             self._subscribe(contract.PROCESSED, self._on_processed, self._on_participant)
         if recorded:
             self._subscribe(contract.RECORDED, self._on_recorded, self._on_recorder)
-
-    def cleanup(self) -> None:
-        """Unsubscribe."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions = []
 
     def check(self) -> None:
         """Count the checks of the sample that waits for its answers."""
@@ -47,10 +44,8 @@ class SampleReports:
         self, topic: contract.Topic, take: Callable[[Header], None], matched: Callable[[Any], None]
     ) -> None:
         events = SubscriptionEventCallbacks(matched=matched)
-        self._subscriptions.append(
-            self._node.create_subscription(
-                Header, topic.name, take, profile(topic.qos), event_callbacks=events
-            )
+        self._node.create_subscription(
+            Header, topic.name, take, profile(topic.qos), event_callbacks=events
         )
 
     def _on_processed(self, message: Header) -> None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publishers of the node `plant` for its samples and events, with injected sensor faults."""
 
 from __future__ import annotations
@@ -24,30 +25,26 @@ from rosgraph_msgs.msg import Clock
 class SamplePublishers:
     """Publishers of all measurements, with a fault; ``saturated`` counts saturated forces."""
 
-    def __init__(self, node: BaseNode) -> None:
+    def __init__(self, node: BaseNode, plant_run: PlantRun) -> None:
         streams = (
             contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION,
             contract.GROUND_TRUTH, contract.END_EFFECTOR_POSE,
         )  # fmt: skip
-        self._streams = {topic.name: node.publisher(topic) for topic in streams}
+        publishers = {topic.name: node.publisher(topic) for topic in streams}
         self._events = node.publisher(contract.EVENTS)
         self._clock: Publisher | None = None
         self._node = node
-        #: Publish functions for the values of a sample, by topic.
-        self._publish: dict[str, Callable[[int, list[float]], None]] = {}
         #: Fault, and topic of the sensor with the fault.
         self.fault: SensorFault | None = None
         self.faulty = ''
         self.saturated = 0
         #: On a steady clock.
         self.rate = RateCounter()
-
-    def configure(self, plant_run: PlantRun) -> None:
-        """Publish the measurements of a plant."""
         constants = plant_run.constants
         rate = constants.own.rate
-        self._publish = {
-            name: partial(_write, self._streams[name], topic.template().serialize)
+        #: Publish functions for the values of a sample, by topic.
+        self._publish: dict[str, Callable[[int, list[float]], None]] = {
+            name: partial(_write, publishers[name], topic.template().serialize)
             for name, topic in plant_run.topics.items()
         }
         limits = constants.sensor.per_axis('range').tolist()
@@ -60,12 +57,6 @@ class SamplePublishers:
     def offer_clock(self) -> None:
         """Create the publisher of the time."""
         self._clock = self._node.publisher(contract.CLOCK, always=True)
-
-    def cleanup(self) -> None:
-        """Destroy the publisher of the time."""
-        if self._clock is not None:
-            self._node.destroy_publisher(self._clock)
-            self._clock = None
 
     @property
     def topics(self) -> tuple[str, ...]:

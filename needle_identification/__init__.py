@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Identification of friction, stiffness and tissue from recordings at the needle base, without ROS.
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from needle_identification.bags.messages import deserialize as deserialize
     from needle_identification.bags.messages import encode as encode
     from needle_identification.bags.messages import message_type as message_type
+    from needle_identification.bags.table import read_bag as read_bag
+    from needle_identification.bags.table import TopicTable as TopicTable
     from needle_identification.bags.topics import BagTopic as BagTopic
     from needle_identification.bags.topics import OfferedQos as OfferedQos
     from needle_identification.bags.writer import BagWriter as BagWriter

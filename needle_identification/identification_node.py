@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node that identifies friction and stiffness from recordings and from running topics."""
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class IdentificationNode(BaseNode):
         super().__init__('identification', **node_options)
         # The type of an empty list is undefined.
         self.declare_text('bags', [''], 'recordings to identify from')
-        self.declare_text('what', 'friction', ' or '.join(WHAT))
+        self.declare_text('what', 'friction', ' or '.join(WHAT), WHAT)
         self.declare_text('output', '', 'parameter file to write the result to; none if empty')
         self.declare_text('wrench_topic', '', 'topic of the force; found by its type if empty')
         self.declare_text('motion_topic', '', 'topic of the motion; found by its type if empty')
@@ -130,7 +131,7 @@ class IdentificationNode(BaseNode):
             'friction: axis or joint of the motion, may be signed; y or insertion if empty',
         )
         self.declare_text('axes', ['x', 'z'], 'stiffness: axes of the plane, may be signed')
-        self.declare_text('time', 'header', f'stamps to use: {" or ".join(TIMES)}')
+        self.declare_text('time', 'header', f'stamps to use: {" or ".join(TIMES)}', TIMES)
         self.declare_settings('friction.', FrictionSettings())
         self.declare_settings('stiffness.', StiffnessSettings())
         self.declare_text('live', False, 'identify friction from the running topics too')
@@ -171,8 +172,6 @@ class IdentificationNode(BaseNode):
     def cleanup(self) -> None:
         """Disconnect from the nodes of ``apply_to``."""
         self._calls.abandon()
-        for client in self._setters.values():
-            self.destroy_client(client)
         self._setters.clear()
 
     def activate(self) -> None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node that plays a recording into the ROS graph with its original timing."""
 
 from __future__ import annotations
@@ -162,12 +163,8 @@ class PlayerNode(BaseNode):
             return None
 
     def cleanup(self) -> None:
-        for publisher in self._outputs.values():
-            self.destroy_publisher(publisher)
         self._outputs.clear()
-        if self._clock_publisher is not None:
-            self.destroy_publisher(self._clock_publisher)
-            self._clock_publisher = None
+        self._clock_publisher = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
         self._playback.change(self.settings('', PlaybackSettings, changes))

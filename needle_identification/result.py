@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
     """Return a ROS parameter file for plant, controller and steering node, errors as comments."""
     # The data determine lengths, not forces: the bending stiffness is the default.
     # Imported here for the same reason.
-    from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
+    from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE
     from needle_dynamics.steering.parameters import tissue_of
 
     if len(found.media) > 1:
@@ -115,14 +116,14 @@ def steering_yaml(found: SteeringEstimate) -> str:
     length = medium['bending_length']
     if not length.determined:
         raise IdentificationError('the data do not determine the bending length')
-    stiffness = NeedleParameters.preset(DEFAULT_PRESET).bending_stiffness
+    stiffness = NeedleParameters.preset(PAPER_NEEDLE).bending_stiffness
     tissue = tissue_of(stiffness, length.value)
     lines = ['# Steered needle, identified by needle_identification.']
     for one in (found.free_length, *medium.parameters):
         unit = '' if one.unit == '1' else f' {one.unit}'
         known = f'SE {one.error:.2g}' if one.determined else UNKNOWN
         lines.append(f'# {one.symbol} ({one.name}) = {one.value:.6g}{unit}, {known}')
-    lines.append(f'# E I = {stiffness:g} N m^2 of the preset {DEFAULT_PRESET}')
+    lines.append(f'# E I = {stiffness:g} N m^2 of the needle {PAPER_NEEDLE}')
     if medium.held_out is not None:
         lines.append(
             f'# error of predicted recordings {medium.held_out.rms:.3g} m, '
@@ -142,7 +143,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
         z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
         steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
         lines.append(f'# the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
-    model = {'model.preset': DEFAULT_PRESET, 'model.tissue_stiffness': _short(tissue)}
+    model = {'needle': PAPER_NEEDLE, 'model.tissue_stiffness': _short(tissue)}
     sections = {
         '/**/plant': {'ros__parameters': {**model, **steering}},
         '/**/controller': {'ros__parameters': model},

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import LifeCycle
 from needle_ros.parameter_node import ParameterNode
 from needle_ros.preparation import imports, Preparation, PreparationProgress
-from needle_ros.status import Diagnosis, NodeStatus
+from needle_ros.status import Diagnosis, HARDWARE, NodeStatus, STALE, TASK
 from needle_ros.wire import MessageReader, Reading
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -84,8 +85,9 @@ class BaseNode(ParameterNode):
 
     A subclass declares its parameters in ``__init__`` (`declare_settings`) and overrides
     `configure`, `activate`, `deactivate` and `diagnose`. It raises `NeedleError` to refuse a
-    transition; the error is logged. Parameters in `LIVE` may change in the configured node, which
-    then calls `change`.
+    transition; the error is logged. Publishers, subscriptions, services, clients and timers that
+    it creates in `configure` or later are destroyed with the configuration. Parameters in `LIVE`
+    may change in the configured node, which then calls `change`.
 
     Attributes
     ----------
@@ -108,6 +110,8 @@ class BaseNode(ParameterNode):
         self.invalid: Counter[str] = Counter()
         self._preparation = Preparation(self.preparation())
         self._life_cycle = LifeCycle(self, self._preparation, self._is_valid)
+        #: Publishers, subscriptions and others of the unconfigured node; None in this state.
+        self._lasting: set[Any] | None = None
         self.declare_text('autostart', True, 'configure and activate at start')
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
@@ -126,10 +130,10 @@ class BaseNode(ParameterNode):
         return imports(self.IMPORTS)
 
     def cleanup(self) -> None:
-        """Undo `configure`, also after an error halfway."""
+        """Discard the objects of `configure`, also after an error halfway."""
 
     def configure(self) -> None:
-        """Read the parameters and create the resources of the node."""
+        """Read the parameters and create the publishers and subscriptions of the node."""
 
     def activate(self) -> None:
         """Start the periodic work of the node."""
@@ -216,6 +220,10 @@ class BaseNode(ParameterNode):
     def is_active(self) -> bool:
         return bool(self._state_machine.current_state[1] == 'active')
 
+    @property
+    def _is_finalized(self) -> bool:
+        return bool(self._state_machine.current_state[1] == 'finalized')
+
     def begin(self, refused: Callable[[], None]) -> None:
         """Prepare, configure and activate in a spinning executor; `refused` handles a failure."""
 
@@ -244,10 +252,11 @@ class BaseNode(ParameterNode):
         def configure() -> None:
             self._check_overrides()
             self._preparation.complete()
+            self._lasting = self._entities()
             try:
                 self.configure()
             except NeedleError:
-                self.cleanup()
+                self._clean_up()
                 raise
             self._configured = True
             if self._parameter_overrides:
@@ -271,22 +280,42 @@ class BaseNode(ParameterNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call `cleanup`, and unlock the parameters; rclpy calls this."""
         self._configured = False
-        return self._attempt(self.cleanup, super().on_cleanup, state)
+        return self._attempt(self._clean_up, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `deactivate` if the node is active; rclpy calls this."""
+        """Call `deactivate` if the node is active, and `cleanup`; rclpy calls this."""
 
         def leave() -> None:
             if state.label == 'active':
                 self.deactivate()
+            self._clean_up()
 
         return self._attempt(leave, super().on_shutdown, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Return to unconfigured after an unexpected error; rclpy calls this."""
         self._configured = False
-        self.cleanup()
+        self._clean_up()
         return super().on_error(state)
+
+    def _entities(self) -> set[Any]:
+        return {*self.publishers, *self.subscriptions, *self.services, *self.clients, *self.timers}
+
+    def _clean_up(self) -> None:
+        """Call `cleanup`, and destroy all that was created since the node was unconfigured."""
+        self.cleanup()
+        lasting, self._lasting = self._lasting, None
+        if lasting is None:
+            return
+        for found, destroy in (
+            (self.publishers, self.destroy_lifecycle_publisher),
+            (self.subscriptions, self.destroy_subscription),
+            (self.services, self.destroy_service),
+            (self.clients, self.destroy_client),
+            (self.timers, self.destroy_timer),
+        ):
+            for one in {*found} - lasting:
+                destroy(one)
 
     def _attempt(
         self,
@@ -325,9 +354,10 @@ class BaseNode(ParameterNode):
         )
         values = status.to_values()
         published = DiagnosticStatus(
-            level=severity.level,
-            name=self.get_fully_qualified_name(),
+            level=STALE if self._is_finalized else severity.level,
+            name=f'{self.get_fully_qualified_name()}: {TASK}',
             message=message,
+            hardware_id=self.get_namespace().strip('/') or HARDWARE,
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
         array = DiagnosticArray(status=[published])

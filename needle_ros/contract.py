@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Contract of all topics: type, publisher, QoS, frame, joints, units and stamp.
 
@@ -391,6 +392,15 @@ TIP_EXPECTED: Final = Topic(
     'predicted tip pose at the target depth, with covariance, after each tip measurement',
     qos=COMMAND,
     frame=ENTRY,
+)
+
+INSERTION_RECORD: Final = Topic(
+    'insertion_record',
+    'std_msgs/msg/String',
+    'steering',
+    'plan and estimate of the latest insertion, as JSON: depths, tip measurements and guide '
+    'setpoints so far, expected tip; a restarted node resumes from it',
+    qos=LATCHED,
 )
 
 TIP_POSE: Final = Topic(

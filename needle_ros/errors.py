@@ -1,9 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
 """Error types; every error of the packages is a `NeedleError`."""
 
 from typing import Final
 
 #: Maximum length of a log line [characters].
 _LONGEST: Final = 500
+
+#: Endings of the Python modules with the messages of ROS 2, and its other modules.
+_MESSAGES: Final = ('_msgs', '_srvs', '_interfaces')
+_ROS: Final = {'rclpy', 'launch', 'launch_ros', 'domain_coordinator', 'ament_index_python'}
 
 
 class NeedleError(Exception):
@@ -44,3 +49,14 @@ def shown(text: str) -> str:
 def printable(line: str) -> str:
     """Return a line for a log: as `shown`, and at most 500 characters."""
     return shown(f'{line[: _LONGEST - 4]} ...' if len(line) > _LONGEST else line)
+
+
+def missing_ros(error: ModuleNotFoundError, program: str) -> str:
+    """Return how to install the missing module of ROS 2; raise the error of any other module."""
+    module = str(error.name).partition('.')[0]
+    if module not in _ROS and not module.endswith(_MESSAGES):
+        raise error
+    return (
+        f'{program} needs ROS 2 (no module {module}): '
+        "pip install 'needle_insertion[ros]', or source the setup file of an installed ROS 2"
+    )

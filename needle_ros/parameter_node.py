@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Parameters of a node: fields of frozen dataclasses.
 
@@ -12,14 +13,18 @@ from array import array
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import fields
+from sys import float_info
 from typing import Any, ClassVar, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
-from needle_ros.settings import check_choice, from_values, unknown_name
+from needle_ros.settings import check_choice, constraints, from_values, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 import yaml
+
+#: Largest finite number.
+_LARGEST = float_info.max
 
 #: Strings that rcl parses as booleans in a parameter file.
 _READ_AS_BOOL = ('y', 'n')
@@ -72,11 +77,28 @@ class ParameterNode(LifecycleNode):
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
 
-    def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
-        """Declare a parameter that is not a number."""
-        # YAML 1.1 parses y as true; `text` converts it back.
-        dynamic = default in _READ_AS_BOOL
-        descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set declared parameters; the error of rclpy for an undeclared one does not name it."""
+        for name in (one.name for one in parameter_list):
+            if not self.has_parameter(name):
+                known = self.list_parameters([], 0).names
+                return SetParametersResult(successful=False, reason=unknown_name(name, known))
+        return super().set_parameters_atomically(parameter_list)
+
+    def declare_text(
+        self,
+        name: str,
+        default: str | bool | list[str],
+        description: str,
+        valid: Collection[str] = (),
+    ) -> None:
+        """Declare a parameter that is not a number; empty ``valid`` allows any text."""
+        descriptor = ParameterDescriptor(
+            description=description,
+            # YAML 1.1 parses y as true; `text` converts it back.
+            dynamic_typing=default in _READ_AS_BOOL,
+            additional_constraints=constraints({'valid': valid} if valid else {}, default),
+        )
         self.declare_parameter(name, default, descriptor)
 
     def declare_settings(self, prefix: str, defaults: object, names: Collection[str] = ()) -> None:
@@ -84,20 +106,22 @@ class ParameterNode(LifecycleNode):
         for item in fields(defaults):  # type: ignore[arg-type]
             if names and item.name not in names:
                 continue
-            meta = item.metadata
+            meta, default = item.metadata, getattr(defaults, item.name)
             unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
             descriptor = ParameterDescriptor(
                 description=f'{meta.get("description", item.name)}{unit}',
                 # Integers are accepted for floats; the dataclass checks the value.
                 dynamic_typing=True,
+                additional_constraints=constraints(meta, default),
             )
-            if 'low' in meta:
+            # A range has no infinite bounds.
+            if 'low' in meta and not meta['unlimited']:
+                low, high = (min(max(meta[end], -_LARGEST), _LARGEST) for end in ('low', 'high'))
                 descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
+                    FloatingPointRange(from_value=low, to_value=high)
                 ]
             if 'unit' in meta:
                 self._numbers.add(prefix + item.name)
-            default = getattr(defaults, item.name)
             if isinstance(default, tuple):
                 default = list(default)
             self.declare_parameter(f'{prefix}{item.name}', default, descriptor)

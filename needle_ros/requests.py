@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Requests on topics, and their acknowledgement in the status of the receiver.
 
@@ -15,8 +16,9 @@ from time import monotonic
 from typing import Final
 
 from needle_ros.contract import REQUEST_AGE, Stamp, Topic
-from needle_ros.errors import printable
+from needle_ros.errors import NeedleError, printable
 from needle_ros.timing import apart, NANOSECONDS
+from needle_ros.trajectories import LateTrajectoryError
 
 #: Interval of repetitions without an answer [s], and the maximum number of repetitions.
 REPEAT_AFTER: Final = 1.0
@@ -50,6 +52,8 @@ class Verdict(Enum):
     RECEIVED = 'received'
     ACCEPTED = 'accepted'
     REJECTED = 'rejected'
+    #: Rejected because all its points are in the past: it may be sent again with a new stamp.
+    LATE = 'rejected as late'
     #: Not executed, because the receiver executes a newer request.
     SUPERSEDED = 'superseded'
 
@@ -69,7 +73,7 @@ class Acknowledgement:
     @property
     def refused(self) -> bool:
         """Whether the request is not executed."""
-        return self.verdict in (Verdict.REJECTED, Verdict.SUPERSEDED)
+        return self.verdict in (Verdict.REJECTED, Verdict.LATE, Verdict.SUPERSEDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +199,11 @@ class RequestLog:
             del self._answers[next(iter(self._answers))]
         self._changed = True
         return made
+
+    def reject(self, topic: Topic, stamp: int, why: str | NeedleError) -> None:
+        """Answer that a request is rejected, for a reason or an error."""
+        late = isinstance(why, LateTrajectoryError)
+        self.answer(topic, stamp, Verdict.LATE if late else Verdict.REJECTED, str(why))
 
     def supersede(self, now: int) -> None:
         """Supersede all requests sent before `now` [ns]: a stop or a retraction has priority."""

@@ -1,23 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
 """Settings: frozen dataclasses whose fields have a unit, a description and a range."""
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import field, fields
 from difflib import get_close_matches
 from math import inf, isfinite
 from typing import Any, Final, TypeVar
 
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import quantity
 
 _Settings = TypeVar('_Settings')
 
 #: Types accepted for a tuple.
 _LISTS: Final = (list, array, type(None))
 
-#: Names of the types of fields that are not numbers.
-_NAMES: Final = {bool: 'true or false', str: 'text'}
+#: Names of the types of fields and parameters.
+_NAMES: Final = {
+    bool: 'true or false', str: 'text', list: 'a list of text', tuple: 'a list of numbers',
+    int: 'a number', float: 'a number',
+}  # fmt: skip
 
 #: Larger integers cannot be converted to float.
 _LARGEST_INTEGER: Final = 10**300
@@ -57,8 +63,12 @@ def constant(
 
 
 def choice(default: str, valid: Iterable[str], meaning: str = '') -> Any:
-    """Declare a dataclass field with one of the `valid` words, which its description lists."""
-    words = tuple(valid)
+    """
+    Declare a dataclass field with one of the `valid` words, which its description lists.
+
+    A mapping by word may get more words later.
+    """
+    words = valid if isinstance(valid, Mapping) else tuple(valid)
     description = f'one of {", ".join(words)}' + (meaning and f': {meaning}')
     return field(default=default, metadata={'valid': words, 'description': description})
 
@@ -127,15 +137,26 @@ def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
         raise ParameterError(f'{name} must be a whole number{of}, got {value!r}')
 
 
+def constraints(meta: Mapping[str, Any], default: object) -> str:
+    """Describe the valid values of a parameter beyond its range, from metadata and default."""
+    if 'valid' in meta:
+        return f'one of {", ".join(meta["valid"])}'
+    if 'low' not in meta:
+        return _NAMES[type(default)]
+    whole = 'a whole number' if meta['whole'] else ''
+    limit = f'greater than {meta["low"]:g}' if meta['open_low'] else ''
+    return ', '.join(filter(None, (whole, limit, '.inf for no limit' * meta['unlimited'])))
+
+
 def from_values(
     kind: Callable[..., _Settings], values: Mapping[str, Any], prefix: str = ''
 ) -> _Settings:
     """
     Construct settings from values by field name.
 
-    Integers are accepted for floats, lists and arrays for tuples. None means an empty tuple,
-    because rcl returns an empty list of a parameter file as None. The message of a
-    `ParameterError` contains the field with ``prefix``, such as ``model.``.
+    Integers and text with a unit are accepted for floats, lists, arrays and single numbers for
+    tuples. None means an empty tuple, because rcl returns an empty list of a parameter file as
+    None. The message of a `ParameterError` contains the field with ``prefix``, such as ``model.``.
     """
     known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
     given = {}
@@ -146,17 +167,27 @@ def from_values(
             )
         several = isinstance(known[name].default, tuple)
         taken = tuple(value or ()) if several and isinstance(value, _LISTS) else value
-        given[name] = _as_number(taken) if 'unit' in known[name].metadata else taken
+        if 'unit' in known[name].metadata:
+            taken = _as_number(taken, known[name].metadata['unit'])
+            only_tuple = several and 'float |' not in str(known[name].type)
+            taken = (taken,) if only_tuple and isinstance(taken, float) else taken
+        given[name] = taken
     try:
         return kind(**given)
     except ParameterError as error:
-        raise ParameterError(f'{prefix}{error}') from error
+        # A message about several fields does not begin with one.
+        of_one = not prefix or str(error).partition(' ')[0] in known
+        begin = prefix if of_one else f'{prefix.removesuffix(".")}: '
+        raise ParameterError(f'{begin}{error}') from error
 
 
-def _as_number(value: Any) -> Any:
-    """Convert integers to float, also within a tuple; keep other values."""
+def _as_number(value: Any, unit: str) -> Any:
+    """Convert integers and text with a unit to float, also in a tuple; keep other values."""
     if isinstance(value, tuple):
-        return tuple(_as_number(number) for number in value)
+        return tuple(_as_number(number, unit) for number in value)
+    if isinstance(value, str) and value[-1:].isalpha():
+        with suppress(ParameterError):
+            return quantity(value, unit)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Status of the state machines, and its mapping to the key-value pairs of a DiagnosticStatus.
 
@@ -30,6 +31,15 @@ from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus
 from needle_ros.system_state import Mode
 
+#: Task in the name of the status of a node: ``/plant: state``.
+TASK: Final = 'state'
+
+#: Hardware of nodes without a namespace; the hardware of others is their namespace.
+HARDWARE: Final = 'needle'
+
+#: Level STALE of a DiagnosticStatus: its values are no longer updated.
+STALE: Final = bytes([3])
+
 #: Key of the kind of a status.
 _KIND: Final = 'kind'
 
@@ -38,6 +48,11 @@ _MISSING: Final = object()
 
 _Status = TypeVar('_Status', bound='NodeStatus')
 _Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
+
+
+def node_of(name: str) -> str:
+    """Return the node in the name of a DiagnosticStatus, with or without a task."""
+    return name.partition(':')[0]
 
 
 def entry(default: Any, unit: str, description: str) -> Any:

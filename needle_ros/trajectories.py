@@ -1,18 +1,87 @@
-"""Validation of trajectory_msgs/JointTrajectory points."""
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories of joints: points, validation, and start time."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from needle_ros.errors import ParameterError
+from needle_ros.timing import seconds
 
 #: Maximum number of points: checking a million invalid points would take seconds.
 MOST_POINTS: Final = 10_000
 
 #: A number of each joint at each point, or none at a point.
 Points: TypeAlias = Sequence[Sequence[float]]
+
+
+class LateTrajectoryError(ParameterError):
+    """All points of a trajectory are in the past."""
+
+
+class JointPath(NamedTuple):
+    """
+    Points of joints, with times from the start of the trajectory [s].
+
+    The start is the stamp of the message, as for joint_trajectory_controller: a trajectory that
+    arrives later joins at its first point that is not in the past. Without points, the joints
+    stop; without names, all joints.
+    """
+
+    joints: Sequence[str]
+    times: Sequence[float]
+    positions: Points
+    velocities: Points = ()
+    efforts: Points = ()
+
+    @classmethod
+    def from_message(cls, message: Any) -> JointPath:
+        """Convert a trajectory_msgs/JointTrajectory."""
+        # One point above the limit is enough to reject it.
+        points = message.points[: MOST_POINTS + 1]
+        return cls(
+            list(message.joint_names),
+            [seconds(point.time_from_start) for point in points],
+            [list(point.positions) for point in points],
+            [list(point.velocities) for point in points],
+            [list(point.effort) for point in points],
+        )
+
+    @property
+    def stops(self) -> bool:
+        """Whether the joints must stop."""
+        return not self.times
+
+    def check(self, elapsed: float) -> None:
+        """
+        Check number and times of the points, at a time after the start [s].
+
+        Raises `LateTrajectoryError` if all points are in the past.
+        """
+        if len(self.times) > MOST_POINTS:
+            raise ParameterError(f'a path may have at most {MOST_POINTS} points')
+        if self.stops:
+            return
+        check_times(self.times)
+        if elapsed > 0.0 and self.times[-1] <= elapsed:
+            raise LateTrajectoryError(
+                f'all points are in the past, the last by {elapsed - self.times[-1]:.3f} s'
+            )
+
+    def after(self, elapsed: float) -> JointPath:
+        """Return the points that are not in the past at a time after the start [s], from then."""
+        self.check(elapsed)
+        if elapsed <= 0.0 or self.stops:
+            return self
+        kept = [k for k, time in enumerate(self.times) if time > elapsed]
+        times = [self.times[k] - elapsed for k in kept]
+        columns = (
+            [values[k] for k in kept] if values else values
+            for values in (self.positions, self.velocities, self.efforts)
+        )
+        return JointPath(self.joints, times, *columns)
 
 
 def joint_values(joint: str, joints: Sequence[str], values: Points) -> list[float | None]:

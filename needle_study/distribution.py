@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Distributions of one variable, as defined in a study file."""
 
 from __future__ import annotations
@@ -145,19 +146,8 @@ def _is_number(value: Any) -> bool:
 def _numbers(name: str, given: Any) -> tuple[float, ...]:
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{name} takes a list of numbers, got {given!r}')
-    # YAML 1.1 reads 1e-3 as text.
-    read = [_read(one) for one in given]
-    if not all(map(_is_number, read)):
+    if not all(map(_is_number, given)):
         raise ParameterError(
             f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
         )
-    return tuple(map(float, read))
-
-
-def _read(value: Any) -> Any:
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            return value
-    return value
+    return tuple(map(float, given))

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Insert sampled flexible needles to a depth, under a control law or in open loop."""
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import (
-    DEFAULT_PRESET,
+    find_needle,
     FloatArray,
     NeedleModel,
     NeedleParameters,
-    PRESETS,
     simulate_batch,
 )
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant, from_values
@@ -132,9 +133,10 @@ class InsertionScenario(Scenario):
     """
     Insert needles that differ from the nominal model to a depth.
 
-    `settings` holds ``needle``, a preset; nominal ``constants``; ``controller`` of `CONTROLLERS`
-    with ``gains`` that are stable for the ``uncertainty``; ``reference`` of `REFERENCES`; and the
-    fields of `InsertionStudy`. Raises `ParameterError` if a setting is not valid.
+    `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``controller`` of
+    `CONTROLLERS` with ``gains`` that are stable for the ``uncertainty``; ``reference`` of
+    `REFERENCES`; and the fields of `InsertionStudy`. Raises `ParameterError` if a setting is
+    not valid.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -144,7 +146,6 @@ class InsertionScenario(Scenario):
         numbers = {name: value for name, value in settings.items() if name not in _PARTS}
         self._numbers = from_values(InsertionStudy, numbers, 'settings.')
         words = {
-            'needle': (DEFAULT_PRESET, tuple(PRESETS)),
             'controller': (LAWS[0], CONTROLLERS),
             'reference': (next(iter(REFERENCES)), tuple(REFERENCES)),
         }
@@ -158,7 +159,7 @@ class InsertionScenario(Scenario):
         )
         self._needle = from_values(
             NeedleParameters,
-            {**asdict(PRESETS[chosen['needle']]), **constants},
+            {**asdict(find_needle(settings.get('needle', PAPER_NEEDLE)).needle), **constants},
             'settings.constants.',
         )
         self._kind = REFERENCES[chosen['reference']]

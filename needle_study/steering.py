@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Insert sampled needles to a target, steered by a law or in open loop."""
 
 from __future__ import annotations
@@ -24,25 +25,25 @@ from needle_controller.steering.simulation import (
     step_depths,
 )
 from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
     FloatArray,
     insert_batch,
     NeedleParameters,
-    STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, with_lengths
+from needle_dynamics.steering.parameters import with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.reading import check_names, mapping, one_of
+from needle_study.reading import check_names, mapping
 from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 
 #: Law of a guide at rest, for which a batch is simulated without a law.
 _OPEN_LOOP: Final = 'open_loop'
 
-HIT: Final = 1e-3  #: largest miss of a hit [m]
 _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 
 _JOINTS: Final = contract.steered_states().without_efforts()
@@ -54,7 +55,7 @@ _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are ma
 
 METRICS: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
-    'hit': Metric('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
+    'hit': Metric('', 'the tip ends within `hit_radius` of the target'),
     'tip_x': Metric('m', 'final tip position, in the frame of the sensor'),
     'tip_z': Metric('m', 'final tip position, in the frame of the sensor'),
     'guide_travel': Metric('m', 'distance traveled by the guide'),
@@ -75,14 +76,16 @@ class SteeringStudy(SteeringLimits):
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
     step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
+    hit_radius: float = constant(1e-3, 'm', 'largest miss of a hit', open_low=True)
 
 
 class SteeringScenario(Scenario):
     """
     Steer needles that differ from the nominal model to a target.
 
-    `settings` holds ``needle``, a preset; nominal ``constants``; ``prior``, the prior uncertainty;
-    ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises `ParameterError`.
+    `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``prior``, their
+    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises
+    `ParameterError`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -93,10 +96,7 @@ class SteeringScenario(Scenario):
         self._numbers = numbers = from_values(
             SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
         )
-        preset = settings.get('needle', DEFAULT_STEERING_PRESET)
-        needle, steering, _ = STEERING_PRESETS[
-            one_of('settings: needle', preset, STEERING_PRESETS)
-        ]
+        needle, steering, _ = find_needle(settings.get('needle', DEFAULT_NEEDLE))
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
         given = dict(mapping('settings: constants', settings.get('constants')))
@@ -164,7 +164,7 @@ class SteeringScenario(Scenario):
         for row, found in zip(rows, each, strict=True):
             x, z = (found.get(f'tip_{axis}', nan) - row[f'target_{axis}'] for axis in 'xz')
             miss = float(np.hypot(x, z))
-            yield {**found, 'miss': miss, 'hit': float(miss <= HIT)}
+            yield {**found, 'miss': miss, 'hit': float(miss <= self._numbers.hit_radius)}
 
     def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
         needle, steering = with_lengths(

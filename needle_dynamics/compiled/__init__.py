@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Functions compiled by Numba, grouped by topic.
 
@@ -10,6 +11,7 @@ Functions compiled by Numba, grouped by topic.
 `normal_modes`        modal stiffness, normal modes at a frozen depth, and axial coupling force
 `oscillator`          damped oscillator and first-order lag
 `friction`            friction laws and the motion of the insertion axis under them
+`own_law`             call of a friction law of a user
 `modal_flow`          exact flow of the deflections through one step
 `step`                integrator steps and sequences of intervals
 `force_sensor`        force sensor samples

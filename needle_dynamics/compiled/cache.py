@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Decorators of compiled functions, and their preparation before the first call.
 
@@ -194,7 +195,11 @@ def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
 
 
 def announce_compilation() -> None:
-    """Write one line to standard error when this process first compiles; for commands."""
+    """Write one line to standard error when this process, not a worker, first compiles."""
+    from multiprocessing import parent_process
+
+    if parent_process() is not None:
+        return
 
     def report(_name: str, loaded: bool, _prepared: bool) -> None:
         if not loaded:

@@ -1,9 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Friction along the insertion axis: friction laws, and the motion of the axis under them.
 
 Each law is a branch of `dry_friction`. To add a law, add its name to `FRICTION_LAWS` and its
 branch there; simulation, linearization and inverse dynamics use it. A new constant is a field of
-`FrictionConstants`, of `needle_dynamics.friction.Friction` and of `NeedleParameters`.
+`FrictionConstants`, of `needle_dynamics.friction.Friction` and of `NeedleParameters`. The number
+of a law of a user (`needle_dynamics.friction.add_friction_law`) is the address of its function.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.compiled.cache import compiled, inlined_kernel, kernel
 from needle_dynamics.compiled.oscillator import glide
+from needle_dynamics.compiled.own_law import own_level
 
 #: Names of the laws; the index is the number of the law.
 FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
@@ -25,7 +28,7 @@ TANH: Final = 2
 class FrictionConstants(NamedTuple):
     """Constants of a friction law; see `needle_dynamics.friction.Friction`."""
 
-    law: int  #: index of the law in `FRICTION_LAWS`
+    law: int  #: index of the law in `FRICTION_LAWS`, or address of the function of a user
     #: Coulomb friction mu_s [N] and viscous friction mu_v [N s/m].
     coulomb: float
     viscous: float
@@ -42,7 +45,8 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
     Return dry friction at a speed [N] and its derivative [N s/m], for every law.
 
     ``coulomb`` is for the direction of motion [N]. The value at rest is the static friction limit;
-    if it is zero, the law is smooth and the needle never sticks.
+    if it is zero, the law is smooth and the needle never sticks. A law of a user has no
+    derivative here, see `dry_slope`.
     """
     if f.law == STRIBECK:
         ratio = speed / f.stribeck_speed
@@ -51,7 +55,21 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
     if f.law == TANH:
         turned = tanh(speed / f.smoothing_speed)
         return coulomb * turned, coulomb * (1.0 - turned * turned) / f.smoothing_speed
+    if f.law > TANH:
+        return own_level(f.law, coulomb, speed), 0.0
     return coulomb, 0.0
+
+
+@kernel
+def dry_slope(f: FrictionConstants, coulomb: float, speed: float) -> float:
+    """Return the derivative of dry friction with respect to the speed [N s/m], for every law."""
+    if f.law > TANH:
+        # Relative to the speed, and small compared with the speed scales of friction at rest.
+        step = 1e-5 * speed + 1e-9
+        low = max(speed - step, 0.0)
+        rise = own_level(f.law, coulomb, speed + step) - own_level(f.law, coulomb, low)
+        return rise / (speed + step - low)
+    return dry_friction(f, coulomb, speed)[1]
 
 
 @kernel
@@ -155,6 +173,8 @@ def _implicit_stage(f: FrictionConstants, mass: float, u: float, drive: float, h
     for _ in range(100):
         factor = 1.0 if w >= 0.0 else f.withdrawal
         level, slope = dry_friction(f, f.coulomb, abs(w))
+        if f.law > TANH:
+            slope = dry_slope(f, f.coulomb, abs(w))
         dry = level if w >= 0.0 else -level
         value = inertia * (w - u) - drive + factor * (dry + f.viscous * w)
         steep = slope + f.viscous

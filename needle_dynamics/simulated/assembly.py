@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Construction of a simulated plant from the parameters of a node or a recording."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 from needle_dynamics.model import NeedleModel
+from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
@@ -18,7 +20,7 @@ from needle_dynamics.simulated.plant import Plant
 from needle_dynamics.simulated.steered import GuideParameters, SteeredPlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_dynamics.steering.insertion import Insertion
-from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice, check_constants, constant, from_values
 
@@ -80,13 +82,11 @@ SETTINGS: Final[Mapping[str, Any]] = {
 }
 
 
-def defaults_of(prefix: str, preset: str) -> Any:
-    """Return the default settings of a namespace in `SETTINGS` for a preset (``model.preset``)."""
-    if prefix == 'model.' and preset in NEEDLES:
-        return NEEDLES[preset]
-    if prefix == 'steering.' and preset in STEERING_PRESETS:
-        return STEERING_PRESETS[preset].steering
-    return SETTINGS[prefix]
+def defaults_of(prefix: str, needle: str) -> Any:
+    """Return the default settings of a namespace in `SETTINGS` for the parameter ``needle``."""
+    if prefix == 'model.':
+        return find_needle(needle).needle
+    return find_needle(needle).steering if prefix == 'steering.' else SETTINGS[prefix]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,15 +107,14 @@ class PlantConstants:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlantConstants:
-        """Read the constants from parameters by name; defaults are of ``model.preset``."""
-        mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
-        for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, NEEDLES)):
-            check_choice(name, value, valid)
+        """Read the constants from parameters by name; defaults are of the parameter ``needle``."""
+        mode, needle = values.get('mode', MODES[0]), values.get('needle', 'paper_si')
+        check_choice('mode', mode, MODES)
         made = {}
         for prefix, defaults in SETTINGS.items():
             names = {item.name: f'{prefix}{item.name}' for item in fields(defaults)}
             given = {name: values[full] for name, full in names.items() if full in values}
-            given = {**asdict(defaults_of(prefix, preset)), **given}
+            given = {**asdict(defaults_of(prefix, needle)), **given}
             made[prefix.rstrip('.') or 'own'] = from_values(type(defaults), given, prefix)
         seed = values.get('seed', 1)
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= LARGEST_SEED:

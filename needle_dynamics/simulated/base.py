@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion-controlled base that moves the needle in mode `robot`, and its trajectories."""
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 PUSHES: Final = 4
 
 _SETTLED: Final = 1e-8  #: position error below which the base rests at the end of a trajectory [m]
+_LATE: Final = 1e-4  #: position error above which the base is late [m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +68,7 @@ class BaseMotion:
         self._depths = np.array([depth])
         self._forces = np.array([0.0])
         self._pushes = np.array([False])
+        self._find_ranges()
 
     def follow(
         self,
@@ -106,6 +109,13 @@ class BaseMotion:
         columns = zip(*first, *points, strict=True)
         offsets, self._depths, self._forces, self._pushes = map(np.array, columns)
         self._times = start + offsets
+        self._find_ranges()
+
+    def _find_ranges(self) -> None:
+        """Find the smallest and the largest depth of each point and the points after it."""
+        reverse = self._depths[::-1]
+        self._lowest = np.minimum.accumulate(reverse)[::-1]
+        self._highest = np.maximum.accumulate(reverse)[::-1]
 
     @property
     def end(self) -> float:
@@ -124,6 +134,7 @@ class BaseMotion:
         if k > 0 and self._pushes[k - 1]:
             # The push has ended: the segment of insertion depths starts here.
             self._depths[k - 1], self._pushes[k - 1] = depth, False
+            self._find_ranges()
         self._force = 0.0
         return None
 
@@ -150,6 +161,19 @@ class BaseMotion:
         # Reduce the error no faster than the base can brake; half the limit leaves a margin.
         gain = min(limits.position_gain, 1.0 / interval)
         closing = min(gain * abs(error), sqrt(limits.acceleration_limit * abs(error)))
-        wanted = (ahead - now) / interval + copysign(closing, error)
+        forward = (ahead - now) / interval
+        if abs(error) > _LATE:
+            # It catches up, but brakes within the rest of the trajectory.
+            k = min(int(np.searchsorted(self._times, time, side='right')), len(self._times) - 1)
+            end = self._highest[k] if error > 0.0 else self._lowest[k]
+            rest = (float(end) - depth - 0.5 * interval * velocity) * copysign(1.0, error)
+            fastest = self._braking_speed(max(0.0, rest), interval)
+            closing = min(closing, max(0.0, fastest - copysign(forward, forward * error)))
+        wanted = forward + copysign(closing, error)
         wanted = min(max(wanted, -limits.speed_limit), limits.speed_limit)
         return min(max(wanted, velocity - change), velocity + change)
+
+    def _braking_speed(self, distance: float, interval: float) -> float:
+        """Return the highest speed [m/s] after an interval [s] to brake within a distance [m]."""
+        limit, half = self.limits.acceleration_limit, 0.5 * interval
+        return limit * (sqrt(half**2 + 2.0 * distance / limit) - half)

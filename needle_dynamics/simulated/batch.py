@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parallel simulation of many insertions on all cores."""
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from needle_dynamics.compiled.step import CompiledNeedle, run
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import count_of, floats
 from needle_dynamics.statics import ROUNDING
@@ -90,7 +92,7 @@ def simulate_batch(
     graded: bool = False,
     keep: bool = True,
     workers: int | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Progress | None = None,
 ) -> Batch:
     """
     Simulate many insertions in parallel; the result does not depend on the number of workers.
@@ -111,9 +113,8 @@ def simulate_batch(
         Keep the states at all samples, or only the final states.
     workers : int, optional
         Threads; one per core by default.
-    progress : callable, optional
-        Called after each run, from its worker thread; for example ``update`` of a tqdm progress
-        bar.
+    progress : bool or callable, optional
+        True shows a progress bar; a function is called after each run, from its worker thread.
 
     Returns
     -------
@@ -170,10 +171,10 @@ def simulate_batch(
     runs = sizes.pop() if sizes else 1
     _check(each, starts)
     course = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
-    kept, completed = _take(
-        each, np.array(np.broadcast_to(starts, (runs, starts.shape[1]))), course, keep=keep,
-        workers=thread_count(workers, runs), progress=progress or (lambda: None),
-    )  # fmt: skip
+    ends = np.array(np.broadcast_to(starts, (runs, starts.shape[1])))
+    workers = thread_count(workers, runs)
+    with progress_of(progress, runs, 'runs') as advance:
+        kept, completed = _take(each, ends, course, keep=keep, workers=workers, progress=advance)
     time = np.arange(count + 1, dtype=np.float64) * interval
     return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
 

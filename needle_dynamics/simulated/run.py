@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Run of a simulated plant: samples and events, shared by the node and the replay.
 
@@ -113,13 +114,15 @@ class PlantRun:
     def halt(self) -> None:
         """End every force and motion, of the needle and of all joints that move by themselves."""
         self.commands.stop()
-        mode, steered = self.constants.mode, self.constants.steered
-        joints, at = moved_joints(mode, steered=steered), self._positions()
-        positions, efforts = [at[name] for name in joints], list[float]()
-        if mode == 'indenter':
-            joints, positions, efforts = PRESS_JOINTS, [], [0.0] * len(PRESS_JOINTS)
-        if joints:
-            self._follow(joints, _HALT, positions, efforts)
+        self.hold(moved_joints(self.constants.mode, steered=self.constants.steered))
+
+    def hold(self, joints: Sequence[str]) -> None:
+        """End the motion of joints at their positions, or every force of an indenter."""
+        if self.constants.mode == 'indenter':
+            self._follow(PRESS_JOINTS, _HALT, [], [0.0] * len(PRESS_JOINTS))
+        elif joints:
+            at = self._positions()
+            self._follow(joints, _HALT, [at[name] for name in joints], [])
 
     def withdraw(self) -> None:
         """Withdraw the needle by its own base, if it has one."""

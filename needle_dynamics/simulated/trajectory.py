@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulation of one insertion under a given force."""
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.refined import run_refined
 from needle_dynamics.compiled.step import run
+from needle_dynamics.display import Displayed
 from needle_dynamics.errors import ToleranceError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
@@ -35,7 +37,7 @@ _TRIES: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Trajectory:
+class Trajectory(Displayed):
     """
     A simulated run, sampled evenly, with dense output.
 
@@ -68,13 +70,6 @@ class Trajectory:
     graded: bool = False
     error: float = nan
 
-    def __repr__(self) -> str:
-        depth = self.depth
-        return (
-            f'Trajectory({len(self.time)} samples up to {self.time[-1]:g} s, '
-            f'depth {depth[0]:.4g} to {depth[-1]:.4g} m)'
-        )
-
     @property
     def depth(self) -> FloatArray:
         """Insertion depth at the samples [m], shape (k + 1,)."""
@@ -89,6 +84,18 @@ class Trajectory:
     def tip_deflection(self) -> FloatArray:
         """Tip deflection at the samples [m], shape (k + 1,)."""
         return NeedleModel(self.parameters).tip_deflections(self.states)
+
+    def columns(self) -> dict[str, FloatArray]:
+        force = np.append(self.forces, self.forces[-1:])
+        modal = self.states[:, 2 : self.states.shape[1] // 2]
+        return {
+            'time [s]': self.time,
+            'depth [m]': self.depth,
+            'velocity [m/s]': self.velocity,
+            'force [N]': force,
+            'tip_deflection [m]': self.tip_deflection,
+            **{f'q{i} [m^3/2]': q for i, q in enumerate(modal.T, 1)},
+        }
 
     def at(self, time: float) -> FloatArray:
         """
@@ -185,7 +192,7 @@ def simulate(
     >>> start = NeedleModel(parameters).state_at(0.05, tip_deflection=5e-4)
     >>> run = simulate(parameters, start, force=3.0, duration=0.5, interval=1e-2)
     >>> run
-    Trajectory(51 samples up to 0.5 s, depth 0.05 to 0.05407 m)
+    <Trajectory: 51 samples, time 0 to 0.5 s, depth 0.05 to 0.05407 m>
     >>> print(f'{run.velocity[-1]:.4f} m/s')
     0.0081 m/s
     >>> run.error < 1e-3

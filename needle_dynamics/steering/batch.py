@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parallel simulation of many steered needles on all cores."""
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def insert_batch(
     Examples
     --------
     >>> import numpy as np
-    >>> from needle_dynamics import insert_batch, STEERING_PRESETS
-    >>> needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    >>> from needle_dynamics import insert_batch, NEEDLES
+    >>> needle, steering, _ = NEEDLES['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
     >>> tilts = np.zeros((100, 21, 2))
     >>> tilts[:, :, 1] = np.linspace(-0.02, 0.02, 100)[:, np.newaxis]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Insertion of a steered needle: dynamics along the axis, quasi-static lateral bending."""
 
 from __future__ import annotations
@@ -7,6 +8,7 @@ from math import copysign, inf, isfinite
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, VELOCITY
+from needle_dynamics.display import Displayed
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import Placement, SteeredNeedle
@@ -49,7 +51,7 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConst
     )
 
 
-class Insertion:
+class Insertion(Displayed):
     """
     Time simulation of a steered needle: axial dynamics and quasi-static lateral bending.
 
@@ -118,6 +120,12 @@ class Insertion:
         self._punctured = np.asarray(self.axis.membranes < depth)
         self._tissue = np.zeros(3)
         self._drift = 0.0
+
+    def __repr__(self) -> str:
+        return f'<Insertion: {self.time:.4g} s, {self.velocity:.4g} m/s, {self.needle!r}>'
+
+    def columns(self) -> dict[str, FloatArray]:
+        return self.needle.columns()
 
     @property
     def depth(self) -> float:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Needle that cuts its path, moved by guide, roll and insertion depth."""
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from needle_dynamics.compiled.cutting_needle import (
     Steered,
     TIP_ROLL,
 )
+from needle_dynamics.display import Displayed
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import (
     by_layer,
@@ -149,7 +151,7 @@ def empty_cut(length: float, element: float, layers: int) -> Cut:
     )
 
 
-class SteeredNeedle:
+class SteeredNeedle(Displayed):
     """
     Needle between guide and tip that cuts its path; lateral bending is quasi-static.
 
@@ -214,6 +216,20 @@ class SteeredNeedle:
             _pair('guide', guide), _pair('tilt', tilt), _finite('roll', roll), np.zeros(3)
         )
         start(self._constants, self._cut, self._pose(0.0), self.steering.free_length)
+
+    def __repr__(self) -> str:
+        x, y, z = (1e3 * self.tip).tolist()
+        return f'<SteeredNeedle: tip at x {x:.3f}, depth {y:.2f}, z {z:.3f} mm>'
+
+    def columns(self) -> dict[str, FloatArray]:
+        depths, (x, z), (slope_x, slope_z) = (one.T for one in self.shape)
+        return {
+            'depth [m]': depths,
+            'deflection_x [m]': x,
+            'deflection_z [m]': z,
+            'slope_x [1]': slope_x,
+            'slope_z [1]': slope_z,
+        }
 
     def _pose(self, depth: float) -> GuidePose:
         """Return the pose in the frame of the tissue."""

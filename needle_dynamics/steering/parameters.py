@@ -1,20 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
 """Constants of a steered needle in addition to the needle and tissue constants."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from math import pi
-from typing import Final, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, from_values
 import numpy as np
 
 #: Ratio of bending to torsional stiffness of a round steel needle: E I / (G J) = 1 + nu.
-_STEEL: Final = 1.3
+STEEL: Final = 1.3
 
 #: Longest element over the bending length; the element series converges up to this value.
 _LONGEST: Final = 1.0
@@ -74,7 +73,7 @@ class SteeringParameters:
         0.0, 'N', 'friction torque on the shaft per inserted length'
     )
     torsional_stiffness: float = constant(
-        0.0256 / _STEEL, 'N m^2', 'torsional stiffness G J of the needle', open_low=True
+        0.0256 / STEEL, 'N m^2', 'torsional stiffness G J of the needle', open_low=True
     )
     element: float = constant(1e-3, 'm', 'longest element of the beam', open_low=True)
 
@@ -88,6 +87,29 @@ class SteeringParameters:
                 f'membrane_strengths must have one value for each of the '
                 f'{len(self.membrane_depths)} membrane_depths, got {len(self.membrane_strengths)}'
             )
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> SteeringParameters:
+        """
+        Return the constants of a needle by name, with changed fields.
+
+        Parameters
+        ----------
+        name : str
+            Name or file of a needle, as `needle_dynamics.find_needle`.
+        **changes : Any
+            Fields to replace.
+
+        Returns
+        -------
+        SteeringParameters
+            The constants.
+
+        """
+        # Imported here: the needles are above this module.
+        from needle_dynamics.needles import find_needle
+
+        return from_values(cls, {**asdict(find_needle(name).steering), **changes})
 
 
 def bending_length(stiffness: float, tissue: float) -> float:
@@ -155,78 +177,3 @@ def longest_element(needle: NeedleParameters, steering: SteeringParameters) -> f
 def noise_cell(steering: SteeringParameters) -> float:
     """Return the distance between the lateral loads of the path noise [m]."""
     return steering.path_noise_length / _CELLS
-
-
-class SteeringPreset(NamedTuple):
-    """
-    Constants of a needle in tissue, with their source.
-
-    Attributes
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        Additional constants of a steered needle.
-    source : str
-        Source of the constants.
-
-    """
-
-    needle: NeedleParameters
-    steering: SteeringParameters
-    source: str
-
-
-def _tube(outer: float, inner: float, modulus: float, tissue: float) -> NeedleParameters:
-    """Return a round needle with outer and inner diameter [m]."""
-    return replace(
-        PRESETS['phantom'],
-        youngs_modulus=modulus,
-        area=pi / 4.0 * (outer**2 - inner**2),
-        area_moment=pi / 64.0 * (outer**4 - inner**4),
-        tissue_stiffness=tissue,
-    )
-
-
-def _literature(
-    outer: float, inner: float, modulus: float, tissue: float, source: str
-) -> SteeringPreset:
-    needle = _tube(outer, inner, modulus, tissue)
-    twist = needle.bending_stiffness / _STEEL
-    return SteeringPreset(needle, SteeringParameters(torsional_stiffness=twist), source)
-
-
-def _phantom(length: float) -> SteeringPreset:
-    needle = PRESETS['phantom']
-    tissue = tissue_of(needle.bending_stiffness, length)
-    return SteeringPreset(
-        replace(needle, tissue_stiffness=tissue),
-        SteeringParameters(free_length=0.04),
-        f"the paper's needle with a bending length of {1e3 * length:g} mm, as stock needles in "
-        'phantoms and in tissue ex vivo',
-    )
-
-
-#: Needles in tissue by name. Constants missing in a source are taken from the paper's needle.
-STEERING_PRESETS: Final[Mapping[str, SteeringPreset]] = {
-    'paper': SteeringPreset(
-        PRESETS['phantom'], SteeringParameters(), 'Boroomand et al. 2014, Table 3'
-    ),
-    'bending_25mm': _phantom(0.025),
-    'bending_35mm': _phantom(0.035),
-    'bending_50mm': _phantom(0.05),
-    'abayazid_2013': _literature(0.5e-3, 0.0, 75e9, 167059.0, 'Abayazid et al. 2013, gelatin'),
-    'misra_2010': _literature(0.46e-3, 0.0, 50e9, 4830.0, 'Misra et al. 2010, plastisol A'),
-    'roesthuis_2012': _literature(0.8e-3, 0.0, 75e9, 1.5e5, 'Roesthuis et al. 2012'),
-    'hollow_0.70mm': _literature(0.7e-3, 0.48e-3, 200e9, 2e4, 'ustk, needle of 22 gauge'),
-    'hollow_1.05mm': _literature(1.05e-3, 0.838e-3, 200e9, 2e4, 'ustk, needle of 19 gauge'),
-}
-
-#: Preset of the node, of commands, studies and environments, if no other preset is set.
-DEFAULT_STEERING_PRESET: Final = 'bending_35mm'
-
-#: Needle and tissue constants of all presets by name.
-NEEDLES: Final[Mapping[str, NeedleParameters]] = {
-    **PRESETS,
-    **{name: preset.needle for name, preset in STEERING_PRESETS.items()},
-}

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Friction estimate of a recording, and summary over several recordings, as in Table 1."""
 
 from __future__ import annotations
@@ -8,14 +9,16 @@ from math import log
 from sys import float_info
 
 from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.display import Displayed
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.display import DisplayedEstimate, EstimateRows
 from needle_identification.estimation.estimate import (
     named,
     ParameterEstimate,
     Statistic,
     statistic,
 )
-from needle_identification.estimation.formatting import measured
+from needle_identification.estimation.prediction import Moments, predicted, RecordingPrediction
 from needle_identification.estimation.residual_tests import ResidualTest
 from needle_identification.friction.comparison import CandidateFit, SIGNIFICANCE
 from needle_identification.friction.punctures import Puncture
@@ -23,7 +26,7 @@ from scipy.special import chdtrc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class Fit:
+class Fit(Displayed):
     """Filtered signals and fitted force, for plots; shape (n,) each."""
 
     time: FloatArray  #: evenly spaced, on the clock of the recording [s]
@@ -31,13 +34,22 @@ class Fit:
     force: FloatArray  #: filtered [N]
     model: FloatArray  #: fitted force [N]; nan for samples that were not used
     used: BoolArray  #: whether the sample was used
+    moments: Moments  #: for the prediction of other recordings
 
     def __repr__(self) -> str:
         return f'<Fit: {self.used.sum()} of {len(self.time)} samples used>'
 
+    def columns(self) -> dict[str, FloatArray]:
+        return {
+            'time [s]': self.time,
+            'velocity [m/s]': self.velocity,
+            'force_measured [N]': self.force,
+            'force_fitted [N]': self.model,
+        }
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class FrictionEstimate:
+class FrictionEstimate(DisplayedEstimate):
     """Friction estimate of a recording; ``estimate[name]`` is a parameter."""
 
     name: str  #: name of the recording
@@ -67,23 +79,24 @@ class FrictionEstimate:
     def __getitem__(self, name: str) -> ParameterEstimate:
         return named(self.parameters, name)
 
-    def __repr__(self) -> str:
-        found = ', '.join(
-            f'{p.symbol} = {measured(p.value, p.error, p.unit)}' for p in self.parameters
-        )
-        return f'<FrictionEstimate of {self.name}: {found}>'
+    def rows(self) -> EstimateRows:
+        return ((self.name, one) for one in self.parameters)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrictionSummary:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class FrictionSummary(DisplayedEstimate):
     """Friction over several recordings; ``summary[name]`` is a statistic."""
 
     statistics: tuple[Statistic, ...]  #: one per parameter
     estimates: tuple[FrictionEstimate, ...]  #: one per recording
+    prediction: RecordingPrediction | None = None  #: error of recordings predicted from the others
     warnings: tuple[str, ...] = ()  #: warnings that only all recordings together support
 
     def __getitem__(self, name: str) -> Statistic:
         return named(self.statistics, name)
+
+    def rows(self) -> EstimateRows:
+        return ((f'{len(self.estimates)} recordings', one) for one in self.statistics)
 
 
 def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
@@ -113,10 +126,14 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
         for parameter in (*estimate.parameters, estimate.breakaway, estimate.lag):
             if parameter is not None:
                 found.setdefault(parameter.name, []).append(parameter)
+    same = len({one.terms for one in estimates}) == 1
+    prediction = predicted([one.fit.moments for one in estimates]) if same else None
+    worse = prediction.warning if prediction else ''
     return FrictionSummary(
         statistics=tuple(statistic(parameters) for parameters in found.values()),
         estimates=tuple(estimates),
-        warnings=tuple(_together(estimates)),
+        prediction=prediction,
+        warnings=(*_together(estimates), *([worse] if worse else [])),
     )
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Identify friction from force and motion of the needle base by linear regression.
 
@@ -16,6 +17,7 @@ from math import nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.prediction import moments
 from needle_identification.estimation.regression import hausman_test, Regression
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
 from needle_identification.friction import checks
@@ -208,6 +210,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     """Test the chosen fit, compare it with other terms, and assemble the result."""
     design, fit, signals = chosen.design, chosen.fit, chosen.design.signals
     settings, used = signals.settings, design.used
+    known = fit.values[: len(columns_of(settings.terms, settings))]
     mean_speed = float(np.mean(np.abs(design.velocity[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     checks.check_friction(parameters)
@@ -249,5 +252,6 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
             force=signals.force,
             model=np.where(used, signals.force - fit.residual, nan),
             used=used,
+            moments=moments(design.columns(settings.terms)[used], fit.residual[used], known),
         ),
     )

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Estimate friction online by recursive least squares with exponential forgetting.
 
@@ -39,6 +40,11 @@ _REMEMBERED: Final = 8.0
 
 #: Relative threshold below which singular values of the information are rounding errors.
 _ROUNDING: Final = 1e-7
+
+#: Time for which a sensor with an unknown filter settles after a change of regime [s].
+_SETTLING: Final = 0.05
+
+_LAGS: Final = 5  # number of blocks over which the noise may be correlated
 
 _FIRST: Final = 50  # number of pairs that determine the sampling rate
 _LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
@@ -100,6 +106,7 @@ class RecursiveFriction:
         self._taps = filter_taps(settings.cutoff, self._period)
         # The filtered acceleration needs a neighbor on either side, the lag another neighbor.
         self._margin = len(self._taps) // 2 + 2
+        self._settling = ceil(_SETTLING / self._period)
         self._raw: deque[tuple[float, float]] = deque(maxlen=len(self._taps))
         self._smooth: deque[tuple[float, float]] = deque(maxlen=3)
         self._pending: deque[tuple[float, float, float]] = deque()
@@ -161,7 +168,7 @@ class RecursiveFriction:
             self._drop_pending()
             self._regime = regime
         self._since_change += 1
-        if self._since_change <= self._margin or abs(regime) != 1.0:
+        if self._since_change <= self._margin + self._settling or abs(regime) != 1.0:
             return
         self._pending.append((velocity, acceleration, force))
         if len(self._pending) > self._margin:
@@ -258,7 +265,19 @@ class _Information:
             total**2, (even**2).sum(axis=1), out=np.ones(len(total)), where=total > 0
         )
         effective = float(ages.sum() ** 2 / (ages @ ages))
-        return scores.T @ scores, behind, min(effective, now / self._length)
+        # Correlation between blocks increases the errors (Newey and West), but does not reduce
+        # them.
+        changes = scores @ inverse
+        plain = colored = (changes**2).sum(axis=0)
+        for lag in range(1, min(_LAGS + 1, len(changes))):
+            weight = 2.0 * (1.0 - lag / (_LAGS + 1.0))
+            colored = colored + weight * (changes[lag:] * changes[:-lag]).sum(axis=0)
+        growth = np.divide(colored, plain, out=np.ones_like(plain), where=plain > 0.0)
+        return (
+            growth.max(initial=1.0) * (scores.T @ scores),
+            behind,
+            min(effective, now / self._length),
+        )
 
 
 class LiveFriction:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recordings: force and motion of one experiment as validated arrays."""
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from hashlib import sha256
 from typing import Any
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.display import Displayed
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ShapeError, shown
 import numpy as np
@@ -34,7 +36,7 @@ def freeze(recording: Any, first: str, missing: str = '', /, **columns: int | No
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class BaseRecording:
+class BaseRecording(Displayed):
     """Force of one experiment over time, and its source."""
 
     name: str = 'recording'  #: for messages
@@ -112,6 +114,10 @@ class Recording(BaseRecording):
             raise ShapeError(f'{self.name}: velocity or depth must be given')
         self._freeze(depth=None, force=None)
 
+    def columns(self) -> dict[str, FloatArray]:
+        known = {} if self.velocity is None else {'velocity [m/s]': self.velocity}
+        return {'time [s]': self.time, 'depth [m]': self.depth, **known, 'force [N]': self.force}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class IndentationRecording(BaseRecording):
@@ -134,6 +140,17 @@ class IndentationRecording(BaseRecording):
         if self.off_plane is None:
             object.__setattr__(self, 'off_plane', np.zeros(np.shape(self.time)))
         self._freeze(position=2, off_plane=None, force=2)
+
+    def columns(self) -> dict[str, FloatArray]:
+        (x, z), (force_x, force_z) = self.position.T, self.force.T
+        return {
+            'time [s]': self.time,
+            'position_x [m]': x,
+            'position_y [m]': self.off_plane,
+            'position_z [m]': z,
+            'force_x [N]': force_x,
+            'force_z [N]': force_z,
+        }
 
 
 def integrated(time: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -1,12 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering estimate: constants of needle and medium from steered insertions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.estimation.display import DisplayedEstimate, EstimateRows
 from needle_identification.estimation.estimate import named, ParameterEstimate
 import numpy as np
 
@@ -34,7 +37,7 @@ class HeldOut(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class MediumEstimate:
+class MediumEstimate(DisplayedEstimate):
     """Constants of the needle in a medium; ``estimate[name]`` is a parameter."""
 
     medium: str  #: name of the medium
@@ -50,9 +53,12 @@ class MediumEstimate:
     def __getitem__(self, name: str) -> ParameterEstimate:
         return named(self.parameters, name)
 
+    def rows(self) -> EstimateRows:
+        return ((self.medium, one) for one in self.parameters)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SteeringEstimate:
+class SteeringEstimate(DisplayedEstimate):
     """Joint fit of several recordings; ``estimate[name]`` is a medium."""
 
     free_length: ParameterEstimate  #: common to all recordings
@@ -72,6 +78,10 @@ class SteeringEstimate:
             if one.medium == medium:
                 return one
         raise KeyError(f'{medium!r}; valid: {", ".join(one.medium for one in self.media)}')
+
+    def rows(self) -> EstimateRows:
+        media = (medium.rows() for medium in self.media)
+        return chain([('all', self.free_length)], *media)
 
     @property
     def rms(self) -> float:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Identify the bending of a needle in tissue from guide and tip positions.
 
@@ -26,11 +27,12 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
+from needle_dynamics.progress import Progress, progress_of
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
@@ -86,7 +88,7 @@ class SteeringSettings:
 def identify_steering(
     recordings: Sequence[SteeringRecording],
     settings: SteeringSettings | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Progress | None = None,
 ) -> SteeringEstimate:
     """
     Identify free length, bending length, skin and drift from recorded insertions.
@@ -98,8 +100,8 @@ def identify_steering(
         length, skin and drift constants; each recording has a separate offset.
     settings : SteeringSettings, optional
         Drift terms, order and free length.
-    progress : callable, optional
-        Called after each search.
+    progress : bool or callable, optional
+        True shows a progress bar; a function is called after each search.
 
     Returns
     -------
@@ -119,16 +121,16 @@ def identify_steering(
     orders = ORDERS if settings.order is None else (settings.order,)
     read = [readings(one) for one in recordings]
     fits: list[_Fit] = []
-    for order in orders:
-        tips, optima = Tips(read, order), list[Optimum]()
-        for terms in sets:
-            _check(read, terms)
-            search = Search(tips, terms, settings.free_length)
-            # The lengths hardly depend on the drift terms.
-            optima = search.optima([one.x for one in optima])
-            fits.append(_Fit(search, optima))
-            if progress is not None:
-                progress()
+    with progress_of(progress, len(orders) * len(sets), 'fits') as advance:
+        for order in orders:
+            tips, optima = Tips(read, order), list[Optimum]()
+            for terms in sets:
+                _check(read, terms)
+                search = Search(tips, terms, settings.free_length)
+                # The lengths hardly depend on the drift terms.
+                optima = search.optima([one.x for one in optima])
+                fits.append(_Fit(search, optima))
+                advance()
     best = min(fits, key=lambda fit: fit.selection)
     alternatives = {
         fit.search.terms: rms_of(fit.search.residuals(fit.optima[0].x))

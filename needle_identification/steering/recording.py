@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recording of a steered insertion."""
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.display import Displayed
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import freeze
 from needle_ros.errors import ShapeError
@@ -35,7 +37,7 @@ _ASIDE: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class SteeringRecording:
+class SteeringRecording(Displayed):
     """
     Recorded insertion: depth, guide, roll and tip position.
 
@@ -63,6 +65,17 @@ class SteeringRecording:
     def __repr__(self) -> str:
         deepest = 1e3 * self.depth.max(initial=0.0)
         return f'<SteeringRecording {self.name}: {self.samples} samples to {deepest:.4g} mm>'
+
+    def columns(self) -> dict[str, FloatArray]:
+        (guide_x, guide_z), (tip_x, tip_z) = self.guide.T, self.tip.T
+        return {
+            'depth [m]': self.depth,
+            'guide_x [m]': guide_x,
+            'guide_z [m]': guide_z,
+            'roll [rad]': self.roll,
+            'tip_x [m]': tip_x,
+            'tip_z [m]': tip_z,
+        }
 
     @property
     def known(self) -> BoolArray:
@@ -150,6 +163,11 @@ def recorded_insertion(
     known = tip[np.isfinite(tip).all(axis=1)]
     if not len(known):
         raise RecordingError(f'{path}: no row has a position of the tip')
+    if len(known) > 1 and not np.ptp(known, axis=0).any() and np.ptp(depth) > _GONE:
+        raise RecordingError(
+            f'{path}: the tip never moves: all {len(known)} positions are equal while the needle '
+            f'moves by {1e3 * np.ptp(depth):.3g} mm: check its sensor, topic or columns'
+        )
     good, wrong = credible(depth, guide - guide[0], tip - known[0])
     tip[~good] = np.nan
     return SteeringRecording(

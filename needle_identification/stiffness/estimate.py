@@ -1,18 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tissue stiffness at a place, by force level, and summary over places, as in Table 2."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.display import DisplayedEstimate, EstimateRows
 from needle_identification.estimation.estimate import (
     named,
     ParameterEstimate,
     Statistic,
     statistic,
 )
+from needle_identification.estimation.formatting import measured
+from needle_identification.estimation.prediction import Moments, predicted, RecordingPrediction
 from needle_identification.stiffness.matrix import ENTRIES
 from needle_identification.stiffness.presses import grouped, Presses
 from needle_identification.stiffness.settings import StiffnessSettings
@@ -20,7 +25,7 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class LevelEstimate:
+class LevelEstimate(DisplayedEstimate):
     """Stiffness at a force level; ``level[name]`` is a parameter."""
 
     force: float  #: mean magnitude [N]
@@ -43,15 +48,24 @@ class LevelEstimate:
     residual: float  #: root mean square of force minus K d [N]
     determination: float  #: coefficient of determination R^2
     condition: float  #: of the displacements; large for a single direction
+    #: Rotation of the axes of force against those of motion that would make K symmetric [rad].
+    rotation: ParameterEstimate
+    moments: Moments  #: for the prediction of other places
 
     def __getitem__(self, name: str) -> ParameterEstimate:
-        others = (self.curl, self.spring, *self.principal, self.angle, self.tissue_stiffness)
+        others = (
+            self.curl, self.spring, self.rotation, *self.principal, self.angle,
+            self.tissue_stiffness,
+        )  # fmt: skip
         return named((*self.parameters, *others), name)
 
     def __repr__(self) -> str:
         (k_xx, k_xz), (k_zx, k_zz) = self.matrix.tolist()
         matrix = f'[[{k_xx:.4g}, {k_xz:.4g}], [{k_zx:.4g}, {k_zz:.4g}]] N/m'
         return f'<LevelEstimate at {self.force:.3g} N: K = {matrix}>'
+
+    def rows(self) -> EstimateRows:
+        return ((f'{self.force:.3g} N', one) for one in self.parameters)
 
     @property
     def matrix(self) -> FloatArray:
@@ -60,7 +74,7 @@ class LevelEstimate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class StiffnessEstimate:
+class StiffnessEstimate(DisplayedEstimate):
     """Tissue stiffness at a place."""
 
     name: str  #: name of the recording
@@ -73,26 +87,41 @@ class StiffnessEstimate:
         forces = ', '.join(f'{level.force:.3g}' for level in self.levels)
         return f'<StiffnessEstimate of {self.name}: force levels {forces} N>'
 
+    def rows(self) -> EstimateRows:
+        return chain.from_iterable(level.rows() for level in self.levels)
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelSummary:
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class LevelSummary(DisplayedEstimate):
     """Force level over several places, a column of Table 2; ``level[name]`` is a statistic."""
 
     force: float  #: mean magnitude [N]
     statistics: tuple[Statistic, ...]  #: k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness
+    prediction: RecordingPrediction | None  #: error of places predicted from the others
 
     def __getitem__(self, name: str) -> Statistic:
         return named(self.statistics, name)
 
+    def rows(self) -> EstimateRows:
+        return ((f'{self.force:.3g} N', one) for one in self.statistics)
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StiffnessSummary:
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class StiffnessSummary(DisplayedEstimate):
     """Stiffness over several places, as in Table 2."""
 
     levels: tuple[LevelSummary, ...]  #: by force, in ascending order
     tissue_stiffness: Statistic  #: k_a [N/m^2] at the chosen level
     estimates: tuple[StiffnessEstimate, ...]  #: one per place
     warnings: tuple[str, ...] = ()  #: warnings about all places
+
+    def __repr__(self) -> str:
+        one = self.tissue_stiffness
+        found = measured(one.mean, one.error, one.unit)
+        return f'<StiffnessSummary: {one.symbol} = {found}, n = {one.count}>'
+
+    def rows(self) -> EstimateRows:
+        return chain.from_iterable(level.rows() for level in self.levels)
 
 
 def summarize_stiffness(
@@ -138,6 +167,7 @@ def summarize_stiffness(
                     statistic([level[name] for level in members])
                     for name in (*ENTRIES, 'curl', 'tissue_stiffness')
                 ),
+                prediction=predicted([level.moments for level in members]),
             )
         )
     chosen = summaries[-1]
@@ -152,4 +182,9 @@ def summarize_stiffness(
         levels=tuple(summaries),
         tissue_stiffness=chosen['tissue_stiffness'],
         estimates=tuple(estimates),
+        warnings=tuple(
+            f'{one.prediction.warning} (at {one.force:.3g} N)'
+            for one in summaries
+            if one.prediction is not None and one.prediction.warning
+        ),
     )

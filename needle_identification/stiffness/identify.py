@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Identify the tissue stiffness in the plane of deflection, section 3.2.2.3 of the paper.
 
@@ -14,6 +15,7 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.prediction import moments
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
 from needle_identification.stiffness.matrix import (
@@ -21,6 +23,7 @@ from needle_identification.stiffness.matrix import (
     fit_matrix,
     MatrixFit,
     principal_estimates,
+    rotation_estimate,
     spring_estimates,
 )
 from needle_identification.stiffness.plateaus import find_plateaus
@@ -148,6 +151,12 @@ def _level(
         residual=sqrt(residual / len(force)) if is_known else nan,
         determination=1.0 - residual / variation if is_known and variation > 0.0 else nan,
         condition=fit.condition,
+        rotation=rotation_estimate(fit),
+        moments=moments(
+            np.asarray(np.kron(np.eye(2), presses.displacement[chosen]), dtype=np.float64),
+            fit.residual.T.ravel() if is_known else np.zeros(2 * len(force)),
+            fit.matrix.ravel(),
+        ),
     )
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Fit the stiffness matrix of a force level, and test whether the tissue is a spring.
 
@@ -16,11 +17,12 @@ antisymmetric part of K over the norm of its symmetric part. Its largest value f
 from __future__ import annotations
 
 from dataclasses import replace
-from math import atan2, hypot, inf, isfinite, nan, sqrt
+from math import atan2, degrees, hypot, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
+from needle_identification.estimation.formatting import measured
 from needle_identification.estimation.regression import regress
 from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise
@@ -56,6 +58,7 @@ class MatrixFit(NamedTuple):
     residual: FloatArray  # (m, 2) force minus K d [N]
     scatter: float  # of the presses about the matrix over their noise [1]
     condition: float  # of the displacements
+    systematic: float = 0.0  # relative error of the whole matrix by creep and hysteresis
 
     def derived(
         self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
@@ -67,6 +70,9 @@ class MatrixFit(NamedTuple):
         variance, freedom = self.variance_of(gradient)
         error = sqrt(variance)
         half_width = error * float(stdtrit(freedom, 0.975))
+        if self.systematic:
+            slack = self.systematic * abs(float(np.nansum(gradient * self.matrix)))
+            error, half_width = hypot(error, slack), hypot(half_width, 2.0 * slack)
         return with_half_width(parameter, value, error, half_width)
 
     def variance_of(self, gradient: FloatArray) -> tuple[float, float]:
@@ -142,6 +148,7 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
         residual=residual,
         scatter=sqrt(float(scaled_x @ scaled_x + scaled_z @ scaled_z) / (2.0 * freedom)),
         condition=fit.condition,
+        systematic=noise.systematic,
     )
 
 
@@ -228,6 +235,15 @@ def asymmetry(matrix: ArrayLike) -> float:
     return float(norm(k - k.T)) / symmetric if symmetric else nan
 
 
+def rotation_estimate(fit: MatrixFit) -> ParameterEstimate:
+    """Return the rotation of the axes of force against those of motion that makes K symmetric."""
+    k = fit.matrix
+    curl, trace = float(k[1, 0] - k[0, 1]), float(k[0, 0] + k[1, 1])
+    size = curl**2 + trace**2 or nan
+    gradient = (trace * _CURL - curl * np.eye(2)) / size
+    return fit.derived('axes_rotation', 'theta', 'rad', atan2(curl, trace), gradient)
+
+
 def spring_estimates(
     fit: MatrixFit, limit: float
 ) -> tuple[ParameterEstimate, ParameterEstimate, bool, str]:
@@ -246,6 +262,10 @@ def spring_estimates(
     spring = replace(spring, value=abs(value), interval=(low, high))
     is_spring = high <= limit
     verdict = 'a spring' if is_spring else 'not a spring' if low > limit else 'undecided'
+    if low > limit:
+        angle = rotation_estimate(fit)
+        turned = measured(degrees(angle.value), degrees(angle.error))
+        verdict += f' unless the axes of force and motion differ by a rotation of {turned} deg'
     words = (
         f'{verdict}: antisymmetric part {spring.value:.2%} of the symmetric, 95 % interval '
         f'{low:.2%} to {high:.2%}, limit {limit:.0%}; curl '

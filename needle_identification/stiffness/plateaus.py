@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Find plateaus of force and position: holds of presses, and rests.
 
@@ -43,6 +44,7 @@ class Plateaus(NamedTuple):
     time: FloatArray  # (p,) centers [s]
     mean: FloatArray  # (p, 5)
     variance: FloatArray  # (p, 5) of the means
+    trend: FloatArray  # (p, 5) change of a fitted line from the first to the last sample
     rest: BoolArray  # (p,) whether it is a rest
     missed: int  # presses without a plateau
 
@@ -83,7 +85,8 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     # Noise may cross the limit of a rest repeatedly, but not twice the limit.
     high = size > 2.0 * settings.rest_force
     missed = sum(high[up:down].any() and not in_hold[up:down].any() for up, down in edges)
-    return Plateaus(middle, mean, _variances(channels, parts), rest, missed)
+    trend = np.array([_line(channels[begin:end]) for begin, end in parts])
+    return Plateaus(middle, mean, _variances(channels, parts), trend, rest, missed)
 
 
 def _steady_runs(
@@ -116,9 +119,14 @@ def _steady_runs(
 
 
 def _trend(values: FloatArray) -> float:
-    """Return the change of a fitted line from the first to the last row."""
+    """Return the size of the change of a fitted line from the first to the last row."""
+    return float(norm(_line(values)))
+
+
+def _line(values: FloatArray) -> FloatArray:
+    """Return the change of a fitted line (c,) over the rows of values (n, c)."""
     abscissa = np.linspace(-0.5, 0.5, len(values))
-    return float(norm(abscissa @ values / (abscissa @ abscissa)))
+    return np.asarray(abscissa @ values / (abscissa @ abscissa))
 
 
 def _trimmed(values: FloatArray) -> tuple[int, int]:

@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compute displacement and force of each hold relative to the rests."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, log, pi
+from math import exp, hypot, log, pi, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray, IntArray
@@ -16,6 +17,11 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
 _SAME_DIRECTION: Final = pi / 18.0  # largest angle between forces of the same direction [rad]
+#: Smallest ratio of creep or hysteresis to its error, and smallest fraction that counts.
+_CLEARLY: Final = 4.0
+_LEAST_MEMORY: Final = 1e-3
+
+_FEWEST_FOR_MEMORY: Final = 4  # smallest number of presses with a rest after them
 _WORTH_WARNING: Final = 0.1  # relative drift of the zero above which a warning is given
 
 
@@ -44,6 +50,13 @@ class PressNoise(NamedTuple):
     displacement: FloatArray  # likewise [m^2]
     force_zero: FloatArray  # (m, m) covariance of the zeros of an axis [N^2]
     displacement_zero: FloatArray  # likewise [m^2]
+    creep: float  # growth of a displacement during its hold, as a fraction
+    set: float  # fraction of a displacement that remains at the next rest
+
+    @property
+    def systematic(self) -> float:
+        """Relative standard error of all stiffnesses by creep and by hysteresis."""
+        return hypot(self.creep, self.set)
 
     def covariance(self, matrix: FloatArray, chosen: IntArray, *, pooled: bool) -> FloatArray:
         """Return the covariance (2, m, m) of F - K d by row of K [N^2], or of pooled noise."""
@@ -94,7 +107,12 @@ def find_presses(
         covariances.append(covariance)
     force, displacement = change[:, :2], change[:, 2:4]
     noise = PressNoise(
-        plateaus.variance[hold, :2], plateaus.variance[hold, 2:4], covariances[0], covariances[1]
+        plateaus.variance[hold, :2],
+        plateaus.variance[hold, 2:4],
+        covariances[0],
+        covariances[1],
+        _fraction(plateaus.trend[hold, 2:4], displacement),
+        _remaining(plateaus, displacement),
     )
     presses = Presses(
         time=time,
@@ -108,7 +126,36 @@ def find_presses(
     )
     for array in (getattr(presses, name) for name in Presses.__slots__):
         array.setflags(write=False)
-    return presses, noise, _warnings(presses, plateaus, settings)
+    return presses, noise, [*_warnings(presses, plateaus, settings), *_of_memory(noise)]
+
+
+def _fraction(change: FloatArray, displacement: FloatArray) -> float:
+    """Return the factor of changes (m, 2) that follow the displacements; 0 if insignificant."""
+    power = float((displacement**2).sum())
+    factor = float((change * displacement).sum()) / power
+    left = change - factor * displacement
+    error = sqrt(float((left**2).sum()) / max(1, 2 * len(change) - 1) / power)
+    return factor if factor > max(_CLEARLY * error, _LEAST_MEMORY) else 0.0
+
+
+def _remaining(plateaus: Plateaus, displacement: FloatArray) -> float:
+    """Return the fraction of a displacement that remains at the rest after its press."""
+    holds = np.flatnonzero(~plateaus.rest)
+    follows = np.isin(holds + 1, np.flatnonzero(plateaus.rest))
+    if np.count_nonzero(follows) < _FEWEST_FOR_MEMORY:
+        return 0.0
+    after = plateaus.mean[holds[follows] + 1, 2:4]
+    return _fraction(after - after.mean(axis=0), displacement[follows])
+
+
+def _of_memory(noise: PressNoise) -> list[str]:
+    """Warn of creep and hysteresis, which the errors include."""
+    found = []
+    if noise.creep:
+        found.append(f'the displacement grows by {noise.creep:.1%} during a hold (creep)')
+    if noise.set:
+        found.append(f'{noise.set:.1%} of it remain at the next rest (hysteresis or creep)')
+    return [' and '.join(found) + ': the errors include it'] if found else []
 
 
 def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings) -> list[str]:

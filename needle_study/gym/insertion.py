@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle that is pushed to a depth, single or vectorized."""
 
 from __future__ import annotations
@@ -13,26 +14,30 @@ from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.boxed import Boxed
 from needle_ros.errors import ParameterError
-from needle_study.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
+from needle_ros.settings import check_choice
+from needle_study.gym.actions import checked_actions
+from needle_study.gym.picture import picture
+from needle_study.gym.pushed import BOUND, FORCE, observe, push, Pushed, START, Tissues, UNITS
 import numpy as np
 
-#: Depth at the start, and range of target depths [m].
-START: Final = 0.02
+#: Range of target depths [m].
 TARGETS: Final = (0.03, 0.12)
 
-#: Largest relative deviation from the preset, and the constants that deviate.
+#: Largest relative deviation from the nominal needle, and the constants that deviate.
 SPREAD: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
 _ONE: Final = np.ones(1, dtype=bool)  #: mask of a single environment
 
+_EDGE: Final = 2e-3  #: lateral position at the upper edge of an image [m]
+
 
 class _Needles:
     """The needles of several episodes, each with its target."""
 
-    def __init__(self, preset: str, number: int) -> None:
-        self._preset = NeedleParameters.preset(preset)
-        model = NeedleModel(self._preset)
+    def __init__(self, needle: str, number: int) -> None:
+        self._nominal = NeedleParameters.preset(needle)
+        model = NeedleModel(self._nominal)
         self._start, common = model.state_at(START), model.compiled
         self._needles = Pushed(
             common,
@@ -43,26 +48,38 @@ class _Needles:
             np.zeros(number),
         )
         self._boxed = Boxed(self._needles)
+        self.forces = np.zeros(number)
 
     def begin(self, k: int, rng: np.random.Generator) -> None:
         """Sample a new needle and target for episode k."""
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
         changed: dict[str, Any] = {
-            name: float(factor * getattr(self._preset, name))
+            name: float(factor * getattr(self._nominal, name))
             for name, factor in zip(DRAWN, factors, strict=True)
         }
-        drawn, all_of = NeedleModel(replace(self._preset, **changed)).compiled, self._needles
+        drawn, all_of = NeedleModel(replace(self._nominal, **changed)).compiled, self._needles
         all_of.friction[k] = drawn.friction.coulomb, drawn.friction.viscous
         for layers, one in zip(all_of.layers, drawn.layers, strict=True):
             layers[k] = one
         all_of.times[k], all_of.states[k] = 0.0, self._start
-        all_of.targets[k] = rng.uniform(*TARGETS)
+        all_of.targets[k], self.forces[k] = rng.uniform(*TARGETS), 0.0
 
     def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
-        """Push the selected needles for a period; return rewards and which episodes ended."""
-        if not np.isfinite(actions).all():
-            raise ParameterError(f'an action must be finite, got {actions!r}')
-        return push(self._boxed, np.array(actions, dtype=np.float64), which)
+        """Push the selected needles for a period; return rewards and ends as `push`."""
+        self.forces = np.where(which, FORCE * actions, 0.0)
+        return push(self._boxed, actions, which)
+
+    def info(self, ends: Any) -> dict[str, Any]:
+        """Return depth error [m], force [N] and success, shape (n,)."""
+        n = self._needles
+        errors = n.targets - (n.common.length - n.states[:, 0])
+        return {'error': errors, 'force': self.forces.copy(), 'success': ends > 0}
+
+    def picture(self, k: int) -> Any:
+        """Return an image of needle k."""
+        n = self._needles
+        depth, tip = n.common.length - n.states[k, 0], 1e-3 * float(self.observe()[k, 3])
+        return picture(n.common.length, _EDGE, (depth, tip), (n.targets[k], 0.0))
 
     def observe(self) -> FloatArray:
         """Return the observations, shape (n, 4)."""
@@ -71,54 +88,74 @@ class _Needles:
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
-    Push a needle to a depth; friction and tissue are sampled around a preset in each episode.
+    Push a needle to a depth; friction and tissue are sampled around a needle in each episode.
 
     Action: force over 10 ms, as a fraction of 15 N. Observation: error of depth, velocity and
-    depth in dm and dm/s, tip deflection in mm. Reward: negative error [m] minus a small price of
-    force. The episode ends at rest at the target, or outside the range with a reward of -1.
+    depth in dm and dm/s, tip deflection in mm. The episode ends at rest at the target, or outside
+    the range of the needle.
+
+    Reward: decrease of the error as a fraction of the initial error, minus 0.001 for the period
+    and 0.003 times the square of the action; 1 more at the target, 2 less outside the range. The
+    sum is below 2, and -0.5 for a needle at rest for 500 periods. Info: ``error`` of depth [m],
+    ``force`` [N], ``success``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
+    metadata: ClassVar[dict[str, Any]] = {'render_modes': ['rgb_array'], 'render_fps': 25}
 
-    def __init__(self, preset: str = 'phantom') -> None:
-        self._needles, self._begun = _Needles(preset, 1), False
+    def __init__(self, needle: str = 'phantom', render_mode: str | None = None) -> None:
+        if render_mode is not None:
+            check_choice('render_mode', render_mode, self.metadata['render_modes'])
+        self.render_mode = render_mode
+        self._needles, self._begun = _Needles(needle, 1), False
         self.action_space = spaces.Box(-1.0, 1.0, (1,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (len(UNITS),))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode with a new needle; return the observation and an empty dict."""
+        """Start an episode with a new needle; return the observation and the info."""
         super().reset(seed=seed, options=options)
         self._needles.begin(0, self.np_random)
         self._begun = True
-        return self._needles.observe()[0], {}
+        return self._needles.observe()[0], self._info(np.zeros(1))
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Push for 10 ms; the action is clipped to [-1, 1]."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
-        [reward], [over] = self._needles.step(action, _ONE)
-        return self._needles.observe()[0], float(reward), bool(over), False, {}
+        rewards, ends = self._needles.step(checked_actions(action, (1,)), _ONE)
+        over = bool(ends[0] != 0)
+        return self._needles.observe()[0], float(rewards[0]), over, False, self._info(ends)
+
+    def _info(self, ends: Any) -> dict[str, Any]:
+        return {name: values[0].item() for name, values in self._needles.info(ends).items()}
+
+    def render(self) -> Any:
+        """Return an image of the needle and its target depth, or None without a render mode."""
+        return None if self.render_mode is None else self._needles.picture(0)
 
 
 class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     """Needles as in `InsertionEnv`, each with its own seed, for up to `max_episode_steps`."""
 
     metadata: ClassVar[dict[str, Any]] = {
-        'render_modes': [], 'autoreset_mode': AutoresetMode.NEXT_STEP,
+        **InsertionEnv.metadata, 'autoreset_mode': AutoresetMode.NEXT_STEP,
     }  # fmt: skip
 
     def __init__(
-        self, num_envs: int = 1, preset: str = 'phantom', max_episode_steps: int = 500
+        self,
+        num_envs: int = 1,
+        needle: str = 'phantom',
+        max_episode_steps: int = 500,
+        render_mode: str | None = None,
     ) -> None:
-        single = InsertionEnv(preset)
-        self.num_envs = num_envs
+        single = InsertionEnv(needle, render_mode)
+        self.num_envs, self.render_mode = num_envs, render_mode
         self.single_action_space = single.action_space
         self.single_observation_space = single.observation_space
         self.action_space = batch_space(single.action_space, num_envs)
         self.observation_space = batch_space(single.observation_space, num_envs)
-        self._needles, self._longest = _Needles(preset, num_envs), max_episode_steps
+        self._needles, self._longest = _Needles(needle, num_envs), max_episode_steps
         self._rngs = [gymnasium.utils.seeding.np_random()[0] for _ in range(num_envs)]
         self._begun, self._over = np.zeros((2, num_envs), dtype=bool)
         self._steps = np.zeros(num_envs, dtype=int)
@@ -126,6 +163,11 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     def _begin(self, k: int) -> None:
         self._needles.begin(k, self._rngs[k])
         self._begun[k], self._over[k], self._steps[k] = True, False, 0
+
+    def _info(self, ends: Any) -> dict[str, Any]:
+        """Return the info of all environments, with masks of the environments that have it."""
+        info = self._needles.info(ends)
+        return info | {f'_{name}': np.ones(self.num_envs, dtype=bool) for name in info}
 
     def reset(
         self,
@@ -155,17 +197,24 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             if seeds[k] is not None:
                 self._rngs[k] = gymnasium.utils.seeding.np_random(seeds[k])[0]
             self._begin(k)
-        return self._needles.observe(), {}
+        return self._needles.observe(), self._info(np.zeros(self.num_envs))
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, dict[str, Any]]:
         """Push all needles for 10 ms; where an episode has ended, start the next one instead."""
         if not self._begun.all():
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
         again = self._over
-        rewards, ended = self._needles.step(actions[:, 0], ~again)
+        pushes = checked_actions(actions, (self.num_envs, 1))[:, 0]
+        rewards, ends = self._needles.step(pushes, ~again)
         self._steps += 1
         for k in np.flatnonzero(again).tolist():
             self._begin(k)
-        broken = self._steps >= self._longest
+        ended, broken = ends != 0, self._steps >= self._longest
         self._over = ended | broken
-        return self._needles.observe(), rewards, ended, broken, {}
+        return self._needles.observe(), rewards, ended, broken, self._info(ends)
+
+    def render(self) -> Any:
+        """Return an image of each needle and its target depth, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(map(self._needles.picture, range(self.num_envs)))

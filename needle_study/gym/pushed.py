@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulate and observe many pushed needles in one call of compiled code."""
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
 #: Largest depth error [m] and speed [m/s] of a needle at rest at its target.
 NEAR, SLOW = 2e-4, 1e-3
 
-PRICE: Final = 1e-5  #: price of force in the reward [1/N^2]
+#: Depth at the start [m].
+START: Final = 0.02
+
+#: Rewards: of the whole way to the target, of an arrival, of a needle that leaves its range, of
+#: a period, and of a period at the largest force.
+WAY, ARRIVAL, LEFT, TIME, EFFORT = 1.0, 1.0, -2.0, -1e-3, -3e-3
 
 #: Units of an observation: error [m], velocity [m/s], depth [m], deflection [m].
 UNITS: Final = (0.1, 0.1, 0.1, 1e-3)
@@ -56,11 +62,12 @@ def push(boxed: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[Floa
     """
     Push the needles of the mask `which` for a period by actions, fractions of `FORCE` in [-1, 1].
 
-    Returns rewards [m], 0 where not pushed, and where a needle has arrived or left its range.
+    Returns rewards, 0 where not pushed, and 1 where a needle has arrived, -1 where it has left its
+    range, else 0.
     """
     c, friction, layers, times, states, targets = boxed.value
     n, u = states.shape[0], states.shape[1] // 2
-    rewards, over = np.zeros(n), np.zeros(n, dtype=np.bool_)
+    rewards, ends = np.zeros(n), np.zeros(n, dtype=np.int8)
     none = np.empty((0, 3))
     for k in range(n):
         if not which[k]:
@@ -70,17 +77,20 @@ def push(boxed: Boxed[Pushed], actions: Vector, which: BoolVector) -> tuple[Floa
             layers.moment[k],
         )  # fmt: skip
         needle = adapted(c, friction[k, 0], friction[k, 1], tissue)
-        force = FORCE * min(max(actions[k], -1.0), 1.0)
-        inputs = Inputs(force, 0.0, 0.0, False)
+        part = min(max(actions[k], -1.0), 1.0)
+        before = abs(targets[k] - (c.length - states[k, 0]))
+        inputs = Inputs(FORCE * part, 0.0, 0.0, False)
         left, _ = advance(needle, states[k], times[k], inputs, STEP, False, PERIOD, none)
         times[k] += PERIOD - left
         error = abs(targets[k] - (c.length - states[k, 0]))
+        rewards[k] = WAY * (before - error) / abs(targets[k] - START) + TIME + EFFORT * part * part
         if left > 0.0:
-            rewards[k], over[k] = -1.0, True
-        else:
-            rewards[k] = -error - PRICE * force * force
-            over[k] = error < NEAR and abs(states[k, u]) < SLOW
-    return rewards, over
+            ends[k] = -1
+            rewards[k] += LEFT
+        elif error < NEAR and abs(states[k, u]) < SLOW:
+            ends[k] = 1
+            rewards[k] += ARRIVAL
+    return rewards, ends
 
 
 @kernel

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle whose guide steers its tip."""
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ from needle_controller import SIMULATION_LIMITS, SteeringPrior
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.simulation import sample_truth, SteeringPlant, step_depths
-from needle_dynamics import FloatArray, STEERING_PRESETS
-from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
+from needle_study.gym.actions import checked_actions
+from needle_study.gym.picture import picture
 from needle_study.gym.pushed import BOUND
 import numpy as np
 
@@ -27,34 +29,37 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
     Steer the tip to a target in steps of a needle; needle, tissue and target are sampled.
 
-    ``needle`` is a key of `STEERING_PRESETS`, ``depth`` of the target, ``step`` and the limits of
-    guide and target (``aside``) along x and z in m, ``prior`` the distribution of the needles. The
+    ``needle`` is as for `find_needle`, ``depth`` of the target, ``step`` and the limits of guide
+    and target (``aside``) along x and z in m, ``prior`` the distribution of the needles. The
     action is the position of the guide for the next step, as a fraction of its limit. The
     observation is the depth over the target depth, and as fractions of the guide limit the
     measured tip, the target and the guide, each x and z. The reward at the end is the negative
     distance of the tip from the target [mm], before it is 0. Then the info has ``miss``, the
-    distance [m].
+    distance [m]; it always has ``tip``, the true tip in x and z [m]. Images show the plane of z.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
+    metadata: ClassVar[dict[str, Any]] = {'render_modes': ['rgb_array'], 'render_fps': 2}
 
     def __init__(
         self,
-        needle: str = DEFAULT_STEERING_PRESET,
+        needle: str = DEFAULT_NEEDLE,
         *,
         depth: float = 0.1,
         step: float = STEP_LENGTH,
         guide_limit: float = SIMULATION_LIMITS.guide_limit,
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
+        render_mode: str | None = None,
     ) -> None:
-        check_choice('needle', needle, STEERING_PRESETS)
+        if render_mode is not None:
+            check_choice('render_mode', render_mode, self.metadata['render_modes'])
+        self.render_mode = render_mode
         for name, value in (
             ('depth', depth), ('step', step), ('guide_limit', guide_limit), ('aside', aside),
         ):  # fmt: skip
             if not 0.0 < value < np.inf:
                 raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
-        self._needle, self._steering, _ = STEERING_PRESETS[needle]
+        self._needle, self._steering, _ = find_needle(needle)
         reach = self._needle.length - self._steering.free_length
         if depth > reach:
             raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
@@ -76,21 +81,29 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         target = rng.uniform(-self._aside, self._aside, 2)
         self._plant = given.get('truth', truth).plant(self._depths)
         self._target = np.array(given.get('target', target))
-        return self._observe(self._plant), {}
+        return self._observe(self._plant), {'tip': self._plant.tip}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Move the guide, then the needle; the action is clipped to [-1, 1]."""
         plant = self._plant
         if plant is None or plant.done:
             raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')
-        x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
+        x, z = (self._limit * checked_actions(action, (2,))).tolist()
         plant.guide(GuideSetpoint(x, z))
         plant.insert()
-        observation = self._observe(plant)
+        observation, tip = self._observe(plant), plant.tip
         if not plant.done:
-            return observation, 0.0, False, False, {}
-        miss = float(np.hypot(*(plant.tip - self._target)))
-        return observation, -1e3 * miss, True, False, {'miss': miss}
+            return observation, 0.0, False, False, {'tip': tip}
+        miss = float(np.hypot(*(tip - self._target)))
+        return observation, -1e3 * miss, True, False, {'tip': tip, 'miss': miss}
+
+    def render(self) -> Any:
+        """Return an image of needle and target, or None without a render mode or an episode."""
+        plant = self._plant
+        if self.render_mode is None or plant is None:
+            return None
+        tip, length = (plant.needle.depth, plant.tip[1]), float(1.1 * self._depths[-1])
+        return picture(length, self._limit, tip, (self._depths[-1], self._target[1]))
 
     def _observe(self, plant: SteeringPlant) -> FloatArray:
         tip = plant.tip + self._prior.noise * self.np_random.standard_normal(2)

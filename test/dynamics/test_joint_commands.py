@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parsing of `joint_commands` messages and their effect on a plant."""
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def test_zero_values_after_the_end_of_a_controller_have_no_effect() -> None:
 
 
 def run(**values: Any) -> PlantRun:
-    return PlantRun({'model.preset': 'phantom', 'depth': 0.05, **values})
+    return PlantRun({'needle': 'phantom', 'depth': 0.05, **values})
 
 
 def drive(plant: PlantRun, samples: int, every: int, say: Any) -> list[float]:
@@ -201,7 +202,7 @@ def test_invalid_forces_are_rejected(value: float) -> None:
 
 def test_position_out_of_range_rejects_the_whole_message() -> None:
     """The force is rejected too, and the guide does not move."""
-    plant = run(steered=True, **{'model.preset': 'bending_35mm'})
+    plant = run(steered=True, needle='bending_35mm')
     plant.take(START)
     names, efforts = ('insertion', 'guide_x'), (2.0, nan)
     say = lambda x, k: plant.command_joints(  # noqa: E731
@@ -278,6 +279,6 @@ def test_arbitrary_messages_give_finite_forces_and_positions_in_range(
 
 
 _PLANTS = {
-    (mode, steered): run(mode=mode, steered=steered, **{'model.preset': 'bending_35mm'})
+    (mode, steered): run(mode=mode, steered=steered, needle='bending_35mm')
     for mode, steered in (('simulation', False), ('simulation', True), ('robot', True))
 }

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Model constants: published values, ranges and error messages."""
 
 from __future__ import annotations
@@ -7,7 +8,8 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import NeedleError, NeedleParameters, ParameterError, PRESETS
+from needle_dynamics import NeedleError, NeedleParameters, ParameterError
+from needle_dynamics.parameters import PRESETS
 from needle_ros.settings import from_values
 import numpy as np
 from numpy.testing import assert_allclose
@@ -227,7 +229,7 @@ def test_unknown_key_error_lists_all_valid_keys() -> None:
 
 
 def test_unknown_preset_error_lists_the_presets() -> None:
-    with pytest.raises(ParameterError, match=r"'papper'.*paper_si, paper_mm, phantom"):
+    with pytest.raises(ParameterError, match=r"paper_si, paper_mm, phantom.*'papper'"):
         NeedleParameters.preset('papper')
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plant: base motions and pushes, changes of constants, tare, and tip sensor."""
 
 from __future__ import annotations
@@ -6,6 +7,10 @@ from dataclasses import replace
 from math import inf, nan
 from typing import Any
 
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_controller.steering.motion import duration_of, smooth
+from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics import (
     FloatArray,
     ForceSensor,
@@ -15,14 +20,16 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
     ParameterError,
-    PRESETS,
     ShapeError,
 )
+from needle_dynamics.parameters import PRESETS
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
+from needle_ros.contract import INSERTION
 from needle_ros.errors import JobError
+from needle_ros.trajectories import JointPath
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -260,6 +267,34 @@ def test_incompatible_constants_are_rejected() -> None:
         one.change(replace(parameters, length=0.1))
     assert one.model.parameters == parameters
     assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)
+
+
+@given(
+    end=st.floats(0.02, 0.18),
+    part=st.floats(0.0, 0.99),
+    acceleration=st.floats(0.05, 0.5),
+    rate=st.sampled_from([100.0, 200.0, 1000.0]),
+)
+def test_base_that_joins_late_does_not_overshoot(
+    end: float, part: float, acceleration: float, rate: float
+) -> None:
+    """A minimum-jerk motion within its limits that is joined after a part of its duration."""
+    settings = ExecutiveSettings(speed=0.05, guide_speed=0.05, acceleration=0.8 * acceleration)
+    duration = duration_of(np.array([end - DEPTH, 0.0, 0.0]), settings)
+    motion = smooth((INSERTION,), np.array([DEPTH]), np.array([end]), max(duration, 1e-3))
+    path = JointPath([INSERTION], motion.times.tolist(), motion.positions.tolist())
+    rest = path.after(part * duration)
+    base = BaseMotion(BaseParameters(acceleration_limit=acceleration), DEPTH, (0.0, 0.2))
+    base.follow(0.0, DEPTH, rest.times, [depth for (depth,) in rest.positions])
+    depth, velocity, beyond = DEPTH, 0.0, 0.0
+    for k in range(round((duration + 4.0) * rate)):
+        after = base.velocity(k / rate, depth, velocity, 1.0 / rate)
+        depth, velocity = depth + 0.5 * (velocity + after) / rate, after
+        beyond = max(beyond, (depth - end) * np.sign(end - DEPTH))
+    # A base in time has an error of an interval at its speed; a base is late above 0.1 mm.
+    assert beyond <= 0.5 * 0.05 / rate + 1e-4
+    # The last of the error decays with `position_gain`, in much less than the 4 s after the end.
+    assert depth == pytest.approx(end, abs=1e-6)
 
 
 def test_same_seed_gives_the_same_samples() -> None:

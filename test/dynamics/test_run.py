@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plant run: samples, and events that make it repeatable."""
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import pytest
 BEGIN = 1_700_000_000_123_456_789
 #: The period is not a whole number of nanoseconds.
 VALUES: dict[str, Any] = {
-    'model.preset': 'phantom',
+    'needle': 'phantom',
     'depth': 0.1,
     'rate': 300.0,
     'sensor.rate': 6000.0,
@@ -140,11 +141,11 @@ def test_rejected_inputs_are_not_events() -> None:
 
 def test_constants_are_read_from_the_parameters() -> None:
     """Missing values have their defaults, from the preset if given."""
-    constants = PlantConstants.of({'model.preset': 'paper_mm', 'rate': 500, 'sensor.filter': 0})
+    constants = PlantConstants.of({'needle': 'paper_mm', 'rate': 500, 'sensor.filter': 0})
     assert constants.model == NeedleParameters.preset('paper_mm')
     assert (constants.mode, constants.seed, constants.own.rate) == ('simulation', 1, 500.0)
     assert constants.sensor.filter == 0
-    changed = PlantConstants.of({'model.preset': 'phantom', 'model.density': 7900})
+    changed = PlantConstants.of({'needle': 'phantom', 'model.density': 7900})
     assert changed.model == NeedleParameters.preset('phantom', density=7900.0)
     start = changed.make()
     assert isinstance(start, Plant)
@@ -155,7 +156,7 @@ def test_constants_are_read_from_the_parameters() -> None:
     ('values', 'complaint'),
     [
         ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
-        ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom, p'),
+        ({'needle': 'steel'}, 'needle must be one of paper_si, paper_mm, phantom, b'),
         ({'sensor.rate': -1.0}, 'sensor.rate must be finite, > 0 and <= 8000 Hz, got -1.0'),
         ({'rate': 1e5}, 'rate must be finite, >= 1 and <= 8000 Hz, got 100000.0'),
     ],

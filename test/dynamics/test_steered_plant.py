@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steered plant: robot, guide and sensors of a needle that cuts its path."""
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ import pytest
 PERIOD = 2_000_000
 VALUES: dict[str, Any] = {
     'steered': True,
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'mode': 'robot',
     'rate': 500.0,
     'depth': 0.01,
@@ -300,9 +301,9 @@ def test_inconsistent_constants_are_rejected(change: dict[str, Any], complaint: 
 
 def test_preset_includes_its_steering_constants() -> None:
     """Given constants override the preset."""
-    constants = PlantConstants.of({'steered': True, 'model.preset': 'bending_50mm'})
+    constants = PlantConstants.of({'steered': True, 'needle': 'bending_50mm'})
     assert constants.steering.free_length == 0.04
-    changed = {'steered': True, 'model.preset': 'bending_50mm', 'steering.free_length': 0.03}
+    changed = {'steered': True, 'needle': 'bending_50mm', 'steering.free_length': 0.03}
     assert PlantConstants.of(changed).steering.free_length == 0.03
     assert PlantConstants.of({'steered': True}).steering.free_length == 0.02
 

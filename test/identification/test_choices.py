@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Selection of the velocity source, samples and friction terms from the data; punctures."""
 
 from __future__ import annotations
@@ -214,7 +215,10 @@ def test_false_suggestions_are_rare_over_all_recordings() -> None:
         rng = np.random.default_rng(study)
         made = [recorded(NoiseKind(duration=20.0), rng)[0] for _ in range(20)]
         found = [identify_friction(one, among=len(made)) for one in made]
-        wrong += any(advised(one) for one in found) or bool(summarize(found).warnings)
+        together = summarize(found).warnings
+        # The recordings have different friction.
+        assert 'predicted from the others' in together[-1]
+        wrong += any(advised(one) for one in found) or len(together) > 1
     assert wrong <= 1
 
 
@@ -227,4 +231,4 @@ def test_pooled_recordings_reveal_a_drift_too_small_for_each_recording() -> None
     # Only recordings without a significant drift of their own.
     others = [one for one in found if not advised(one)]
     assert 'add the term drift' in summarize(others).warnings[0]
-    assert not alone or not summarize(found).warnings
+    assert not alone or len(summarize(found).warnings) == 1

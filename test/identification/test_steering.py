@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of needles that follow the path they cut."""
 
 from __future__ import annotations
@@ -280,6 +281,22 @@ def test_media_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert 'is no regular expression' in capsys.readouterr().err
 
 
+def test_a_tip_that_never_moves_is_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'still.csv'
+    write_table(path, insertion(0), frozen=20)
+    table = path.read_text().splitlines()
+    first = table[1].split(',')[2:5]
+    rows = [','.join([*row.split(',')[:2], *first, *row.split(',')[5:]]) for row in table[1:]]
+    path.write_text('\n'.join([table[0], *rows]) + '\n')
+    assert main(['identify', 'steering', str(path), '--columns', COLUMNS]) == 2
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert said.err.count('\n') == 1
+    assert 'the tip never moves: all ' in said.err
+
+
 def test_frozen_and_implausible_readings_are_discarded() -> None:
     depth = np.linspace(0.0, 0.045, 10)
     guide, tip = np.zeros((10, 2)), 1e-4 * np.random.default_rng(1).standard_normal((10, 2))
@@ -353,7 +370,7 @@ def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = No
     Joints may have other names, with the opposite sign of another robot.
     """
     values = {
-        'steered': True, 'mode': 'robot', 'model.preset': 'bending_35mm', 'rate': 200.0,
+        'steered': True, 'mode': 'robot', 'needle': 'bending_35mm', 'rate': 200.0,
         'depth': 0.005, 'seed': seed, 'steering.skin_stiffness': 300.0, 'tip.noise': 1.8e-4,
         'tip.rate': 40.0, 'tip.delay': 0.03, 'tip.dropout': 0.05,
     }  # fmt: skip
@@ -432,7 +449,9 @@ def test_a_bag_of_the_plant_is_read_without_options(
         min(max(gel['path_noise'], 1e-6), 1e-4), rel=1e-6
     )
     assert sections['/**/controller']['ros__parameters'] == {
-        name: value for name, value in values.items() if name.startswith('model.')
+        name: value
+        for name, value in values.items()
+        if name == 'needle' or name.startswith('model.')
     }
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Construction of settings from values: checks, defaults, and error messages."""
 
 from __future__ import annotations
@@ -43,6 +44,19 @@ class Stand:
 
     def __post_init__(self) -> None:
         check_constants(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pair:
+    """Example of settings with a condition on two of them."""
+
+    low: float = constant(0.0, '1', 'low')
+    high: float = constant(1.0, '1', 'high')
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if self.low > self.high:
+            raise ParameterError('both are wrong: low > high')
 
 
 def test_values_are_converted_to_field_types() -> None:
@@ -113,3 +127,17 @@ def test_unknown_name_has_a_hint() -> None:
     """The nearest name, or all names."""
     assert unknown_name('rat', ['rate', 'mode']) == "unknown parameter 'rat'; did you mean 'rate'?"
     assert unknown_name('q', ['rate', 'mode']) == "unknown parameter 'q'; valid: mode, rate"
+
+
+def test_message_about_several_fields_names_their_group() -> None:
+    """The prefix alone would be read as the beginning of a name."""
+    with pytest.raises(ParameterError) as caught:
+        from_values(Pair, {'low': 2.0}, 'pair.')
+    assert str(caught.value) == 'pair: both are wrong: low > high'
+
+
+def test_units_in_text_and_single_numbers_are_accepted() -> None:
+    assert from_values(Robot, {'levels': '3N'}).levels == (3.0,)
+    assert from_values(Robot, {'levels': ['30mN', 2]}).levels == (0.03, 2.0)
+    with pytest.raises(ParameterError, match=r"^levels must be a number, got '3mm'$"):
+        from_values(Robot, {'levels': '3mm'})

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Needles in tissue by name: the paper's, needles that bend, and needles of YAML files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from difflib import get_close_matches
+from math import pi
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE, PRESETS
+from needle_dynamics.steering.parameters import STEEL, SteeringParameters, tissue_of
+from needle_ros.documents import read_document
+from needle_ros.errors import ParameterError
+from needle_ros.settings import from_values, unknown_name
+
+#: Needle of new commands, studies and environments, and of the node `steering`.
+DEFAULT_NEEDLE: Final = 'bending_35mm'
+
+#: Ends of the names of files of needles.
+FILES: Final = ('.yaml', '.yml')
+
+#: Prefixes of the constants in a ROS parameter file.
+_PREFIXES: Final = ('model.', 'steering.')
+
+
+class NeedlePreset(NamedTuple):
+    """
+    Constants of a needle in tissue, with their source.
+
+    Attributes
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters
+        Additional constants of a needle that bends about the path that it cuts.
+    source : str
+        Source of the constants.
+
+    """
+
+    needle: NeedleParameters
+    steering: SteeringParameters
+    source: str
+
+    @property
+    def bends(self) -> bool:
+        """Whether constants of bending are known; the needles of the paper have none."""
+        return self.steering != SteeringParameters()
+
+    def changed(self, values: Mapping[str, Any]) -> NeedlePreset:
+        """
+        Return these constants with changed values by name.
+
+        Parameters
+        ----------
+        values : Mapping[str, Any]
+            Fields of `needle` and `steering` to replace; one number may replace a tuple.
+
+        Returns
+        -------
+        NeedlePreset
+            The changed constants.
+
+        Raises
+        ------
+        ParameterError
+            If a name is unknown or a value is not valid.
+
+        """
+        known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
+        for name in values:
+            if name not in known:
+                raise ParameterError(unknown_name(name, known))
+
+        def replaced(part: Any) -> Any:
+            own = {item.name: values[item.name] for item in fields(part) if item.name in values}
+            return from_values(type(part), {**asdict(part), **own})
+
+        return NeedlePreset(replaced(self.needle), replaced(self.steering), self.source)
+
+
+def _tube(outer: float, inner: float, modulus: float, tissue: float) -> NeedleParameters:
+    """Return a round needle with outer and inner diameter [m]."""
+    return replace(
+        PRESETS['phantom'],
+        youngs_modulus=modulus,
+        area=pi / 4.0 * (outer**2 - inner**2),
+        area_moment=pi / 64.0 * (outer**4 - inner**4),
+        tissue_stiffness=tissue,
+    )
+
+
+def _literature(
+    outer: float, inner: float, modulus: float, tissue: float, source: str
+) -> NeedlePreset:
+    needle = _tube(outer, inner, modulus, tissue)
+    twist = needle.bending_stiffness / STEEL
+    return NeedlePreset(needle, SteeringParameters(torsional_stiffness=twist), source)
+
+
+def _phantom(length: float) -> NeedlePreset:
+    needle = PRESETS['phantom']
+    tissue = tissue_of(needle.bending_stiffness, length)
+    return NeedlePreset(
+        replace(needle, tissue_stiffness=tissue),
+        SteeringParameters(free_length=0.04),
+        f"the paper's needle with a bending length of {1e3 * length:g} mm, as stock needles in "
+        'phantoms and in tissue ex vivo',
+    )
+
+
+#: Needles in tissue by name. Constants missing in a source are taken from the paper's needle.
+NEEDLES: Final[Mapping[str, NeedlePreset]] = {
+    **{
+        name: NeedlePreset(needle, SteeringParameters(), 'Boroomand et al. 2014, Tables 1 to 3')
+        for name, needle in PRESETS.items()
+    },
+    'bending_25mm': _phantom(0.025),
+    'bending_35mm': _phantom(0.035),
+    'bending_50mm': _phantom(0.05),
+    'abayazid_2013': _literature(0.5e-3, 0.0, 75e9, 167059.0, 'Abayazid et al. 2013, gelatin'),
+    'misra_2010': _literature(0.46e-3, 0.0, 50e9, 4830.0, 'Misra et al. 2010, plastisol A'),
+    'roesthuis_2012': _literature(0.8e-3, 0.0, 75e9, 1.5e5, 'Roesthuis et al. 2012'),
+    'hollow_0.70mm': _literature(0.7e-3, 0.48e-3, 200e9, 2e4, 'ustk, needle of 22 gauge'),
+    'hollow_1.05mm': _literature(1.05e-3, 0.838e-3, 200e9, 2e4, 'ustk, needle of 19 gauge'),
+}
+
+
+def find_needle(name: str) -> NeedlePreset:
+    """
+    Return a needle of `NEEDLES`, or of a YAML file.
+
+    A file has names and values of constants, and the name of the needle to which the other
+    constants belong as ``needle`` (default bending_35mm). A ROS parameter file is accepted, too.
+
+    Parameters
+    ----------
+    name : str
+        Key of `NEEDLES`, or file name (.yaml).
+
+    Returns
+    -------
+    NeedlePreset
+        The constants.
+
+    Raises
+    ------
+    ParameterError
+        If the needle is unknown, or the file is not valid.
+
+    Examples
+    --------
+    >>> find_needle('bending_35mm').steering.free_length
+    0.04
+
+    """
+    if not isinstance(name, str) or (name not in NEEDLES and not name.endswith(FILES)):
+        near = get_close_matches(str(name), NEEDLES, 1)
+        meant = f'; did you mean {near[0]}?' if near else ''
+        raise ParameterError(f'needle must be {NEEDLE_HELP}, got {name!r}{meant}')
+    if name in NEEDLES:
+        return NEEDLES[name]
+    try:
+        document = read_document(Path(name).expanduser().read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise ParameterError(f'needle {name} cannot be read: {error}') from error
+    return _based(name, document)
+
+
+def usable_needle(name: str) -> str:
+    """Return the name of a valid needle, or of the paper's: nodes reject names in `configure`."""
+    try:
+        find_needle(name)
+    except ParameterError:
+        return PAPER_NEEDLE
+    return name
+
+
+def _based(name: str, document: object) -> NeedlePreset:
+    given = document if isinstance(document, dict) else {}
+    values: dict[str, Any] = {str(key): value for key, value in given.items()}
+    sections = [
+        part['ros__parameters']
+        for part in values.values()
+        if isinstance(part, dict) and isinstance(part.get('ros__parameters'), dict)
+    ]
+    if sections:
+        found = {str(key): value for part in sections for key, value in part.items()}
+        values = {
+            key.rpartition('.')[2]: value
+            for key, value in found.items()
+            if key == 'needle' or key.startswith(_PREFIXES)
+        }
+    base = str(values.pop('needle', DEFAULT_NEEDLE))
+    if base not in NEEDLES or not values:
+        raise ParameterError(
+            f'{name} must have constants by name, and as needle one of {", ".join(NEEDLES)}'
+        )
+    try:
+        return NEEDLES[base].changed(values)._replace(source=name)
+    except ParameterError as error:
+        raise ParameterError(f'{name}: {error}') from error
+
+
+#: Help text of the choice of a needle.
+NEEDLE_HELP: Final = f'one of {", ".join(NEEDLES)}, or a file of your own (.yaml)'

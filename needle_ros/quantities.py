@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quantities with units as text, such as ``4mm``, ``3N`` and ``20 s``, and targets of the tip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isfinite
+import re
+from typing import Final
+
+from needle_ros.errors import ParameterError
+
+_LENGTHS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6}
+
+#: Name and example of a quantity, and its accepted units with their factors, by SI unit.
+_KINDS: Final[Mapping[str, tuple[str, str, Mapping[str, float]]]] = {
+    'm': ('length', '0.05 or 50mm', _LENGTHS),
+    's': ('time', '20 or 20s', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'min': 60.0}),
+    'N': ('force', '3 or 3N', {'N': 1.0, 'mN': 1e-3}),
+    'm/s': ('velocity', '0.005 or 5mm/s', {f'{name}/s': _LENGTHS[name] for name in _LENGTHS}),
+}
+
+#: Example of a quantity by SI unit, as the word for its value in a help text.
+EXAMPLES: Final = {unit: example.split()[-1] for unit, (_, example, _) in _KINDS.items()}
+
+#: Help text of a target.
+TARGET_HELP: Final = 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm; m without a unit'
+
+
+def quantity(text: str, unit: str) -> float:
+    """Return a number in an SI unit from text with or without a unit, or nan and infinity."""
+    kind, example, known = _KINDS.get(unit, ('quantity', f'1.5 or 1.5{unit}', {unit: 1.0}))
+    units = '|'.join(re.escape(name) for name in known if name != '1')
+    found = re.fullmatch(f'(.*?) *({units})?', text.strip())
+    try:
+        if found:
+            return float(found[1]) * known[found[2] or unit]
+    except ValueError:
+        pass
+    raise ParameterError(f'{text.strip()!r} is not a {kind}, such as {example}')
+
+
+def quantities(text: str, unit: str) -> list[float]:
+    """Return the numbers of a list, separated by commas or blanks, as `quantity`."""
+    return [quantity(word, unit) for word in re.split(r' *, *| +(?=[-+.\d])', text.strip())]
+
+
+def target(text: str) -> tuple[float, float, float]:
+    """Return x, y, z of a target of the tip [m], from three lengths or from the depth y alone."""
+    found = quantities(text, 'm')
+    if len(found) == 1:
+        found = [0.0, found[0], 0.0]
+    if len(found) != 3 or not all(map(isfinite, found)):
+        raise ParameterError(f'{text!r} is not a target: {TARGET_HELP}')
+    x, y, z = found
+    return x, y, z

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests that wait for the first sample after their stamp."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeAlias
+
+from needle_ros.contract import REQUEST_AGE, Topic
+from needle_ros.requests import RequestLog, Verdict
+from needle_ros.timing import NANOSECONDS
+
+#: Executes a request: an object of the caller, and the time since the stamp [s].
+RequestAction: TypeAlias = Callable[[Any, float], None]
+
+
+class WaitingRequest(NamedTuple):
+    """
+    A received request: topic, stamp [ns], moved joints, and action.
+
+    The action raises its errors; the time of a request that has waited is 0.
+    """
+
+    topic: Topic
+    stamp: int
+    joints: tuple[str, ...]
+    act: RequestAction
+
+    def elapsed(self, now: int) -> float:
+        """Return the time since the stamp [s]; 0 without a stamp, or before it."""
+        return max(0, now - self.stamp) / NANOSECONDS if self.stamp else 0.0
+
+
+class WaitingRequests:
+    """Requests of a log that are not executed yet: the newest of each joint."""
+
+    def __init__(self, requests: RequestLog) -> None:
+        self._requests = requests
+        self._waiting: list[WaitingRequest] = []
+
+    def add(
+        self, topic: Topic, stamp: int, joints: Iterable[str], act: RequestAction
+    ) -> WaitingRequest:
+        """Add a request; it replaces those of the same joints."""
+        request = WaitingRequest(topic, stamp, tuple(joints), act)
+        replaced = [one for one in self._waiting if {*one.joints} & {*request.joints}]
+        for one in replaced:
+            self._drop(one, f'a newer {topic.name} is followed', Verdict.SUPERSEDED)
+        self._waiting.append(request)
+        self._requests.answer(topic, stamp, Verdict.RECEIVED)
+        return request
+
+    def take(self, stamp: int) -> WaitingRequest | None:
+        """Return and remove a request that was sent before a stamp [ns], if any."""
+        for one in self._waiting:
+            if one.stamp - stamp > REQUEST_AGE * NANOSECONDS:
+                # The clock was set back after its arrival.
+                self._drop(one, 'the clock was set back', Verdict.REJECTED)
+                break
+            if one.stamp < stamp:
+                self._waiting.remove(one)
+                return one
+        return None
+
+    def discard(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
+        """Discard all requests, and answer them."""
+        for one in [*self._waiting]:
+            self._drop(one, reason, verdict)
+
+    def _drop(self, one: WaitingRequest, reason: str, verdict: Verdict) -> None:
+        self._waiting.remove(one)
+        self._requests.answer(one.topic, one.stamp, verdict, reason)

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values of YAML documents."""
+
+from needle_ros.documents import read_document
+import pytest
+
+
+@pytest.mark.parametrize(
+    ('text', 'value'),
+    [
+        ('4e-5', 4e-5),
+        ('-1E+3', -1e3),
+        ('2.e4', 2e4),
+        ('.5e1', 5.0),
+        ('1.5e3', 1.5e3),
+        ('"4e-5"', '4e-5'),
+        ('1e', '1e'),
+        ('e5', 'e5'),
+        ('12e3x', '12e3x'),
+        ('1e-3-1', '1e-3-1'),
+    ],
+)
+def test_numbers_with_an_exponent_are_read(text: str, value: object) -> None:
+    """As in YAML 1.2, also without a point or a sign, and within lists and mappings."""
+    assert read_document(text) == value
+    assert read_document(f'{{a: [{text}, 1]}}') == {'a': [value, 1]}
