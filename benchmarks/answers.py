@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Time from a trajectory to the status "accepted" or "rejected" of the controller.
 
@@ -22,7 +23,7 @@ from needle_insertion.report.text import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
 from needle_ros.requests import Verdict
-from needle_ros.status import ControllerPhase, ControllerStatus
+from needle_ros.status import ControllerPhase, ControllerStatus, node_of
 from needle_ros.timing import nanoseconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -59,7 +60,7 @@ def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, lis
 
         def hear(array: DiagnosticArray) -> None:
             for status in array.status:
-                if status.name == '/controller':
+                if node_of(status.name) == '/controller':
                     values = {one.key: one.value for one in status.values}
                     found = ControllerStatus.from_values(values)
                     active.append(found.phase is ControllerPhase.ACTIVE)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 All nodes at once for ten minutes: memory, lost samples, and latency at the start and at the end.
 
@@ -30,7 +31,7 @@ from needle_ros.status import NodeStatus, PlantStatus, SteeringPhase, SteeringSt
 import numpy as np
 
 #: Needle of all nodes.
-_NEEDLE: Final[dict[str, object]] = {'model.preset': 'bending_35mm'}
+_NEEDLE: Final[dict[str, object]] = {'needle': 'bending_35mm'}
 
 #: Targets of the tip [m].
 _TARGETS: Final = ((1.5e-3, 0.07, -1e-3), (-1e-3, 0.06, 1e-3), (0.0, 0.065, 0.0))

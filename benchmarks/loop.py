@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plant and supervisor connected by serialized messages, without ROS, faster than real time."""
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class Loop:
             'model.coulomb_friction': friction * phantom.coulomb_friction,
             'model.viscous_friction': friction * phantom.viscous_friction,
         }
-        own = {'model.preset': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed}
+        own = {'needle': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed}
         self.run = PlantRun({**own, **true})
         self.now, self._period = EPOCH, round(NANOSECONDS / rate)
         self.publishers = {'wrench_command': 1}

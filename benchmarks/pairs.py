@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run a plant and a controller as processes, of this package or bare, and measure them."""
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _OURS: Final[Mapping[str, dict[str, object]]] = {
     'needle': {},
     'needle, steered': {
         'steered': True,
-        'model.preset': 'bending_35mm',
+        'needle': 'bending_35mm',
         'steering.bevel_load': [0.3],
     },
 }
@@ -48,6 +49,9 @@ TARGETS: Final = (0.06, 0.09)
 
 #: Settling time at the start of a turn [s].
 _SETTLE: Final = 0.5
+
+#: Least number of messages of each topic in a turn.
+_FEWEST: Final = 10
 
 
 def cpu_seconds(process: int) -> float:
@@ -189,7 +193,7 @@ class Pair:
         """
         Measure the CPU load of each process for a duration [s], in % of one core, after settling.
 
-        Only messages of the measurement remain in `seen`.
+        Only messages of the measurement remain in `seen`; it lasts until each topic has some.
         """
         self.until(lambda: all(seen.values()), f'{", ".join(seen)}')
         self.spin(_SETTLE)
@@ -198,6 +202,7 @@ class Pair:
         spent = {what: cpu_seconds(pid) for what, pid in self.pids.items()}
         begin = time.monotonic()
         self.spin(duration)
+        self.until(lambda: all(len(rows) >= _FEWEST for rows in seen.values()), 'enough messages')
         wall = time.monotonic() - begin
         return {
             f'CPU of the {what} [%]': 100.0 * (cpu_seconds(pid) - spent[what]) / wall

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steered insertions in which one message is dropped, delayed or duplicated by a relay between nodes.
 
@@ -60,7 +61,7 @@ _CHECK: Final = 2e-3
 
 _RATE: Final = 200.0
 _PLANT: Final[dict[str, object]] = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'mode': 'simulation',
     'steered': True,
     'lockstep': True,
@@ -73,7 +74,7 @@ _PLANT: Final[dict[str, object]] = {
     'guide.speed_limit': 0.1,
 }
 _STEERING: Final[dict[str, object]] = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'use_sim_time': True,
     'step_length': 0.01,
     'speed': 0.05,
@@ -83,7 +84,7 @@ _STEERING: Final[dict[str, object]] = {
     'settle_time': 0.02,
 }
 _CONTROLLER: Final[dict[str, object]] = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'use_sim_time': True,
     'steered': True,
     'rate': _RATE,

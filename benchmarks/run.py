@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command `needle bench`: run benchmarks, print a page, and check the bars."""
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ MODULES = {
     'commissioning': ('commissioning',),
     'graph': ('graph',),
     'slicer': ('slicer',),
-    'study': ('study', 'environments'),
+    'study': ('study', 'environments', 'policies'),
     'pool': ('pool',),
 }
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Test the node `slicer` for minutes: targets in, shapes out, and kills of both sides."""
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 #: A flexible needle at rest.
 _PLANT: Final = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'steered': True,
     'mode': 'robot',
     'rate': 200.0,

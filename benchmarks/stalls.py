@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Velocity of the needle after stalls: suspended nodes and lost messages during an insertion.
 
@@ -31,13 +32,13 @@ from needle_controller import (
 )
 from needle_controller.controller import LAWS
 from needle_controller.steering.motion import smooth
-from needle_controller.waiting_request import JointPath
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.run import Event, PARAMETERS
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.trajectories import JointPath
 import numpy as np
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -241,7 +242,7 @@ def draw(rng: np.random.Generator, victim: str, shortest: float, longest: float)
 _BUSY: Final = 'while True: pass'
 
 #: Parameters of all nodes for a needle that is steered.
-_STEERED: Final = {'model.preset': 'bending_35mm'}
+_STEERED: Final = {'needle': 'bending_35mm'}
 
 
 class RealNodes:

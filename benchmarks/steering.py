@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Laws that steer the tip to a target, compared on the same needles."""
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import GroundTruth, sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
-from needle_dynamics.steering.parameters import NEEDLES, tissue_of
+from needle_dynamics.needles import NEEDLES
+from needle_dynamics.steering.parameters import tissue_of
 from needle_ros.process_pool import processes
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -127,7 +129,7 @@ class SteeringOutcome(NamedTuple):
 @lru_cache
 def nominal(medium: str, bevel: float = 0.0) -> tuple[NeedleParameters, SteeringParameters]:
     """Return the nominal parameters in a medium, with the load of a bevel [N]."""
-    needle = NEEDLES['phantom']
+    needle = NEEDLES['phantom'].needle
     (_, first), *others = MEDIA[medium]
     ei = needle.bending_stiffness
     needle = replace(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cost of the steered needle, compared with the same model in NumPy and SciPy."""
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from needle_dynamics import (
     FloatArray,
     insert_batch,
     NeedleParameters,
+    NEEDLES,
     SteeredNeedle,
-    STEERING_PRESETS,
 )
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -117,7 +118,7 @@ class HermiteNeedle:
 
 def compare(tick: Tick) -> Answer:
     """Measure an insertion, a solution and a batch."""
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    needle, steering, _ = NEEDLES['bending_35mm']
     steering = replace(steering, bevel_load=(0.1,))
     step = _DEPTH / _STEPS
     depths = np.linspace(0.0, _DEPTH, _STEPS + 1)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Nodes of a steered insertion in simulated time: robot, axial supervisor and steering executive.
 
@@ -29,8 +30,7 @@ from needle_controller import (
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.steering.motion import JointMotion
 from needle_controller.supervisor import Supervisor
-from needle_controller.waiting_request import JointPath
-from needle_dynamics import STEERING_PRESETS
+from needle_dynamics import NEEDLES
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
 from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_ros.contract import (
@@ -50,6 +50,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.system_state import Authority, Mode
 from needle_ros.timing import NANOSECONDS
+from needle_ros.trajectories import JointPath
 from needle_ros.wire import Reading
 
 #: Rate of samples [Hz], and start time [ns].
@@ -88,7 +89,7 @@ _KEPT_ELSE: Final = 10
 #: Joints of the guide.
 _GUIDE: Final = frozenset(GUIDE_JOINTS)
 
-NEEDLE, STEERING_CONSTANTS, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, STEERING_CONSTANTS, _ = NEEDLES['bending_35mm']
 
 #: Speed of the insertion [m/s], and settings of the steering executive.
 SPEED: Final = 0.02
@@ -109,7 +110,7 @@ _SLIDE: Final = HardwareSettings(
 #: True needle: softer tissue than the nominal needle, a tilted guide and a bevel.
 _WORLD: Final = {
     'steered': True,
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'model.tissue_stiffness': 0.8 * NEEDLE.tissue_stiffness,
     'steering.bevel_load': [0.15],
     'rate': RATE,

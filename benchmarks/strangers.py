@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Effect of unexpected publishers and killed nodes on a real plant and controller."""
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import ControllerStatus, NodeStatus, read_status
+from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status
 from sensor_msgs.msg import JointState
 
 #: Publishes force commands repeatedly: for 6 to 48 ms, or for the first 80 ms after its start.
@@ -190,7 +191,9 @@ class Bystander:
     @property
     def complaints(self) -> str:
         """Last message of each node."""
-        last = {status.name: status.message for one in self._health for status in one.status}
+        last = {
+            node_of(status.name): status.message for one in self._health for status in one.status
+        }
         return '; '.join(f'{name}: {message!r}' for name, message in last.items())
 
     @property

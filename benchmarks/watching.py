@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 CPU cost of `needle watch` with an open page to the plant.
 
@@ -37,7 +38,7 @@ LARGEST: Final = 1.1
 ROUNDS, TURN, SETTLE = 5, 6.0, 4.0
 
 #: A flexible needle, inserted half way.
-_NEEDLE: Final[dict[str, object]] = {'model.preset': 'bending_35mm'}
+_NEEDLE: Final[dict[str, object]] = {'needle': 'bending_35mm'}
 _PLANT: Final = {**_NEEDLE, 'steered': True, 'depth': 0.06}
 
 _BROWSERS: Final = ('chromium', 'chromium-browser', 'google-chrome')

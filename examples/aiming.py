@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steer the tip of a needle to a target, in tissue that is softer than the nominal model.
 
@@ -7,7 +8,7 @@ The guide moves after each tip measurement. With a fixed guide the error is seve
 from dataclasses import replace
 
 from needle_controller import MultiHypothesisLaw, SIMULATION_LIMITS, SteeringModel
-from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import NEEDLES, SteeredNeedle
 import numpy as np
 
 TARGET = np.array([2e-3, -3e-3])
@@ -16,7 +17,7 @@ DEPTHS = np.linspace(0.0, 0.1, 21)
 
 def main() -> None:
     """Insert to 100 mm in steps of 5 mm, to x = 2 mm and z = -3 mm."""
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    needle, steering, _ = NEEDLES['bending_35mm']
     model = SteeringModel(needle, steering, DEPTHS)
     controller = MultiHypothesisLaw(model, TARGET, SIMULATION_LIMITS)
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Infer bending length and path noise from tip measurements by simulation-based inference.
 
@@ -18,7 +19,7 @@ import time
 from typing import Any
 
 from matplotlib.figure import Figure
-from needle_dynamics import FloatArray, insert_batch, STEERING_PRESETS
+from needle_dynamics import FloatArray, insert_batch, NEEDLES
 from needle_dynamics.steering.parameters import with_lengths
 from needle_study.study import made
 import numpy as np
@@ -45,7 +46,7 @@ NOISE = 4e-5
 LAYER, STIFFER = 0.04, 2.0
 
 #: Needles for training, needles for the test, and samples of each posterior.
-NEEDLES, TRIALS, DRAWS = 20_000, 1000, 1000
+DRAWN, TRIALS, DRAWS = 20_000, 1000, 1000
 
 
 def population(count: int, seed: int) -> dict[str, FloatArray]:
@@ -64,7 +65,7 @@ def guides() -> FloatArray:
 
 def looks(drawn: dict[str, FloatArray], seed: int) -> FloatArray:
     """Simulate insertions; return tip measurements [m], shape (needles, measurements, 2)."""
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    needle, steering, _ = NEEDLES['bending_35mm']
     k = needle.tissue_stiffness
     needle = replace(needle, layer_depths=(LAYER,), layer_stiffnesses=(STIFFER * k,))
     steering = replace(steering, skin_stiffness=0.02 * k)
@@ -133,7 +134,7 @@ def learn(values: FloatArray, numbers: FloatArray) -> Any:
 def main() -> None:
     """Simulate the population, train the network, and test the coverage."""
     begin = time.monotonic()
-    drawn = population(NEEDLES + TRIALS, seed=1)
+    drawn = population(DRAWN + TRIALS, seed=1)
     values, numbers = unknown(drawn), summary(looks(drawn, seed=2))
     simulated = time.monotonic()
     draw = learn(values[TRIALS:], numbers[TRIALS:])

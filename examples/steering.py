@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steer a needle with its guide, in tissue that it cuts.
 
@@ -6,12 +7,12 @@ of the guide moves the tip in the same direction near the skin, and in the oppos
 larger depths.
 """
 
-from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import NEEDLES, SteeredNeedle
 
 
 def main() -> None:
     """Insert to 100 mm, with a shift of the guide by 2 mm at a depth of 30 mm."""
-    needle, steering, source = STEERING_PRESETS['bending_35mm']
+    needle, steering, source = NEEDLES['bending_35mm']
     print(f'needle and tissue: {source}')
 
     one = SteeredNeedle(needle, steering)

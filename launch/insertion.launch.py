@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Launch plant and controller, and optionally steering, a recorder and RViz."""
 
 import os
@@ -32,9 +33,9 @@ ARGUMENTS = {
         'mode of the plant; the controller runs only in simulation',
         ['', 'simulation', 'robot', 'indenter'],
     ),
-    'preset': (
+    'needle': (
         '',
-        'constants of the model in plant and controller, such as phantom or bending_35mm',
+        'needle and tissue of all nodes, by name or file, such as phantom or bending_35mm',
         [],
     ),
     'steered': (
@@ -73,13 +74,13 @@ ARGUMENTS = {
 PARAMETERS = {
     'plant': {
         'mode': 'mode',
-        'preset': 'model.preset',
+        'needle': 'needle',
         'steered': 'steered',
         'lockstep': 'lockstep',
         'real_time_factor': 'real_time_factor',
     },
-    'controller': {'preset': 'model.preset', 'law': 'law', 'use_sim_time': 'use_sim_time'},
-    'steering': {'preset': 'model.preset', 'use_sim_time': 'use_sim_time'},
+    'controller': {'needle': 'needle', 'law': 'law', 'use_sim_time': 'use_sim_time'},
+    'steering': {'needle': 'needle', 'use_sim_time': 'use_sim_time'},
     'recorder': {'bag': 'path', 'use_sim_time': 'use_sim_time'},
 }
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Launch the plant as ros2_control hardware, with stock controllers and robot_state_publisher."""
 
 import os
@@ -14,7 +15,7 @@ from launch.actions import (
 from launch.substitutions import Command, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
+from needle_dynamics import find_needle, NEEDLES
 from needle_ros.network import LOCAL, RANGE, stay_local
 
 #: Default, description and valid values of each argument; an empty list allows any value.
@@ -29,9 +30,10 @@ ARGUMENTS = {
         'the needle bends and cuts a curved path, and the guide moves',
         ['true', 'false'],
     ),
-    'preset': ('phantom', 'preset of needle and tissue parameters', [*NEEDLES]),
+    'needle': ('phantom', 'constants of needle and tissue', [*NEEDLES]),
     'depth': ('0.02', 'initial insertion depth [m]', []),
     'namespace': ('', 'namespace of all nodes', []),
+    'frame_prefix': ('', 'prefix of all frames on /tf, such as left/', []),
     'discovery': (
         '',
         'SUBNET includes other machines; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
@@ -75,16 +77,19 @@ def start(context: LaunchContext) -> list[Action]:
     if lacking:
         raise RuntimeError(f'this launch file needs {", ".join(lacking)}, not installed')
     share = get_package_share_path('needle_insertion')
-    mode, preset, steered = given['mode'], given['preset'], given['steered'] == 'true'
-    needle = NEEDLES[preset]
-    known = STEERING_PRESETS.get(preset)
-    steering = known.steering if known else SteeringParameters()
+    mode, name, steered = given['mode'], given['needle'], given['steered'] == 'true'
+    needle, steering, _ = find_needle(name)
     described = {
         'mode': mode,
         'steered': given['steered'],
         'length': needle.length,
         'minimum_depth': needle.minimum_depth,
         'free_length': steering.free_length,
+        'density': needle.density,
+        'area': needle.area,
+        'area_moment': needle.area_moment,
+        'rotary_inertia': needle.rotary_inertia,
+        'carriage_mass': needle.carriage_mass,
     }
     words = [f' {name}:={value}' for name, value in described.items()]
     urdf = Command(['xacro ', str(share / 'description/needle_insertion.urdf.xacro'), *words])
@@ -92,9 +97,10 @@ def start(context: LaunchContext) -> list[Action]:
     plant = {
         'mode': mode,
         'steered': steered,
-        'model.preset': preset,
+        'needle': name,
         'depth': float(given['depth']),
         'publish_tf': True,
+        'frame_prefix': given['frame_prefix'],
     }
     common = {'namespace': given['namespace'], 'on_exit': Shutdown()}
     nodes = [
@@ -109,7 +115,12 @@ def start(context: LaunchContext) -> list[Action]:
         Node(
             package='robot_state_publisher',
             executable='robot_state_publisher',
-            parameters=[{'robot_description': ParameterValue(urdf, value_type=str)}],
+            parameters=[
+                {
+                    'robot_description': ParameterValue(urdf, value_type=str),
+                    'frame_prefix': given['frame_prefix'],
+                }
+            ],
             **common,
         ),
         Node(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Axial controller: reference, control laws and limits; one command per measurement."""
 
 from __future__ import annotations
@@ -346,6 +347,11 @@ class Controller:
 
         """
         self.guide.follow(times, positions, velocities)
+        self._last_depth = None
+
+    def stop_motion(self) -> None:
+        """Brake to rest and hold; see `ReferenceGenerator.stop_motion`."""
+        self.guide.stop_motion()
         self._last_depth = None
 
     def forget(self) -> None:

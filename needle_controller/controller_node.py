@@ -1,8 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `controller`: compute needle forces from encoder measurements and a target."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields
 import sys
 from time import sleep
@@ -19,29 +21,29 @@ from needle_controller.controller import (
 )
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import HardwareSettings
-from needle_controller.hardware_node import CONTRACT, Driver
+from needle_controller.hardware_node import await_topics, CONTRACT, Driver
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.generator import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
-from needle_controller.waiting_request import JointPath
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.base_node import steady_timer
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
+from needle_ros.preparation import PreparationProgress
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.status import ControllerStatus, Diagnosis
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.system_state_node import SystemStateTopics
-from needle_ros.timing import nanoseconds, seconds
-from needle_ros.trajectories import MOST_POINTS
+from needle_ros.timing import nanoseconds
+from needle_ros.trajectories import JointPath
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.subscription import Subscription
+from rclpy.publisher import Publisher
 from trajectory_msgs.msg import JointTrajectory
 
 _RETRACT = 'retract_depth'
@@ -109,12 +111,15 @@ class ControllerNode(ModelNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('controller', **node_options)
-        self.declare_text('law', LAWS[0], f'one of {", ".join(LAWS)}')
-        self.declare_text('reference.kind', 'trapezoid', f'one of {", ".join(REFERENCES)}')
+        self.declare_text('law', LAWS[0], f'one of {", ".join(LAWS)}', LAWS)
+        self.declare_text(
+            'reference.kind', 'trapezoid', f'one of {", ".join(REFERENCES)}', REFERENCES
+        )
         self.declare_text(
             'deflection_feedback',
             FEEDBACKS[0],
             f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)',
+            FEEDBACKS,
         )
         self.declare_text(
             'steered',
@@ -125,7 +130,9 @@ class ControllerNode(ModelNode):
             _RETRACT,
             RETRACT_DEPTH,
             ParameterDescriptor(
-                description='insertion depth of ~/retract [m]', dynamic_typing=True
+                description='insertion depth of ~/retract [m]',
+                dynamic_typing=True,
+                additional_constraints='a number',
             ),
         )
         self.declare_settings('', ControllerSettings())
@@ -141,19 +148,12 @@ class ControllerNode(ModelNode):
         self.declare_model()
 
         self._supervisor = supervisor = Supervisor()
-        self._truths: Subscription | None = None
-        #: Adapter of a robot with its own topics; the error if it could not be created.
+        #: Adapter of a robot with its own topics.
         self._driver: Driver | None = None
-        self._no_driver: NeedleError | None = None
-        self._hardware = HardwareSettings()
+        self._command: Publisher | None = None
         self._checks, self._missing = 0, ''
-        self._connect()
-        self._reference = self.publisher(contract.REFERENCE)
-        self._tracking_error = self.publisher(contract.TRACKING_ERROR)
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._write_aim = contract.REFERENCE.template().serialize
-        self.subscribe(contract.TARGET, self._on_target)
-        self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
         self._system = SystemStateTopics(
             self,
             supervisor.authority,
@@ -161,14 +161,15 @@ class ControllerNode(ModelNode):
             lambda: self._act(supervisor.obey(self.now())),
         )
 
+    def preparation(self) -> Iterator[PreparationProgress]:
+        """Load or compile functions, and find the topics of a robot."""
+        yield from super().preparation()
+        # `configure` raises the error of an invalid parameter.
+        with suppress(NeedleError):
+            await_topics(self, self.settings('hardware.', HardwareSettings))
+
     def _connect(self) -> None:
-        """Offer the commands and subscribe to measurements; `configure` raises the errors."""
-        try:
-            self._hardware = self.settings('hardware.', HardwareSettings)
-            if self._hardware != HardwareSettings():
-                self._driver = Driver(self, self._hardware)
-        except NeedleError as error:
-            self._no_driver = error
+        """Offer the commands and subscribe to measurements."""
         self._topics = topics = self._driver.topics if self._driver is not None else CONTRACT
         offer_lease(self, topics.commander)
         commanders = Publishers(self, topics.commander, self._check_inputs)
@@ -191,18 +192,17 @@ class ControllerNode(ModelNode):
         self.listen(
             contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs
         )
+        self._reference = self.publisher(contract.REFERENCE)
+        self._tracking_error = self.publisher(contract.TRACKING_ERROR)
+        self.subscribe(contract.TARGET, self._on_target)
+        self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
 
     # Transitions.
 
     def configure(self) -> None:
         """Create the controller from the parameters; reject unstable gains."""
-        if self.settings('hardware.', HardwareSettings) != self._hardware:
-            raise ParameterError(
-                'hardware.* is read when the node starts: set it on the command line or in the '
-                'parameter file'
-            )
-        if self._no_driver is not None:
-            raise self._no_driver
+        hardware = self.settings('hardware.', HardwareSettings)
+        self._driver = Driver(self, hardware) if hardware != HardwareSettings() else None
         feedback = self.text('deflection_feedback', FEEDBACKS)
         controller = Controller(
             self.model_parameters(),
@@ -224,9 +224,9 @@ class ControllerNode(ModelNode):
             self._driver.configure(controller, facts, limits)
             robot = self._driver.robot
         self._supervisor.configure(controller, limits, observed, robot)
+        self._connect()
         if feedback == 'ground_truth':
-            take = self._passing(self._supervisor.truth)
-            self._truths = self.listen(contract.GROUND_TRUTH, take)
+            self.listen(contract.GROUND_TRUTH, self._passing(self._supervisor.truth))
 
     def _gains(self, changes: Mapping[str, Any] | None = None) -> dict[str, dict[str, Gains]]:
         gains: dict[str, dict[str, Gains]] = {}
@@ -263,11 +263,9 @@ class ControllerNode(ModelNode):
             self._driver.robot.set_model(parameters)
 
     def cleanup(self) -> None:
-        """Discard the controller, the load estimate and its source."""
+        """Discard the controller, its robot, and the load estimate."""
         self._supervisor.cleanup()
-        if self._truths is not None:
-            self.destroy_subscription(self._truths)
-            self._truths = None
+        self._driver = self._command = None
 
     def activate(self) -> None:
         """Start to answer measurements and to check for missing inputs."""
@@ -281,9 +279,10 @@ class ControllerNode(ModelNode):
         target = '' if values['steered'] else f'{contract.TARGET.name}, '
         hardware = ''
         if self._driver is not None:
-            hardware = f' ({self._hardware.command} of {", ".join(self._hardware.joints)})'
+            robot = self._driver.robot.settings
+            hardware = f' ({robot.command} of {", ".join(robot.joints)})'
         return (
-            f'law {values["law"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz, delay '
+            f'law {values["law"]}, needle {values["needle"]}, {values["rate"]:g} Hz, delay '
             f'{values["delay"]:g}; takes {target}{contract.JOINT_TRAJECTORY.name} and '
             f'{self._topics.state.name}, publishes {self._topics.command.name}{hardware}'
         )
@@ -328,15 +327,7 @@ class ControllerNode(ModelNode):
         if message.joint_names and {*message.joint_names} <= _GUIDE:
             # The plant moves the guide of a steered needle.
             return
-        # One point above the limit is enough to reject it.
-        points = message.points[: MOST_POINTS + 1]
-        path = JointPath(
-            message.joint_names,
-            [seconds(point.time_from_start) for point in points],
-            [point.positions for point in points],
-            [point.velocities for point in points],
-        )
-        header = message.header
+        header, path = message.header, JointPath.from_message(message)
         self._act(
             self._supervisor.trajectory(
                 nanoseconds(header.stamp), header.frame_id, path, self.now()
@@ -367,7 +358,7 @@ class ControllerNode(ModelNode):
 
     def _act(self, answer: ForceCommand | None) -> None:
         """Publish a command, lines for the log, and answers to requests."""
-        if answer is not None:
+        if answer is not None and self._command is not None:
             stamp, force, torque, reference, error = answer
             driver, supervisor = self._driver, self._supervisor
             if driver is None:

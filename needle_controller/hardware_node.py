@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """ROS adapter for a robot driver with its own topics and message types."""
 
 from __future__ import annotations
@@ -81,12 +82,39 @@ CONTRACT: Final = Topics(
 )
 
 
+def await_topics(node: BaseNode, settings: HardwareSettings) -> None:
+    """Wait for the discovery of the topics that are found by their type, for a limited time."""
+    types = []
+    if settings.state_topic == BY_TYPE:
+        types.append(STATE_TYPES[settings.state_type])
+    if settings.wrench_topic == BY_TYPE:
+        types.append(contract.BASE_WRENCH.type_name)
+    deadline = monotonic() + _DISCOVERY
+    while not all(_published(node, one) for one in types) and monotonic() < deadline:
+        sleep(_LOOK)
+
+
+def _published(node: BaseNode, type_name: str) -> list[str]:
+    """Return the topics of a type that other nodes publish."""
+    own = node.get_name(), node.get_namespace()
+    return sorted(
+        name
+        for name, kinds in node.get_topic_names_and_types()
+        if type_name in kinds
+        and any(
+            (one.node_name, one.node_namespace) != own
+            for one in node.get_publishers_info_by_topic(name)
+        )
+    )
+
+
 class Driver:
     """
     Read and command a robot by its own `topics` and message types, for the node of a controller.
 
-    Raises `ParameterError` if a topic name is invalid, or there is not exactly one topic of its
-    type, and `MessageError` if the message type of the joint states is not installed.
+    A topic that is found by its type must be in the graph already, see `await_topics`. Raises
+    `ParameterError` if a topic name is invalid, or there is not exactly one topic of its type, and
+    `MessageError` if the message type of the joint states is not installed.
     """
 
     def __init__(self, node: BaseNode, settings: HardwareSettings) -> None:
@@ -123,31 +151,13 @@ class Driver:
         """Return the name of a topic; `BY_TYPE` selects the only topic of its type."""
         if name != BY_TYPE or topic is contract.WRENCH_COMMAND:
             return name
-        deadline = monotonic() + _DISCOVERY
-        while True:
-            found = self._published(type_name)
-            if len(found) == 1:
-                return found[0]
-            if found or monotonic() > deadline:
-                raise ParameterError(
-                    f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
-                    f'other nodes publish, found {", ".join(found) or "none"}'
-                )
-            sleep(_LOOK)
-
-    def _published(self, type_name: str) -> list[str]:
-        """Return the topics of a type that other nodes publish."""
-        node = self._node
-        own = node.get_name(), node.get_namespace()
-        return sorted(
-            name
-            for name, kinds in node.get_topic_names_and_types()
-            if type_name in kinds
-            and any(
-                (one.node_name, one.node_namespace) != own
-                for one in node.get_publishers_info_by_topic(name)
+        found = _published(self._node, type_name)
+        if len(found) != 1:
+            raise ParameterError(
+                f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
+                f'other nodes publish, found {", ".join(found) or "none"}'
             )
-        )
+        return found[0]
 
     # From the robot.
 
@@ -223,7 +233,7 @@ class Driver:
                 f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
                 f'{topic.type_name} (hardware.state_topic, hardware.state_type)'
             )
-        others = self._published(topic.type_name)
+        others = _published(node, topic.type_name)
         return (
             f'no node publishes {topic.name}; {topic.type_name} is published on '
             f'{", ".join(others) or "no topic"} (hardware.state_topic)'

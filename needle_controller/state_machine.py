@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base of the state machines: event log, request log, clock, and checks of the inputs."""
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from typing import Generic, TypeVar
 
 from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_ros.contract import ENTRY, INSERTION, Topic
+from needle_ros.errors import NeedleError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.system_state import Authority, Mode
@@ -103,7 +105,7 @@ class StateMachine(ABC, Generic[_Command]):
     def _is_new(self, topic: Topic, stamp: int, frame: str, now: int) -> bool:
         """Return whether a request must be executed; log why it is rejected."""
         known = self.requests.check(topic, stamp, now, frame, (INSERTION,))
-        if known is not None and known.verdict is Verdict.REJECTED:
+        if known is not None and known.verdict in (Verdict.REJECTED, Verdict.LATE):
             self.events.reject(f'{topic.name} rejected: {known.reason}')
         return known is None
 
@@ -111,10 +113,10 @@ class StateMachine(ABC, Generic[_Command]):
         """Acknowledge a request."""
         self.requests.answer(topic, stamp, verdict, joints=(INSERTION,))
 
-    def _reject(self, topic: Topic, stamp: int, reason: str) -> None:
+    def _reject(self, topic: Topic, stamp: int, reason: str | NeedleError) -> None:
         """Log and answer that a request is rejected."""
         self.events.reject(f'{topic.name} rejected: {reason}')
-        self.requests.answer(topic, stamp, Verdict.REJECTED, reason)
+        self.requests.reject(topic, stamp, reason)
 
     def clock_went_back(self, now: int, tolerance: int) -> float:
         """Return the step back of the clock since the last call [s], or 0; `tolerance` in ns."""

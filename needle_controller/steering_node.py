@@ -1,9 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `steering`: steer the tip to a target by motions of the guide."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import asdict
+import json
 import sys
 from typing import Any
 
@@ -11,29 +13,28 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.insertion_record import SteeringRecord
 from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.record_file import RecordFile
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.compiled_node import CompiledNode
+from needle_dynamics.needles import DEFAULT_NEEDLE, NEEDLE_HELP, usable_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
-from needle_dynamics.steering.parameters import (
-    DEFAULT_STEERING_PRESET,
-    NEEDLES,
-    SteeringParameters,
-)
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros import contract
 from needle_ros.base_node import steady_timer
-from needle_ros.errors import printable
+from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import Publishers
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
-from needle_ros.status import Diagnosis, SteeringStatus
+from needle_ros.status import Diagnosis, node_of, SteeringStatus
 from needle_ros.system_state import Authority
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS, nanoseconds
@@ -42,7 +43,7 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.duration import Duration as Delay
 from rclpy.publisher import Publisher
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
@@ -50,6 +51,10 @@ _WATCH = 0.05
 
 #: Longest time until a motion is acknowledged, in lock-step.
 _ARRIVAL = Delay(seconds=1.0)
+
+
+#: Shortest time between two warnings of a record that cannot be written [s].
+_SELDOM = 10.0
 
 
 class SteeringNode(CompiledNode):
@@ -71,7 +76,9 @@ class SteeringNode(CompiledNode):
     when a joint does not arrive, and by ``~/stop`` of any node. ``~/pause`` holds needle and
     guide, ``~/retract`` withdraws the needle to ``retract_depth`` and returns the guide to its
     zero. ``tip_expected`` is the expected position of the tip at the target depth, if the law
-    predicts it.
+    predicts it. ``insertion_record`` and a file have the plan, the measurements and the estimate:
+    after a restart of the node, the target resumes the insertion if needle, guide and tip are
+    where the record leaves them.
 
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
@@ -86,36 +93,27 @@ class SteeringNode(CompiledNode):
         super().__init__('steering', **node_options)
         self.declare_settings('', ExecutiveSettings())
         self.declare_settings('prior.', SteeringPrior())
-        self.declare_parameter(
-            'law',
-            DEFAULT_LAW,
-            ParameterDescriptor(
-                description=f'steering law: one of {", ".join(STEERING_LAWS)}, or module:Class'
-            ),
+        self.declare_text(
+            'law', DEFAULT_LAW, f'steering law: one of {", ".join(STEERING_LAWS)}, or module:Class'
         )
         # Fixed at start: it determines the other defaults.
         self.declare_parameter(
-            'model.preset',
-            DEFAULT_STEERING_PRESET,
-            ParameterDescriptor(description=f'one of {", ".join(NEEDLES)}', read_only=True),
+            'needle',
+            DEFAULT_NEEDLE,
+            ParameterDescriptor(
+                description=NEEDLE_HELP, additional_constraints=NEEDLE_HELP, read_only=True
+            ),
         )
-        preset = str(self.get_parameter('model.preset').value)
+        needle = usable_needle(self.text('needle'))
         for prefix, names in (('model.', OF_NEEDLE), ('steering.', OF_STEERING)):
-            self.declare_settings(prefix, defaults_of(prefix, preset), names)
+            self.declare_settings(prefix, defaults_of(prefix, needle), names)
 
         self._loop: SteeringExecutive | None = None
+        self._file = RecordFile(self.get_fully_qualified_name(), self.context.get_domain_id())
+        #: Record before a restart and the source of its measurements, until they are compared.
+        self._before: tuple[SteeringRecord, str] | None = None
         #: Expected tip of the last publication.
         self._told: TipEstimate | None = None
-        self._measurers = Publishers(self, contract.MEASURER, self._watch)
-        self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
-        self._tip_expected = self.publisher(contract.TIP_EXPECTED)
-        for topic, take in (
-            (contract.JOINT_STATES, SteeringExecutive.joints),
-            (contract.TIP_DEFLECTION, SteeringExecutive.tip),
-        ):
-            self.listen(topic, self._passing(take), self._watch)
-        self.subscribe(contract.TARGET, self._on_target)
-        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
         #: State of the system, also before the node is configured.
         self._authority = Authority()
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
@@ -130,11 +128,11 @@ class SteeringNode(CompiledNode):
 
     def configure(self) -> None:
         """Create the steering executive from the parameters."""
-        preset, values = self.text('model.preset', tuple(NEEDLES)), self.values()
+        name, values = self.text('needle'), self.values()
 
         def given(prefix: str, names: Collection[str]) -> dict[str, Any]:
             own = {name: values[f'{prefix}{name}'] for name in names}
-            return {**asdict(defaults_of(prefix, preset)), **own}
+            return {**asdict(defaults_of(prefix, name)), **own}
 
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
@@ -146,10 +144,25 @@ class SteeringNode(CompiledNode):
         find_law(law)
         self._loop = SteeringExecutive(needle, steering, prior, settings, start=ThreadJob, law=law)
         self._loop.authority = self._authority
+        self._measurers = Publishers(self, contract.MEASURER, self._watch)
+        self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
+        self._tip_expected = self.publisher(contract.TIP_EXPECTED)
+        self._record = self.publisher(contract.INSERTION_RECORD)
+        try:
+            self._before = self._file.read()
+        except MessageError as error:
+            self.get_logger().warning(f'the insertion before cannot be resumed: {error}')
+        for topic, take in (
+            (contract.JOINT_STATES, SteeringExecutive.joints),
+            (contract.TIP_DEFLECTION, SteeringExecutive.tip),
+        ):
+            self.listen(topic, self._passing(take), self._watch)
+        self.subscribe(contract.TARGET, self._on_target)
+        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
         """Discard the steering executive."""
-        self._loop = self._told = None
+        self._loop = self._told = self._before = None
 
     def activate(self) -> None:
         """Start to process measurements, and to check for missing inputs."""
@@ -170,7 +183,7 @@ class SteeringNode(CompiledNode):
         """Name constants, steps and topics."""
         values = self.values()
         return (
-            f'law {values["law"]}, preset {values["model.preset"]}, steps of '
+            f'law {values["law"]}, needle {values["needle"]}, steps of '
             f'{1e3 * values["step_length"]:g} mm; takes {contract.TARGET.name}, '
             f'{contract.JOINT_STATES.name} and {contract.TIP_DEFLECTION.name}, publishes '
             f'{contract.JOINT_TRAJECTORY.name} and {contract.TIP_EXPECTED.name}'
@@ -217,6 +230,7 @@ class SteeringNode(CompiledNode):
                 self._loop.requests.answer(contract.TARGET, stamp, Verdict.REJECTED, why)
                 self._act(None)
             return
+        self._recall(self._loop)
         header, point = message.header, message.point
         at = (point.x, point.y, point.z)
         self._act(self._loop.target(stamp, header.frame_id, at, self.now()))
@@ -229,7 +243,7 @@ class SteeringNode(CompiledNode):
             values = {one.key: one.value for one in status.values}
             answers = RequestStatus.from_values(values)
             if answers.takes:
-                node = printable(status.name.rpartition('/')[2])
+                node = printable(node_of(status.name).rpartition('/')[2])
                 self._act(self._loop.hear(node, answers, self.now()))
 
     def _on_request(self, word: str) -> tuple[bool, str]:
@@ -238,6 +252,33 @@ class SteeringNode(CompiledNode):
         success, line, move = self._loop.request(word, self.now())
         self._act(move)
         return success, line
+
+    @property
+    def _source(self) -> str:
+        """Identifiers of the publishers of the joint states."""
+        found = self.get_publishers_info_by_topic(contract.JOINT_STATES.name)
+        return ' '.join(sorted(bytes(one.endpoint_gid).hex() for one in found))
+
+    def _recall(self, loop: SteeringExecutive) -> None:
+        """Use the record before a restart, if the measurements are from the same source."""
+        source = self._source if self._before is not None else ''
+        if not source or self._before is None:
+            return
+        (record, owner), self._before = self._before, None
+        if owner == source:
+            loop.planner.recalled = record
+            self._record.publish(String(data=json.dumps(record.to_values())))
+
+    def _keep(self, record: SteeringRecord) -> None:
+        """Publish a record, and write it for a restart."""
+        text = json.dumps(record.to_values())
+        self._record.publish(String(data=text))
+        try:
+            self._file.write(text, self._source)
+        except ParameterError as error:
+            self.get_logger().warning(
+                f'the insertion cannot be resumed: {error}', throttle_duration_sec=_SELDOM
+            )
 
     def _obey(self) -> None:
         """Follow the state of the system."""
@@ -248,6 +289,7 @@ class SteeringNode(CompiledNode):
         """Check for missing inputs, for duplicate publishers, and for a plan that is computed."""
         if self._loop is None or not self.is_active:
             return
+        self._recall(self._loop)
         count = self._measurers.count
         self._loop.count_publishers(count(contract.JOINT_STATES), count(contract.TIP_DEFLECTION))
         # The state may have changed before the activation.
@@ -262,6 +304,10 @@ class SteeringNode(CompiledNode):
         loop = self._loop
         if loop is None:
             return
+        # Not of a node that is deactivated: its insertion can be resumed.
+        record = loop.keeper.changed(loop.fault) if self.is_active else None
+        if record is not None:
+            self._keep(record)
         if move is not None:
             self._trajectory.publish(self._message(move))
             self._moved = True

@@ -1,15 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
 """Axial supervisor, without ROS: input checks, stops, requests, force commands."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from time import monotonic
 from typing import Final
 
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
+from needle_controller.joint_path import follow_path
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
@@ -20,7 +23,6 @@ from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
-from needle_controller.waiting_request import AxialRequest, follow_path, JointPath, WaitingRequest
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
@@ -29,6 +31,8 @@ from needle_ros.requests import Verdict
 from needle_ros.status import ControllerPhase, ControllerStatus
 from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP
 from needle_ros.timing import NANOSECONDS
+from needle_ros.trajectories import JointPath
+from needle_ros.waiting_requests import RequestAction, WaitingRequests
 from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'
@@ -40,9 +44,8 @@ class Supervisor(StateMachine[ForceCommand]):
 
     Every event is a method: it takes the present time [ns] of the clock that stamps the messages,
     and returns a command. None leaves the last command unchanged. `events` contains lines for the
-    log; `fault` is the reason why no force is commanded, apart from a stop. Without a target,
-    during a fault, and from a stop until it is cleared, all forces are zero. `steady` is as for
-    `EventLog`.
+    log; `fault` is the reason why no force is commanded, apart from a stop. Forces are zero
+    without a target, during a fault, and from a stop to its clearance. `steady`: see `EventLog`.
     """
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
@@ -139,7 +142,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _begin(self, now: int) -> None:
         """Discard all measurements and requests."""
-        self._waiting = WaitingRequest(self.requests)
+        self._waiting = WaitingRequests(self.requests)
         self._time = now
         self.safety.begin(now)
         self._depth = None
@@ -163,14 +166,14 @@ class Supervisor(StateMachine[ForceCommand]):
         self._targets = targets
         topics = (TARGET, JOINT_TRAJECTORY) if targets else (JOINT_TRAJECTORY,)
         self._take_requests(dict.fromkeys(topics, (INSERTION,)))
-        self._waiting = WaitingRequest(self.requests)
+        self._waiting = WaitingRequests(self.requests)
 
     def target(
         self, stamp: int, frame: str, depth: float, deflection: float, now: int
     ) -> ForceCommand | None:
         """Take a target insertion depth [m]; its deflection [m] is ignored."""
 
-        def aim(controller: Controller) -> None:
+        def aim(controller: Controller, _elapsed: float) -> None:
             controller.set_target(depth)
             if deflection != 0.0:
                 self._warn(
@@ -182,44 +185,43 @@ class Supervisor(StateMachine[ForceCommand]):
         return self._request(TARGET, stamp, frame, now, aim)
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
-        """Take a path."""
-        return self._request(
-            JOINT_TRAJECTORY, stamp, frame, now, lambda controller: follow_path(controller, path)
-        )
+        """Take a path, which starts at its stamp."""
+        return self._request(JOINT_TRAJECTORY, stamp, frame, now, partial(follow_path, path))
 
     def _request(
-        self, topic: Topic, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
+        self, topic: Topic, stamp: int, frame: str, now: int, act: RequestAction
     ) -> ForceCommand | None:
         """Execute a request if it is new and valid, and acknowledge it."""
         answer = self._check_clock(now) if self._active is not None else None
         if not self._is_new(topic, stamp, frame, now):
             return answer
         # Valid from the first sample after its stamp on, in any order of arrival.
-        self._waiting.set(AxialRequest(topic, stamp, act))
+        request = self._waiting.add(topic, stamp, (INSERTION,), act)
         newest = self.safety.streams['joint_states'].last
-        waits = self._active is not None and self.safety.stop is None and newest >= 0
-        self._execute_request((newest if waits else stamp) + 1)
+        since = newest if newest >= 0 else now
+        waits = self._active is not None and self.safety.stop is None
+        self._execute_request((since if waits else stamp) + 1, request.elapsed(since))
         return answer
 
-    def _execute_request(self, stamp: int) -> None:
-        """Execute the request that was sent before a stamp [ns], if any, and acknowledge it."""
+    def _execute_request(self, stamp: int, elapsed: float = 0.0) -> None:
+        """Execute a request that was sent before a stamp [ns], if any, and acknowledge it."""
         request = self._waiting.take(stamp)
         if request is None:
             return
         if self.authority.mode is Mode.RETRACTING and not self._targets:
             # The motion is from the node `steering`, not from a user.
-            topic, stamp, _ = request
-            self.requests.answer(topic, stamp, Verdict.SUPERSEDED, 'the needle is retracted')
+            why = 'the needle is retracted'
+            self.requests.answer(request.topic, request.stamp, Verdict.SUPERSEDED, why)
             return
         try:
             if self._active is None:
                 raise JobError('the controller is not active')
             if self.safety.stop is not None:
                 raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
-            request.execute(self._active)
+            request.act(self._active, elapsed)
             self._end_retraction()
         except (JobError, ParameterError) as error:
-            self._reject(request.topic, request.stamp, str(error))
+            self._reject(request.topic, request.stamp, error)
         else:
             self._accept(request.topic, request.stamp)
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the command line `needle`: exit status 0 success, 1 failed job, 2 invalid usage or input."""
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any, Final, NoReturn
 
 from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.made import COMMAND
-from needle_ros.errors import JobError, NeedleError
+from needle_ros.errors import JobError, missing_ros, NeedleError
 from needle_ros.signals import ENDINGS
 
 #: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
@@ -68,6 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in ENDINGS}
     try:
         return _run(words)
+    except ModuleNotFoundError as error:
+        sys.stderr.write(f'error: {missing_ros(error, shlex.join(["needle", *words[:1]]))}\n')
+        return 1
     finally:
         for name, handler in previous.items():
             signal.signal(name, handler)
@@ -94,10 +98,6 @@ def _run(words: list[str]) -> int:
 
         argcomplete.autocomplete(parser)
     options = parser.parse_args([_as_value(word) for word in words])
-    if command is not None:
-        from needle_dynamics.compiled.cache import announce_compilation
-
-        announce_compilation()
     try:
         # From here on a signal must end the nodes that the command has started.
         for name in ENDINGS:
@@ -187,12 +187,8 @@ class _Version(argparse.Action):
 
 
 def _as_value(word: str) -> str:
-    """Prefix a negative number such as ``-5e-3`` with a space, or argparse reads an option."""
-    try:
-        float(word)
-    except ValueError:
-        return word
-    return f' {word}' if word.startswith('-') else word
+    """Prefix a negative number such as ``-5mm`` with a space, or argparse reads an option."""
+    return f' {word}' if re.match(r'-(\.?\d|inf|nan)', word) else word
 
 
 def _joined(words: list[str], signed: Sequence[str]) -> list[str]:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Entry points of the nodes: ``ros2 run needle_insertion plant``, or needle-plant."""
 
 from __future__ import annotations
@@ -25,4 +26,10 @@ def main() -> None:
     # Imports take a second: Ctrl-C ends them at once, without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     name = Path(sys.argv[0]).stem.removeprefix('needle-')
-    runpy.run_module(NODES[name], run_name='__main__')
+    try:
+        runpy.run_module(NODES[name], run_name='__main__')
+    except ModuleNotFoundError as error:
+        # Imported here: setup.py reads this file without the packages.
+        from needle_ros.errors import missing_ros
+
+        sys.exit(f'error: {missing_ros(error, f"needle-{name}")}')

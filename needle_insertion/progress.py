@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show the progress of a long job: its activity and the elapsed time."""
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ class ProgressLine:
     Write the activity of a job with the elapsed time, also while its thread is busy.
 
     On a terminal it is one line that changes; elsewhere a line for each new activity, and one
-    every ten seconds. The default stream is stderr.
+    every ten seconds. A `brief` line is on a terminal only, until the job ends. The default stream
+    is stderr.
     """
 
-    def __init__(self, title: str, stream: TextIO | None = None) -> None:
-        self._title, self._stream = title, stream or sys.stderr
+    def __init__(self, title: str, stream: TextIO | None = None, *, brief: bool = False) -> None:
+        self._title, self._stream, self._brief = title, stream or sys.stderr, brief
         self._terminal = self._stream.isatty()
+        #: Whether nothing is written.
+        self._silent = brief and not self._terminal
         self._text, self._kind = '', ''
         self._begin = self._written = monotonic()
         self._end = Event()
@@ -50,7 +54,8 @@ class ProgressLine:
         self._text = 'done' if kind is None else 'failed'
         self._write()
         if self._terminal:
-            self._stream.write('\n')
+            self._stream.write(_CLEAR if self._brief else '\n')
+            self._stream.flush()
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
         """Set the activity, as `Show`."""
@@ -66,6 +71,8 @@ class ProgressLine:
                 self._write()
 
     def _write(self) -> None:
+        if self._silent:
+            return
         self._written = monotonic()
         elapsed = f'{self._written - self._begin:.0f} s'
         if self._terminal:

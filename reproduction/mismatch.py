@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Simulate the control laws with 30 % mismatch of friction and stiffness.
 
@@ -27,7 +28,8 @@ from needle_controller import (
     run_batch,
     Setpoint,
 )
-from needle_dynamics import DEFAULT_PRESET, FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_insertion.report.content import Grid, Picture, ReportSection
 import numpy as np
 from reproduction.figures import LAW_COLORS
@@ -47,7 +49,7 @@ DEFLECTION: Final = 5e-4
 STEP: Final = 1e-3
 
 #: Preset of the nominal model, and mean of the plants.
-PRESET: Final = DEFAULT_PRESET
+PRESET: Final = PAPER_NEEDLE
 
 #: Cases: description and delay [periods].
 CASES: Final[Mapping[str, tuple[str, int]]] = {

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Plants that repeat a recorded insertion under another motion of the guide.
 
@@ -20,7 +21,8 @@ from typing import Final, Protocol
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
-from needle_dynamics.steering.parameters import NEEDLES, tissue_of
+from needle_dynamics.needles import NEEDLES
+from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import SteeringRecording
 from needle_identification.steering.prediction import rms_of
 from needle_identification.steering.search import Search, Tips
@@ -36,7 +38,7 @@ FREE: Final = 0.04
 #: Depths at which the bins of guide steps of the response begin [m].
 BINS: Final = (0.0, 0.0225, 0.0425, 0.0625)
 
-_NEEDLE: Final = NEEDLES['phantom']
+_NEEDLE: Final = NEEDLES['phantom'].needle
 
 
 class Medium(Protocol):

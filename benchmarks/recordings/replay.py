@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering laws in closed loop on plants that repeat recorded insertions."""
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import FloatArray
-from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, STEERING_PRESETS
+from needle_dynamics.needles import DEFAULT_NEEDLE, NEEDLES
 from needle_identification import SteeringRecording
 import numpy as np
 
@@ -55,7 +56,7 @@ class ReplaySettings:
 
     def model(self, depths: FloatArray) -> SteeringModel:
         """Return the model for all laws."""
-        needle, steering, _ = STEERING_PRESETS[DEFAULT_STEERING_PRESET]
+        needle, steering, _ = NEEDLES[DEFAULT_NEEDLE]
         skin = self.skin * needle.tissue_stiffness
         return SteeringModel(needle, replace(steering, skin_stiffness=skin), depths, self.prior)
 

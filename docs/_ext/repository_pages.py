@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Include pages from outside docs/ in the site, and rewrite their links."""
 
 from os.path import relpath
@@ -14,6 +15,8 @@ PAGES = {
     REPOSITORY / 'README.md': DOCS / 'repository' / 'readme.md',
     REPOSITORY / 'CHANGELOG.md': DOCS / 'repository' / 'changelog.md',
     REPOSITORY / 'CONTRIBUTING.md': DOCS / 'repository' / 'contributing.md',
+    REPOSITORY / 'QUALITY_DECLARATION.md': DOCS / 'repository' / 'quality.md',
+    REPOSITORY / 'SECURITY.md': DOCS / 'repository' / 'security-policy.md',
     REPOSITORY / 'examples' / 'README.md': DOCS / 'repository' / 'examples.md',
     REPOSITORY / 'bags' / 'README.md': DOCS / 'repository' / 'recordings.md',
     REPOSITORY / 'config' / 'README.md': DOCS / 'repository' / 'layouts.md',

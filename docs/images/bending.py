@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Draw bending.png: shapes of a needle during an insertion, in both planes, to scale.
 
@@ -12,7 +13,7 @@ from math import pi
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import FloatArray, NEEDLES, SteeredNeedle
 from needle_insertion.report.insertion import draw_needle
 import numpy as np
 
@@ -24,7 +25,7 @@ WAY = (
 
 def insert() -> tuple[SteeredNeedle, list[FloatArray]]:
     """Return the needle at the end of the insertion, and its shapes at each depth."""
-    preset = STEERING_PRESETS['bending_35mm']
+    preset = NEEDLES['bending_35mm']
     one = SteeredNeedle(preset.needle, replace(preset.steering, bevel_load=(1.5,)))
     shapes = []
     for depth, guide, roll in WAY:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Result of a run of a closed loop."""
 
 from __future__ import annotations
@@ -5,11 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from needle_dynamics import FloatArray, NeedleModel
+from needle_dynamics.display import Displayed
 import numpy as np
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopRun:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoopRun(Displayed):
     """Result of a closed-loop run."""
 
     model: NeedleModel  #: the plant
@@ -31,3 +33,16 @@ class LoopRun:
         """Deflection of the tip [m], shape (k,)."""
         values = self.model.modes.values(self.depth)
         return np.asarray((values * self.states[:, 2 : self.model.coordinates]).sum(axis=1))
+
+    def columns(self) -> dict[str, FloatArray]:
+        m = self.model.coordinates
+        return {
+            'time [s]': self.time,
+            'depth [m]': self.depth,
+            'velocity [m/s]': -self.states[:, m],
+            'force [N]': self.forces[:, 0],
+            'torque [N m]': self.forces[:, 1],
+            'angle [rad]': self.states[:, 1],
+            'tip_deflection [m]': self.tip_deflection,
+            **{f'q{i} [m^3/2]': self.states[:, 1 + i] for i in range(1, m - 1)},
+        }

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sampled controllers with a simulated needle, and sampled laws with batches of needles."""
 
 from __future__ import annotations
@@ -6,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, repeat
 from math import isfinite
 import os
 from typing import Protocol
@@ -17,6 +18,7 @@ from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.setpoint import Reference
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -145,7 +147,7 @@ def run_controller(
     return LoopRun(model, time, states, forces)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoopBatch:
     """Results of many runs of sampled laws."""
 
@@ -164,6 +166,13 @@ class LoopBatch:
     #: Command for each measurement [N], shape (runs, k) or (runs, 0), with ``record``.
     commands: FloatArray
 
+    def __repr__(self) -> str:
+        worst = np.abs(self.largest).max(initial=0.0)
+        return (
+            f'<LoopBatch: {len(self.final)} runs of {len(self.goal) - 1} periods, largest error '
+            f'{1e3 * worst:.4g} mm>'
+        )
+
 
 def run_batch(
     laws: Law | Sequence[Law],
@@ -181,7 +190,7 @@ def run_batch(
     keep: bool = False,
     record: bool = False,
     workers: int | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Progress | None = None,
 ) -> LoopBatch:
     """
     Run sampled laws of insertion on many needles, on all cores; see `run_controller`.
@@ -221,8 +230,8 @@ def run_batch(
         Keep the states and the commands of all periods.
     workers : int, optional
         Number of threads; one per core by default.
-    progress : callable, optional
-        Called after each run.
+    progress : bool or callable, optional
+        True shows a progress bar; a function is called after each run.
 
     Returns
     -------
@@ -275,7 +284,7 @@ def run_batch(
     trajectories = np.full((runs, count + 1 if record else 0, ends.shape[1]), np.nan)
     commands = np.full((runs, count if record else 0), np.nan)
 
-    def run(share: range) -> None:
+    def run(share: range, advance: Callable[[], object]) -> None:
         for i in share:
             law = each_law[i % len(each_law)]
             completed[i] = run_loop(
@@ -283,14 +292,14 @@ def run_batch(
                 goal, np.zeros(delay + late), delay, blurred, along, float(step), depths[i],
                 trajectories[i], commands[i], errors[i],
             )  # fmt: skip
-            if progress is not None:
-                progress()
+            advance()
 
-    # The first run compiles the loop before the threads need it.
-    run(range(1))
     workers = min(workers or os.cpu_count() or 1, runs)
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(run, [range(1 + k, runs, workers) for k in range(workers)]))
+    with progress_of(progress, runs, 'runs') as each_run, ThreadPoolExecutor(workers) as pool:
+        # The first run compiles the loop before the threads need it.
+        run(range(1), each_run)
+        shares = [range(1 + k, runs, workers) for k in range(workers)]
+        list(pool.map(run, shares, repeat(each_run)))
     return LoopBatch(
         final=errors[:, 0],
         largest=errors[:, 1],

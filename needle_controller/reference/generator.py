@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reference generator of a controller: a target or a path, with pauses."""
 
 from __future__ import annotations
@@ -81,6 +82,20 @@ class ReferenceGenerator:
         path = Path(times, positions, velocities, self.limits, self._depths)
         self.target, self._path, self._passed = path.last, path, 0.0
         self._replan()
+
+    def stop_motion(self) -> None:
+        """Discard target and path: brake to rest within the limits, and hold there."""
+        self._path = None
+        if self._motion is None:
+            # No force is commanded.
+            self.target = None
+        else:
+            self.target, self._change = self.ahead(self.now).position, self._halt
+
+    def _halt(self, now: Setpoint) -> Reference:
+        motion = self._brake(now)
+        self.target = motion.at(motion.duration).position
+        return motion
 
     def pause(self) -> None:
         """Brake to rest within the limits and hold the position."""

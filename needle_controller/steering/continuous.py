@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Continuous insertion: the needle moves without rest, and the guide follows its depth."""
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class ContinuousInsertion(InsertionStrategy):
         motions.origin = np.array([depths[0], *self._between[0]])
         motions.goal = np.array([depths[-1], *self._between[1]])
         motions.again = lambda later: self._insert(later, self._depth_now, again=True)
-        return motions.insert(begin, self._between[0], now, again=again)
+        return motions.insert(begin, now, again=again)
 
     @property
     def _depth_now(self) -> float:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 Steering executive: plan, measure the tip, move the guide, insert the needle; without ROS.
 
@@ -18,15 +19,12 @@ from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, describe_phase
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.motion_control import MotionControl, SAME
-from needle_controller.steering.planner import (
-    describe_target,
-    InsertionPlanner,
-    PlannedInsertion,
-)
+from needle_controller.steering.motion_control import MotionControl
+from needle_controller.steering.planner import describe_target, InsertionPlanner
 from needle_controller.steering.planning import ComputedJob, StartJob
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.retraction import Retraction
@@ -101,17 +99,21 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self._streams = self._joint_stream, self._tip_stream
         self.fault, self._noise = '', prior.noise
-        self._planner = InsertionPlanner(needle, steering, prior, settings, start, law)
+        self.planner = InsertionPlanner(needle, steering, prior, settings, start, law)
         self._motions = MotionControl(settings, self.events)
         #: The latest insertion.
         self._insertion: InsertionStrategy | None = None
+        #: Record of it, for an executive after a restart.
+        self.keeper = RecordKeeper()
+        #: The newest reading of the tip [m].
+        self._tip: tuple[float, ...] | None = None
         #: The retraction after it.
         self._retraction: Retraction | None = None
 
     @property
     def phase(self) -> Phase:
         """State."""
-        if self._planner.job is not None:
+        if self.planner.job is not None:
             return Phase.PLANNING
         if self._retraction is not None:
             return Phase.IDLE if self._retraction.done else Phase.RETRACTING
@@ -173,8 +175,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
             if not np.isfinite(point).all():
                 raise ParameterError(f'target must be finite, got {list(point)}')
             self._check_mode()
-            if self.steers:
-                self._aim(point)
+            if self.steers and self._insertion is not None:
+                self._insertion.law.change_target(point)
+                self.events.add(Severity.INFO, f'target changed to {describe_target(point)}')
             else:
                 self._plan(stamp, point, now)
         except NeedleError as error:
@@ -194,16 +197,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if self._obeyed is Mode.PAUSED and not self.steers:
             raise JobError('paused; resume before the next insertion')
 
-    def _aim(self, point: tuple[float, float, float]) -> None:
-        depth = self.depth
-        if abs(point[1] - depth) > SAME or self._insertion is None:
-            raise ParameterError(
-                f'the insertion is to a depth of {1e3 * depth:.2f} mm, got '
-                f'{1e3 * point[1]:.2f} mm; ~/stop ends it'
-            )
-        self._insertion.law.aim(np.array([point[0], point[2]]))
-        self.events.add(Severity.INFO, f'target changed to {describe_target(point)}')
-
     def _check_ready(self, now: int) -> FloatArray:
         """Return the positions of the joints, if an insertion can begin."""
         for stream in self._streams:
@@ -220,16 +213,17 @@ class SteeringExecutive(StateMachine[JointMotion]):
         """Start to compute a plan."""
         at, last = self._check_ready(now), self._insertion
         begun = None if last is None else float(last.law.depths[0])
-        depths = self._planner.depths(point, at, begun)
-        self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
-        self._planner.start(PlannedInsertion(stamp, point, depths, at))
-        self.events.add(
-            Severity.INFO, f'planning to {describe_target(point)} in {len(depths) - 1} steps'
+        request = self.planner.prepare(
+            PlannedInsertion(stamp, point, at), begun, self._tip, self.authority.state.newest
         )
+        self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
+        self.planner.start(request)
+        steps = len(request.depths) - 1
+        self.events.add(Severity.INFO, f'planning to {describe_target(point)} in {steps} steps')
 
     def _cancel(self, verdict: Verdict, why: str) -> None:
         """Cancel the computation of a plan, if it is under way."""
-        request = self._planner.cancel()
+        request = self.planner.cancel()
         if request is None:
             return
         self.requests.answer(TARGET, request.stamp, verdict, why)
@@ -237,26 +231,29 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     def _begin_if_planned(self, now: int) -> JointMotion | None:
         """Begin the insertion once its plan is computed."""
-        taken = None if self._obeyed is Mode.PAUSED else self._planner.take()
+        taken = None if self._obeyed is Mode.PAUSED else self.planner.take()
         if taken is None:
             return None
-        (stamp, point, depths, planned), job = taken
+        (stamp, point, planned, depths, _), job = taken
         settings, motions = self.settings, self._motions
         try:
             law, at = job.result(), self._check_ready(now)
             moved = np.flatnonzero(np.abs(at - planned) > settings.tolerances)
             if len(moved):
                 raise JobError(f'{settings.joints[moved[0]]} has moved during planning')
+            guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
+            self.planner.resume(taken[0], guarded)
         except NeedleError as error:
             self._reject(TARGET, stamp, str(error))
             return None
         self._accept(TARGET, stamp)
-        guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
         strategy = ContinuousInsertion if settings.continuous else SteppedInsertion
         self._insertion, self.fault = strategy(guarded, motions, settings), ''
         self._retraction = None
+        self.keeper.begin(taken[0], self._insertion, self.authority)
         motions.discard_stop()
-        line = f'insertion to {describe_target(point)} in {len(depths) - 1} steps begins'
+        begins = f'is resumed in step {guarded.step}' if guarded.step else 'begins'
+        line = f'insertion to {describe_target(point)} in {len(depths) - 1} steps {begins}'
         self.events.add(Severity.INFO, line)
         return self._insertion.begin(at, now)
 
@@ -416,6 +413,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         tip = reading.values[0]
         if not self._is_valid(self._tip_stream, reading, tip, now):
             return None
+        self._tip = tip
         return self._run(lambda insertion: insertion.tip(reading.stamp, tip, now), now)
 
     def _report(self, stream: InputMonitor, refusal: Refusal) -> None:
@@ -475,7 +473,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             Time [ns].
 
         """
-        insertion, job = self._insertion, self._planner.job
+        insertion, job = self._insertion, self.planner.job
         status, warning = describe(insertion, self._motions.goal, self._noise, active=self.steers)
         status = replace(
             status,
@@ -496,4 +494,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if insertion is not None and self.phase is Phase.DONE:
             line, severity = insertion.law.outcome()
             return severity, f'done: {line}', status
-        return Severity.INFO, describe_phase(status), status
+        line = describe_phase(status)
+        if self.phase is Phase.IDLE and insertion is None:
+            line += self.planner.advice(float(self._motions.at[0]))
+        return Severity.INFO, line, status

@@ -1,11 +1,12 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering law with checked measurements and checked setpoints."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import isfinite, sqrt
-from typing import Final
+from typing import Any, Final
 
 from needle_controller.compiled.guide_plan import HIT
 from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
@@ -19,9 +20,12 @@ from needle_controller.steering.law import (
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering.tip_measurement import AveragedTipMeasurement, TipMeasurements
 from needle_dynamics.arrays import FloatArray
-from needle_ros.errors import NeedleError
+from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
 import numpy as np
+
+#: Tolerance of equal positions [m, rad].
+SAME: Final = 1e-6
 
 #: Tolerance of a setpoint beyond its limit [m].
 _ROUNDING: Final = 1e-6
@@ -61,27 +65,65 @@ class GuardedLaw:
         self._last: tuple[float, float] | None = None
         self._setpoint = GuideSetpoint(0.0, 0.0)
         self._warned = False
+        #: Inputs of the law in their order, and its setpoints: ``aim`` x, z [m]; ``tip``, x, y, z
+        #: [m], or None, with the fields of `AveragedTipMeasurement`, ``at`` and ``depth`` as in
+        #: `update`; ``plan`` x, z [m], roll [rad].
+        self.history: list[dict[str, Any]] = []
 
     @property
     def steps(self) -> int:
         """Number of steps n."""
         return len(self.depths) - 1
 
+    @property
+    def setpoint(self) -> GuideSetpoint:
+        """Last setpoint of guide and roll."""
+        return self._setpoint
+
     def aim(self, target: FloatArray) -> None:
         """Change the target, x and z [m]."""
         with _guarded():
             self.law.aim(target)
         self._warned = False
+        self.history.append({'aim': target.tolist()})
+
+    def change_target(self, point: tuple[float, float, float]) -> None:
+        """Change the target, x, y, z [m], where the depth y stays."""
+        x, y, z = point
+        if abs(y - self.depths[-1]) > SAME:
+            raise ParameterError(
+                f'the insertion is to a depth of {1e3 * self.depths[-1]:.2f} mm, got '
+                f'{1e3 * y:.2f} mm; ~/stop ends it'
+            )
+        self.aim(np.array([x, z]))
+
+    def repeat(self, entry: Mapping[str, Any]) -> None:
+        """Repeat an input of the history."""
+        if 'aim' in entry:
+            self.aim(np.array(entry['aim']))
+            return
+        tip, error, readings, frozen = (entry[name] for name in AveragedTipMeasurement._fields)
+        measured = AveragedTipMeasurement(np.array(tip), error, readings, frozen)
+        self._take(measured if tip is not None else None, entry['at'], entry['depth'])
 
     def update(self, readings: TipMeasurements, at: int, depth: float | None = None) -> None:
         """Pass a measurement at a depth number to the law; it may have no readings."""
-        self.measured = measured = readings.average(self._noise)
+        depth = float(self.depths[at]) if depth is None else depth
+        self._take(readings.average(self._noise), at, depth)
+
+    def _take(self, measured: AveragedTipMeasurement | None, at: int, depth: float) -> None:
+        self.measured = measured
+        fields = (
+            (None, 0.0, 0, False) if measured is None else (measured.tip.tolist(), *measured[1:])
+        )
+        named = zip(AveragedTipMeasurement._fields, fields, strict=True)
+        self.history.append({**dict(named), 'at': at, 'depth': depth})
         if measured is None:
             self._check_sensor(None)
             with _guarded():
                 self.law.update(None, at)
             return
-        self._check_slip(measured, float(self.depths[at]) if depth is None else depth)
+        self._check_slip(measured, depth)
         x, _, z = measured.tip.tolist()
         self._check_sensor((x, z))
         self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
@@ -143,6 +185,7 @@ class GuardedLaw:
                 f'most {1e3 * widest:.3f} mm are possible'
             )
         self._setpoint, self.step = to, k + 1
+        self.history.append({'plan': [*to]})
         if k < self.steps and warning and not self._warned:
             self._warned = True
             depth = 1e3 * self.depths[k]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Common part of stepped and continuous insertions: motions, rest, and measurement of the tip."""
 
 from __future__ import annotations
@@ -37,7 +38,14 @@ class InsertionStrategy(ABC):
         self._span = 0, 0
 
     def begin(self, at: FloatArray, now: int) -> JointMotion | None:
-        """Send the guide to its zero, from positions of the joints [m, rad]."""
+        """
+        Send the guide to its zero, from positions of the joints [m, rad].
+
+        A law with plans continues: the guide is sent to its last setpoint.
+        """
+        if self.law.step:
+            self._motions.goal = at.copy()
+            return self._begin_step(self.law.setpoint, now)
         self._motions.goal = np.array([self.law.depths[0], *at[1:]])
         straight = self._motions.goal.copy()
         straight[1:3] = 0.0

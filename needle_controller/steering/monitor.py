@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Monitor of a motion: check that the robot follows it, and that no node rejects it."""
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class MotionMonitor:
         self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False
     ) -> None:
         """
-        Start to monitor a motion from positions ``at`` [m, rad], shape (joints,).
+        Start to monitor a motion from measured positions ``at`` [m, rad], shape (joints,).
 
         ``again`` marks a repetition of the motion. With ``arrives`` the joints must arrive in
         time, where a part of the motion may have been followed already; otherwise they must begin
@@ -69,7 +70,8 @@ class MotionMonitor:
         self._arrives = arrives
         visible = 0.0
         for k in np.flatnonzero(self._pending):
-            gone = np.abs(move.positions[:, columns.index(int(k))] - at[k])
+            gone = move.positions[:, columns.index(int(k))] - at[k]
+            gone = gone * np.sign(self._goal[k] - at[k])
             seen = len(gone) - 1 if arrives else int(np.argmax(gone >= min(room[k], way[k])))
             visible = max(visible, float(move.times[seen]))
         wait = max(REPEAT_AFTER, visible + _REACTION)
@@ -147,7 +149,15 @@ class MotionMonitor:
             why = f'no node reports that it takes {JOINT_TRAJECTORY.name}'
         elif silent:
             why = f'no answer of {" and ".join(silent)}'
+        elif any(_is_late(status, self._stamps[-1]) for status in takers.values()):
+            why = 'it arrived too late'
         else:
             why = f'{" and ".join(takers)} accepted it'
         count = len(self._stamps)
         return f'{JOINT_TRAJECTORY.name} sent {count} time{"s" * (count > 1)}, {why}'
+
+
+def _is_late(status: RequestStatus, stamp: int) -> bool:
+    """Return whether a node has received a motion after its end."""
+    answer = status.answer_to(JOINT_TRAJECTORY.name, stamp)
+    return answer is not None and answer.verdict is Verdict.LATE

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion control of an insertion: motions of needle and guide, their repetition, and the stop."""
 
 from __future__ import annotations
@@ -5,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from needle_controller.steering.guarded_law import SAME
 from needle_controller.steering.law import SteeringFaultError
 from needle_controller.steering.monitor import MotionMonitor
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
@@ -18,6 +20,9 @@ import numpy as np
 #: Time in which needle and guide brake to rest after a stop [s].
 BRAKING: Final = 0.2
 
+#: Number of points of a stop: one that arrives within a second is not in the past yet.
+_HELD: Final = 6
+
 #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 LAGGING: Final = 5.0
 
@@ -30,9 +35,6 @@ _SPAN: Final = 0.05
 
 #: Largest displacement of a needle at rest [m].
 STILL: Final = 1e-4
-
-#: Tolerance of equal positions [m, rad].
-SAME: Final = 1e-6
 
 
 class MotionControl:
@@ -95,19 +97,17 @@ class MotionControl:
         # Repeated from the present positions, without a jump.
         self.again = lambda later: self._move(later, self.at, again=True)
         move = self._stamped(smooth(self._settings.joints, begin, self.goal, duration), now)
-        self.monitor.begin(move, begin, again=again)
+        self.monitor.begin(move, self.at, again=again)
         return move
 
-    def insert(
-        self, begin: float, guide: FloatArray, now: int, *, again: bool = False
-    ) -> JointMotion:
-        """Send the needle alone to its goal, from a depth [m] and a guide at x, z [m]."""
+    def insert(self, begin: float, now: int, *, again: bool = False) -> JointMotion:
+        """Send the needle alone to its goal, from a depth [m]."""
         end = self.goal[:1].copy()
         duration = duration_of(np.array([end[0] - begin, 0.0, 0.0]), self._settings)
         self.due = now + round(duration * NANOSECONDS)
         joints = self._settings.joints[:1]
         move = self._stamped(smooth(joints, np.array([begin]), end, duration), now)
-        self.monitor.begin(move, np.array([begin, *guide]), again=again)
+        self.monitor.begin(move, self.at, again=again)
         return move
 
     def guide_to(
@@ -217,8 +217,10 @@ class MotionControl:
         return self._brake(end, now)
 
     def _brake(self, end: FloatArray, now: int) -> JointMotion:
-        joints, rest = self._settings.joints, np.zeros((1, len(end)))
-        halt = self._stamped(JointMotion(joints, np.array([BRAKING]), end[np.newaxis], rest), now)
+        held = np.tile(end, (_HELD, 1))
+        times = BRAKING * np.arange(1.0, _HELD + 1.0)
+        move = JointMotion(self._settings.joints, times, held, np.zeros_like(held))
+        halt = self._stamped(move, now)
         self.monitor.forget()
         self.monitor.stream(halt)
         return halt

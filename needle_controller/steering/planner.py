@@ -1,10 +1,14 @@
+# SPDX-License-Identifier: Apache-2.0
 """Planner of an insertion: check its start, and compute the steering law in a job."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil
-from typing import Final, NamedTuple
+from typing import Final
 
+from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.insertion_record import PlannedInsertion, SteeringRecord
 from needle_controller.steering.law import build_law, SteeringLaw
 from needle_controller.steering.planning import Job, Progress, StartJob
 from needle_controller.steering.prior import SteeringPrior
@@ -13,7 +17,7 @@ from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
-from needle_ros.errors import JobError, ParameterError
+from needle_ros.errors import JobError, NeedleError, ParameterError
 import numpy as np
 
 #: Largest depth of a needle outside tissue, where the guide may move freely [m].
@@ -24,19 +28,6 @@ _SAME: Final = 1e-6
 
 #: Most steps of a plan.
 _MOST_STEPS: Final = 200
-
-
-class PlannedInsertion(NamedTuple):
-    """Request of an insertion."""
-
-    #: Stamp of its message [ns].
-    stamp: int
-    #: Target of the tip, x, y, z [m].
-    point: tuple[float, float, float]
-    #: Depths of the tip measurements [m], shape (n + 1,).
-    depths: FloatArray
-    #: Positions of the joints at its start [m, rad].
-    at: FloatArray
 
 
 class InsertionPlanner:
@@ -56,6 +47,58 @@ class InsertionPlanner:
         #: Computation under way, and its request.
         self.job: Job[SteeringLaw] | None = None
         self.request: PlannedInsertion | None = None
+        #: Record of the insertion before a restart.
+        self.recalled: SteeringRecord | None = None
+
+    def advice(self, depth: float) -> str:
+        """Return advice to the user after a restart with a needle at a depth [m], or ''."""
+        record = self.recalled
+        if record is None or not depth > record.depths[0] + _OUTSIDE:
+            return ''
+        x, _, z = record.point
+        at = describe_target((x, record.depths[-1], z))
+        if record.ended:
+            return f'; the insertion to {at} has ended ({record.ended}): retract the needle'
+        return (
+            f'; the insertion to {at} was interrupted in step {len(record.plans)} of '
+            f'{len(record.depths) - 1}: send its target again to resume it, or retract the needle'
+        )
+
+    def prepare(
+        self,
+        request: PlannedInsertion,
+        begun: float | None,
+        tip: Sequence[float] | None,
+        state: int,
+    ) -> PlannedInsertion:
+        """
+        Return a request with the depths of its steps, if an insertion can begin or resume.
+
+        ``begun`` is as for `depths`, ``tip`` and ``state`` are as for `SteeringRecord.check`.
+        """
+        record, depth = self.recalled, float(request.at[0])
+        if begun is None and record is not None:
+            begun = float(record.depths[0])
+            same = abs(request.point[1] - record.depths[-1]) <= _SAME
+            if same and depth > begun + _OUTSIDE:
+                try:
+                    record.check(request.at, tip, state, self._settings)
+                except JobError as error:
+                    raise _cannot_resume(error, begun) from error
+                return request._replace(depths=np.array(record.depths), record=record)
+        return request._replace(depths=self.depths(request.point, request.at, begun))
+
+    def resume(self, request: PlannedInsertion, law: GuardedLaw) -> None:
+        """Restore a law to the record of its request, if it has one."""
+        record, (x, _, z) = request.record, request.point
+        if record is None:
+            return
+        try:
+            record.restore(law)
+        except NeedleError as error:
+            raise _cannot_resume(error, float(record.depths[0])) from error
+        if np.abs(np.subtract(law.law.target, (x, z))).max() > _SAME:
+            law.aim(np.array([x, z]))
 
     def depths(
         self, point: tuple[float, float, float], at: FloatArray, begun: float | None
@@ -79,7 +122,7 @@ class InsertionPlanner:
         if depth > straight + _OUTSIDE and off > settings.guide_tolerance:
             raise JobError(
                 f'the guide is {1e3 * off:.2f} mm off its zero with the needle at '
-                f'{1e3 * depth:.2f} mm; a needle has to be straight at the start'
+                f'{1e3 * depth:.2f} mm; a needle has to be straight at the start: retract it first'
             )
         if point[1] < depth + min(settings.step_length, _OUTSIDE):
             raise ParameterError(
@@ -96,7 +139,13 @@ class InsertionPlanner:
 
     def start(self, request: PlannedInsertion) -> None:
         """Start to compute the law of a request."""
-        _, point, depths, at = request
+        point, depths = request.point, request.depths
+        if request.record is not None:
+            # The law was constructed for the target at the start.
+            x, _, z = request.record.point
+            point, at = (x, point[1], z), np.array(request.record.start)
+        else:
+            at = request.at
         settings, steps = self._settings, len(depths) - 1
 
         def work(progress: Progress) -> SteeringLaw:
@@ -133,6 +182,13 @@ class InsertionPlanner:
         request = self.request
         self.request = self.job = None
         return request
+
+
+def _cannot_resume(error: NeedleError, begun: float) -> JobError:
+    return JobError(
+        f'the insertion cannot be resumed: {error}; retract the needle to {1e3 * begun:.2f} mm '
+        'first'
+    )
 
 
 def describe_target(point: tuple[float, float, float]) -> str:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle analyze`: controllability and observability of the linearized needle model."""
 
 from __future__ import annotations
@@ -8,13 +9,16 @@ from pathlib import Path
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters
 from needle_dynamics.linearization import SLIDING
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_insertion.commands.common import (
+    add_constants,
     add_needle,
     check_folder,
     constants,
     make_folder,
     print_result,
     Subcommand,
+    with_unit,
 )
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
@@ -22,22 +26,19 @@ from needle_ros.errors import ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_needle(parser)
+    add_needle(parser, PAPER_NEEDLE)
+    add_constants(parser, '--set', 'any other constant of the model')
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
-    points = parser.add_argument_group(
-        'operating points', 'every combination of the values given; SI units'
-    )
+    points = parser.add_argument_group('operating points', 'every combination of the values given')
     for name, unit, default, text in (
-        ('depth', 'm', [0.1], 'insertion depths (default 0.1)'),
-        ('tip-deflection', 'm', [0.0, 5e-4], 'tip deflections (default 0 5e-4)'),
-        ('speed', 'm/s', [5e-3], 'insertion velocities, negative for retraction (default 5e-3)'),
+        ('depth', 'm', [0.1], 'insertion depths (default 100mm)'),
+        ('tip-deflection', 'm', [0.0, 5e-4], 'tip deflections (default 0 0.5mm)'),
+        ('speed', 'm/s', [5e-3], 'insertion velocities, negative for retraction (default 5mm/s)'),
     ):
-        points.add_argument(
-            f'--{name}', type=float, nargs='+', default=default, metavar=unit, help=text
-        )
+        points.add_argument(f'--{name}', nargs='+', default=default, help=text, **with_unit(unit))
     points.add_argument(
-        '--force', type=float, default=0.0, metavar='N', help='insertion force (default 0)'
+        '--force', default=0.0, help='insertion force (default 0)', **with_unit('N')
     )
     points.add_argument(
         '--sliding',
@@ -66,7 +67,7 @@ def _run(options: argparse.Namespace) -> int:
         if name in changes:
             raise ParameterError(f'{name} is given by --{name}, not by --set')
     parameters = NeedleParameters.preset(
-        options.preset, **{'formulation': options.formulation, 'modes': options.modes, **changes}
+        options.needle, **{'formulation': options.formulation, 'modes': options.modes, **changes}
     )
     points = report.analyze_points(
         NeedleModel(parameters),
@@ -78,7 +79,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     files = _write_map(parameters, options) if options.map else []
     document = {
-        'preset': options.preset,
+        'needle': options.needle,
         'parameters': asdict(parameters),
         'unit': 'SI',
         'points': [point.document for point in points],

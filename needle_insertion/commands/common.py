@@ -1,8 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
 """Shared parts of the commands: `Subcommand`, model constants from words, output folders."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Iterable, Sequence
 import json
 import os
@@ -11,6 +12,7 @@ import sys
 from typing import Any, NamedTuple
 
 from needle_ros.errors import ParameterError, shown
+from needle_ros.quantities import EXAMPLES, quantity
 
 
 class Subcommand(NamedTuple):
@@ -26,17 +28,29 @@ class Subcommand(NamedTuple):
     signed: tuple[str, ...] = ()  #: options whose value may begin with a minus sign
 
 
-def add_needle(parser: ArgumentParser) -> None:
-    """Add the options of the model constants, ``--preset`` and ``--set``."""
-    from needle_dynamics import DEFAULT_PRESET, PRESETS
+def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '') -> None:
+    """Add the option ``--needle``; ``otherwise`` describes the default if it is None."""
+    from needle_dynamics.needles import NEEDLE_HELP, NEEDLES
 
-    parser.add_argument(
-        '--preset',
-        choices=tuple(PRESETS),
-        default=DEFAULT_PRESET,
-        help=f'constants of needle and tissue (default {DEFAULT_PRESET})',
+    added: Any = parser.add_argument(
+        '--needle',
+        default=default,
+        metavar='NAME',
+        help=f'needle and tissue: {NEEDLE_HELP} (default {default or otherwise})',
     )
-    add_constants(parser, '--set', 'any other constant of the model')
+    added.completer = lambda **_: [*NEEDLES, *map(str, Path().glob('*.yaml'))]
+
+
+def with_unit(unit: str) -> dict[str, Any]:
+    """Return type and word of an option for a quantity, such as ``50mm``."""
+
+    def parse(text: str) -> float:
+        try:
+            return quantity(text, unit)
+        except ParameterError as error:
+            raise ArgumentTypeError(str(error)) from None
+
+    return {'type': parse, 'metavar': EXAMPLES.get(unit, unit)}
 
 
 def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
@@ -46,7 +60,7 @@ def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help=f'{meaning}, SI units; repeatable',
+        help=f'{meaning}; in SI units, or with a unit as length=150mm; repeatable',
     )
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle identify`: fit parameters to recordings; write tables, JSON, parameter file and page."""
 
 from __future__ import annotations
@@ -31,11 +32,14 @@ from needle_insertion.commands.common import (
     print_each,
     print_result,
     Subcommand,
+    with_unit,
 )
 from needle_insertion.commands.identify_steering import add_steering, add_time
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
+from needle_ros.quantities import quantities
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,8 +83,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     fitting.add_argument(
         '--layers',
         type=_lengths,
-        metavar='M,...',
-        help='insertion depths at which layers begin [m], for the term layers',
+        metavar='30mm,...',
+        help='insertion depths at which layers begin, for the term layers',
     )
     friction.set_defaults(identify=_run_friction)
 
@@ -102,8 +106,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--level',
-        type=float,
-        metavar='N',
+        **with_unit('N'),
         help='force level of the stiffness to report (default: the largest)',
     )
     stiffness.set_defaults(identify=_run_stiffness)
@@ -122,11 +125,9 @@ def _words(text: str) -> list[str]:
 
 def _lengths(text: str) -> list[float]:
     try:
-        return [float(word) for word in text.split(',')]
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f'takes lengths [m] with commas between them, got {text!r}'
-        ) from None
+        return quantities(text, 'm')
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _add_common(
@@ -183,9 +184,8 @@ def _add_common(
             default = f'{item.default:g} {unit}'.removesuffix(' 1')
             fitting.add_argument(
                 f'--{item.name.replace("_", "-")}',
-                type=float,
                 default=item.default,
-                metavar='X' if unit == '1' else unit,
+                **with_unit(unit),
                 help=f'{item.metadata["description"]} (default {default})',
             )
     return reading, fitting
@@ -280,11 +280,12 @@ def _identify(
         from needle_insertion.report.identify_page import write_identified_page
 
         make_folder(options.report)
-        written.append(write_identified_page(options.report, summary, origin))
+        with ProgressLine('page', brief=True):
+            written.append(write_identified_page(options.report, summary, origin))
     short, full = warned(summary, origin)
     print_each('warning', full if options.all_warnings else short)
     if len(full) > len(short) and not options.all_warnings:
-        sys.stderr.write(f'{len(full)} warnings in {len(short)} groups: --all-warnings\n')
+        sys.stderr.write(f'--all-warnings prints all {len(full)} warnings\n')
     document = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
     print_result(document, identified_text(summary), written, as_json=options.json)
     print_each('error', complaints)

@@ -1,9 +1,11 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle identify steering`: fit the bending of a needle that cuts its path to recordings."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from itertools import count
 from math import isfinite
 from pathlib import Path
 import re
@@ -18,11 +20,11 @@ from needle_identification.steering.estimate import HeldOut, SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_insertion.commands.common import check_file, print_each, print_result
+from needle_insertion.commands.common import check_file, print_each, print_result, with_unit
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
-from tqdm import tqdm
 
 _ONE = 'all'  #: name of a medium without a name
 
@@ -100,7 +102,7 @@ def add_steering(what: Any) -> None:
         '(default: the order with the best fit)',
     )
     fitting.add_argument(
-        '--free-length', type=float, metavar='M', help='known free length [m] (default: fitted)'
+        '--free-length', help='known free length (default: fitted)', **with_unit('m')
     )
     parser.set_defaults(identify=_run)
 
@@ -163,13 +165,15 @@ def _run(options: argparse.Namespace) -> int:
         terms = tuple(word.strip() for word in options.terms.split(','))
     settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
     columns = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
-    read = [_read(path, columns, options) for path in options.recordings]
+    with ProgressLine('reading', brief=True):
+        read = [_read(path, columns, options) for path in options.recordings]
     recordings = [one for one in read if one is not None]
     if not recordings:
         return 2
     print_each('warning', _alike(recordings))
-    with tqdm(desc='fits', unit='', disable=None, leave=False, delay=2.0) as bar:
-        found = identify_steering(recordings, settings, bar.update)
+    with ProgressLine('identification', brief=True) as show:
+        fits = count(1)
+        found = identify_steering(recordings, settings, lambda: show(f'fit {next(fits)}'))
     print_each('warning', found.warnings)
     written, complaints = list[Path](), list[str]()
     if options.output is not None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle inspect`: list the contents of recordings, and the command that identifies from them."""
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from pathlib import Path
 
 from needle_identification import inspect_recording, Inspection
 from needle_insertion.commands.common import print_each, print_result, Subcommand
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, shown
@@ -29,7 +31,8 @@ def _run(options: argparse.Namespace) -> int:
     found, bad = list[Inspection](), 0
     for path in options.recordings:
         try:
-            found.append(inspect_recording(path))
+            with ProgressLine(f'reading {path.name}', brief=True):
+                found.append(inspect_recording(path))
         except (NeedleError, OSError) as error:  # noqa: PERF203
             print_each('error', [error])
             bad += 1

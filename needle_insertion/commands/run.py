@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle run`: start the nodes of an insertion, execute commands of a person or a script."""
 
 from __future__ import annotations
@@ -7,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from needle_insertion.commands.common import check_folder, Subcommand
+from needle_insertion.commands.common import add_needle, check_folder, Subcommand
 from needle_ros.errors import ParameterError
 
 
@@ -15,19 +16,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--hardware', action='store_true', help='start no plant: a robot publishes joint_states'
     )
-    parser.add_argument(
-        '--steering',
-        action='store_true',
-        help='bending needle: also start the node steering, which aims its tip',
-    )
+    add_needle(parser, None, 'from the parameter file; the tip of a needle that bends is steered')
     parser.add_argument(
         '--realtime',
         action='store_true',
         help='run the plant in real time instead of lock-step: it does not wait for nodes that a '
         'busy machine delays',
-    )
-    parser.add_argument(
-        '--preset', help='constants of the needle (default: from the parameter file)'
     )
     parser.add_argument('--law', help='control law (default: from the parameter file)')
     parser.add_argument(
@@ -56,6 +50,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Run the nodes until `quit`; return 0."""
     # Imported here: rclpy takes a second.
+    from needle_dynamics import find_needle
     from needle_insertion.compilation import compile_nodes
     from needle_insertion.live.session import config_file, run, Session
 
@@ -64,12 +59,11 @@ def _run(options: argparse.Namespace) -> int:
     if options.output.exists():
         raise ParameterError(f'{options.output} exists; name another folder')
     check_folder(options.output)
-    file = options.params_file or config_file(
-        'steering.yaml' if options.steering else 'insertion.yaml'
-    )
+    steers = options.needle is not None and find_needle(options.needle).bends
+    file = options.params_file or config_file('steering.yaml' if steers else 'insertion.yaml')
     if not file.is_file():
         raise ParameterError(f'--params-file {file} does not exist')
-    nodes = _nodes(options)
+    nodes = _nodes(options, steers=steers)
     if not options.no_recording:
         nodes = {'recorder': {'path': str(options.output / 'bag')}, **nodes}
     compile_nodes()
@@ -77,16 +71,16 @@ def _run(options: argparse.Namespace) -> int:
     return run(Session(nodes, file, options.output / 'logs', lockstep=lockstep))
 
 
-def _nodes(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, Any]]:
     """Return the parameters of each node that the options change."""
-    steered = {'steered': True} if options.steering else {}
+    steered = {'steered': True} if steers else {}
     nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {**steered}}
     nodes['controller'] = {**steered}
-    if options.steering:
+    if steers:
         nodes['steering'] = {}
-    if options.preset:
+    if options.needle is not None:
         for values in nodes.values():
-            values['model.preset'] = options.preset
+            values['needle'] = options.needle
     if options.law:
         nodes['controller']['law'] = options.law
     for word in options.parameters:
@@ -102,15 +96,15 @@ def _nodes(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 def _parameter(word: str) -> tuple[str, str, Any]:
     """Parse NODE.NAME=VALUE."""
     # Imported here: the help does not need it.
-    import yaml
+    from needle_ros.documents import DocumentError, read_document
 
     name, sign, text = word.partition('=')
     node, dot, name = name.partition('.')
     if not (sign and dot and name and text):
         raise ParameterError(f'-p takes NODE.NAME=VALUE, got {word!r}')
     try:
-        return node, name, yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        return node, name, read_document(text)
+    except DocumentError as error:
         raise ParameterError(f'-p {word}: {text!r} is not a value in YAML') from error
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle simulate`: simulate the needle in open loop; write a table, CSV, picture or bag."""
 
 from __future__ import annotations
@@ -8,17 +9,27 @@ from pathlib import Path
 from time import perf_counter
 from typing import Final
 
-from needle_dynamics import DEFAULT_PRESET, NeedleModel, NeedleParameters, simulate
+from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
+    NeedleModel,
+    NeedleParameters,
+    simulate,
+)
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
 from needle_insertion.commands.common import (
+    add_constants,
     add_needle,
     check_file,
     constants,
     print_each,
     print_result,
     Subcommand,
+    with_unit,
 )
 from needle_insertion.commands.simulate_steering import add_steering, run_steering
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -33,8 +44,8 @@ _DEPTH, _FORCE = 0.02, 3.0
 #: Options of a single model.
 _MODES: Final = 'modes'
 _ONLY: Final = {
-    _MODES: ('preset', 'force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
-    'steering': ('needle', 'to', 'speed', 'motion', 'seed'),
+    _MODES: ('force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
+    'steering': ('to', 'speed', 'motion', 'seed'),
 }
 
 
@@ -42,32 +53,25 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model',
         choices=tuple(_ONLY),
-        default=_MODES,
-        help='modes: the needle of the paper; steering: a needle that bends about the path that '
-        f'it cuts (default {_MODES})',
+        help='modes: model of the paper; steering: the needle bends about the path that it cuts '
+        '(default: modes for a needle of the paper, steering for all others)',
     )
-    add_needle(parser)
-    # None if not given: an option of another model is an error.
-    parser.set_defaults(preset=None)
+    add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
+    add_constants(parser, '--set', 'any other constant of the model')
     for name, unit, words in (
-        ('depth', 'm', f'insertion depth at the start (default {_DEPTH:g}; model steering: 0)'),
-        ('force', 'N', f'insertion force (default {_FORCE:g})'),
+        ('depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)'),
+        ('force', 'N', f'insertion force (default {_FORCE:g}N)'),
         ('duration', 's', 'time to simulate (default: until the hub is at the skin)'),
         ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)'),
-        (
-            'tolerance',
-            'X',
-            f'largest change when the step is halved (default {DEFAULT_TOLERANCE:g})',
-        ),
+        ('tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})'),
     ):
-        parser.add_argument(f'--{name}', type=float, metavar=unit, help=words)
+        parser.add_argument(f'--{name}', help=words, **with_unit(unit))
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         '--tip-deflection',
-        type=float,
-        metavar='m',
         help='tip deflection at the start, in the shape of least elastic energy (default '
-        f'{_DEFLECTION:g})',
+        f'{1e3 * _DEFLECTION:g}mm)',
+        **with_unit('m'),
     )
     start.add_argument(
         '--modal',
@@ -108,21 +112,23 @@ def _run(options: argparse.Namespace) -> int:
         if not path.suffix and path.exists():
             raise ParameterError(f'{path}: a bag must not exist')
         check_file(path)
+    needle = options.needle or (PAPER_NEEDLE if options.model == _MODES else DEFAULT_NEEDLE)
+    chosen = options.model or ('steering' if find_needle(needle).bends else _MODES)
     for model, names in _ONLY.items():
         given = [name for name in names if getattr(options, name) is not None]
-        if given and model != options.model:
+        if given and model != chosen:
             raise ParameterError(
                 f'--{given[0].replace("_", "-")} is an option of --model {model}, not of '
-                f'{options.model}'
+                f'{chosen}, the model of {needle}; try --needle '
+                f'{PAPER_NEEDLE if model == _MODES else DEFAULT_NEEDLE}'
             )
-    return _run_modes(options) if options.model == _MODES else run_steering(options)
+    return _run_modes(needle, options) if chosen == _MODES else run_steering(needle, options)
 
 
-def _run_modes(options: argparse.Namespace) -> int:
-    preset = options.preset or DEFAULT_PRESET
+def _run_modes(needle: str, options: argparse.Namespace) -> int:
     depth = _DEPTH if options.depth is None else options.depth
     force = _FORCE if options.force is None else options.force
-    parameters = NeedleParameters.preset(preset, **constants(options.set))
+    parameters = NeedleParameters.preset(needle, **constants(options.set))
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
@@ -132,16 +138,17 @@ def _run_modes(options: argparse.Namespace) -> int:
     start = NeedleModel(parameters).state_at(depth, deflection, modal)
     # Loads the machine code, which takes longer than most runs.
     simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
-    begin = perf_counter()
-    trajectory = simulate(
-        parameters,
-        start,
-        force,
-        duration=duration,
-        interval=options.interval,
-        tolerance=options.tolerance,
-    )
-    taken = perf_counter() - begin
+    with ProgressLine('simulation', brief=True):
+        begin = perf_counter()
+        trajectory = simulate(
+            parameters,
+            start,
+            force,
+            duration=duration,
+            interval=options.interval,
+            tolerance=options.tolerance,
+        )
+        taken = perf_counter() - begin
     for path in options.output:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
@@ -149,7 +156,7 @@ def _run_modes(options: argparse.Namespace) -> int:
     # Decayed values have no significant digits left.
     rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
     text = (
-        f'{preset}: inserted {depth:g} m at the start, force {force:g} N, for {duration:g} s\n\n'
+        f'{needle}: inserted {depth:g} m at the start, force {force:g} N, for {duration:g} s\n\n'
         f'{table(rows, ("quantity", "value"))}\n'
         f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time'
     )

@@ -1,25 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle simulate --model steering`: simulate a needle that bends about the path that it cuts."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, fields
+from collections.abc import Mapping
+from dataclasses import fields
 from math import inf
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from needle_dynamics import (
+    find_needle,
     FloatArray,
     Insertion,
     NeedleParameters,
-    STEERING_PRESETS,
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
-from needle_insertion.commands.common import constants, print_result
+from needle_insertion.commands.common import constants, print_result, with_unit
+from needle_insertion.progress import ProgressLine, Show
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
-from needle_ros.settings import from_values, unknown_name
+from needle_ros.settings import unknown_name
 import numpy as np
+
+if TYPE_CHECKING:
+    # Takes half a second to import.
+    from needle_insertion.report.insertion import InsertionRecord
 
 #: Default target depth [m], speed [m/s] and distance between samples [m].
 TO, SPEED, WAY = 0.1, 5e-3, 1e-3
@@ -33,14 +41,11 @@ _MOST = 1_000_000  #: most samples of a run
 def add_steering(parser: argparse.ArgumentParser) -> None:
     """Add the options of this model to the parser of ``needle simulate``."""
     group = parser.add_argument_group('model steering only')
+    group.add_argument('--to', help=f'target depth (default {1e3 * TO:g}mm)', **with_unit('m'))
     group.add_argument(
-        '--needle',
-        choices=tuple(STEERING_PRESETS),
-        help='needle and tissue (default bending_35mm); --set takes the constants of both',
-    )
-    group.add_argument('--to', type=float, metavar='m', help=f'target depth (default {TO:g})')
-    group.add_argument(
-        '--speed', type=float, metavar='m/s', help=f'insertion velocity (default {SPEED:g})'
+        '--speed',
+        help=f'insertion velocity (default {1e3 * SPEED:g}mm/s)',
+        **with_unit('m/s'),
     )
     group.add_argument(
         '--motion',
@@ -53,28 +58,14 @@ def add_steering(parser: argparse.ArgumentParser) -> None:
 
 
 def made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
-    """Return the constants of a preset of `STEERING_PRESETS`, changed by ``name=value`` words."""
-    needle, steering, _ = STEERING_PRESETS[name]
-    own = [item.name for item in fields(steering)]
+    """Return the constants of a needle, changed by ``name=value`` words."""
     given = constants(words)
-    valid = [*NEEDLE_CONSTANTS, *own]
+    valid = [*NEEDLE_CONSTANTS, *(item.name for item in fields(SteeringParameters))]
     for key in given:
         if key not in valid:
             raise ParameterError(unknown_name(key, valid))
-    of_steering = {
-        key: (value,) if isinstance(getattr(steering, key), tuple) and _single(value) else value
-        for key, value in given.items()
-        if key in own
-    }
-    of_needle = {key: value for key, value in given.items() if key not in own}
-    return (
-        from_values(NeedleParameters, {**asdict(needle), **of_needle}),
-        from_values(SteeringParameters, {**asdict(steering), **of_steering}),
-    )
-
-
-def _single(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    needle, steering, _ = find_needle(name).changed(given)
+    return needle, steering
 
 
 def read_motion(path: Path) -> dict[str, FloatArray]:
@@ -99,14 +90,13 @@ def read_motion(path: Path) -> dict[str, FloatArray]:
     return motion
 
 
-def run_steering(options: argparse.Namespace) -> int:
+def run_steering(name: str, options: argparse.Namespace) -> int:
     """Simulate, write the outputs, and print a summary."""
     from needle_insertion.report import insertion as report
 
     for path in options.output:
         if path.suffix not in ('.csv', '.png'):
             raise ParameterError(f'{path}: output of --model steering must be .csv or .png')
-    name = options.needle or 'bending_35mm'
     needle, steering = made(name, options.set)
     to = TO if options.to is None else options.to
     speed = SPEED if options.speed is None else options.speed
@@ -122,7 +112,34 @@ def run_steering(options: argparse.Namespace) -> int:
     motion = read_motion(options.motion) if options.motion is not None else {}
     one = Insertion(needle, steering, depth=start, seed=options.seed or 0)
     recorder = report.InsertionRecord(one)
+    with ProgressLine('simulation', brief=True) as show:
+        _insert(one, recorder, motion, show, to=to, speed=speed, interval=interval)
+    for path in options.output:
+        report.write(path, recorder)
+    summary = report.summary(recorder)
+    rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
+    text = (
+        f'{name}: inserted from {start:g} m to {to:g} m at {speed:g} m/s\n\n'
+        f'{table(rows, ("quantity", "value"))}'
+    )
+    print_result(summary, text, options.output, as_json=options.json)
+    return 0
+
+
+def _insert(
+    one: Insertion,
+    recorder: InsertionRecord,
+    motion: Mapping[str, FloatArray],
+    show: Show,
+    *,
+    to: float,
+    speed: float,
+    interval: float,
+) -> None:
+    """Insert a needle to a depth, and record it."""
+    begin = one.depth
     while one.depth < to:
+        show('inserting', (one.depth - begin) / (to - begin))
         # The first interval accelerates to the speed, the last ends at the target depth.
         ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
         at = {key: float(np.interp(ahead, motion['depth'], motion[key])) for key in motion}
@@ -139,13 +156,3 @@ def run_steering(options: argparse.Namespace) -> int:
         recorder.take(force)
         if ahead == to:
             break
-    for path in options.output:
-        report.write(path, recorder)
-    summary = report.summary(recorder)
-    rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
-    text = (
-        f'{name}: inserted from {start:g} m to {to:g} m at {speed:g} m/s\n\n'
-        f'{table(rows, ("quantity", "value"))}'
-    )
-    print_result(summary, text, options.output, as_json=options.json)
-    return 0

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle steer`: steer a simulated needle to a target, and compare with a guide at rest."""
 
 from __future__ import annotations
@@ -5,7 +6,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,32 +26,36 @@ from needle_controller.steering.simulation import (
     step_depths,
 )
 from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
     FloatArray,
     NeedleParameters,
     NeedlePath,
     NeedleShape,
-    STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET
 from needle_insertion.commands.common import (
     add_constants,
+    add_needle,
     check_file,
     constants,
     print_each,
     print_result,
     Subcommand,
+    with_unit,
 )
-from needle_insertion.commands.simulate_steering import made
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach, evenly
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
+from needle_ros.quantities import target as read_target
+from needle_ros.quantities import TARGET_HELP
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-TARGET = '0.004,0.1,-0.002'  #: default target [m]
+TARGET = '4mm,100mm,-2mm'  #: default target
 
 #: Constants of needle and tissue with an effect here; unknown disturbances are in the prior.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
@@ -67,16 +71,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--target',
-        default=TARGET,
+        nargs='+',
+        default=[TARGET],
         metavar='X,Y,Z',
-        help=f'target of the tip [m], Y is the depth (default {TARGET})',
+        help=f'target of the tip: {TARGET_HELP} (default {TARGET})',
     )
-    parser.add_argument(
-        '--needle',
-        choices=tuple(STEERING_PRESETS),
-        default=DEFAULT_STEERING_PRESET,
-        help=f'nominal model of needle and tissue (default {DEFAULT_STEERING_PRESET})',
-    )
+    add_needle(parser, DEFAULT_NEEDLE)
     parser.add_argument(
         '--law',
         default=DEFAULT_LAW,
@@ -89,18 +89,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
     parser.add_argument(
         '--step',
-        type=float,
         default=STEP_LENGTH,
-        metavar='M',
-        help=f'depth per step (default {STEP_LENGTH:g} m)',
+        help=f'depth per step (default {1e3 * STEP_LENGTH:g}mm)',
+        **with_unit('m'),
     )
     parser.add_argument(
         '--limit',
-        type=float,
         default=SIMULATION_LIMITS.guide_limit,
-        metavar='M',
         help='largest displacement of the guide along x and z '
-        f'(default {SIMULATION_LIMITS.guide_limit:g} m)',
+        f'(default {1e3 * SIMULATION_LIMITS.guide_limit:g}mm)',
+        **with_unit('m'),
     )
     parser.add_argument(
         '--turns',
@@ -110,10 +108,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--load-limit',
-        type=float,
         default=SIMULATION_LIMITS.load_limit,
-        metavar='N',
         help='largest planned lateral force on the guide (default: no limit)',
+        **with_unit('N'),
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
@@ -124,19 +121,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-def _line(line: NeedleShape | NeedlePath) -> FloatArray:
-    """Return a needle or its path as points x, y, z, shape (k, 3) [m]."""
-    return np.insert(line.deflections, 1, line.depths, axis=1)
-
-
-def _target(text: str) -> FloatArray:
-    try:
-        found = [float(word) for word in text.split(',')]
-    except ValueError:
-        found = []
-    if len(found) != 3 or not all(map(isfinite, found)) or found[1] <= 0.0:
-        raise ParameterError(f'--target takes X,Y,Z in m with a depth Y > 0, got {text!r}')
-    return np.array(found)
+def _line(line: NeedleShape | NeedlePath, frame: FloatArray) -> FloatArray:
+    """Return a needle or its path in the frame of the sensor, as points x, y, z, (k, 3) [m]."""
+    seen = line.deflections + np.outer(line.depths, frame)
+    return np.insert(seen, 1, line.depths, axis=1)
 
 
 class _Task(NamedTuple):
@@ -158,7 +146,14 @@ def _task(options: argparse.Namespace) -> _Task:
     find_law(options.law)
     if options.seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {options.seed}')
-    target = _target(options.target)
+    found = find_needle(options.needle)
+    target = np.array(read_target(' '.join(options.target)))
+    reach = found.needle.length - found.steering.free_length
+    if not 0.0 < target[1] <= reach:
+        raise ParameterError(
+            f'--target: the depth must be in (0, {1e3 * reach:g}] mm with the needle '
+            f'{options.needle}, got {1e3 * target[1]:g} mm'
+        )
     if not 0.0 < options.step <= target[1]:
         raise ParameterError(
             f'--step must be in (0, {target[1]:g}] m, the depth of the target, got '
@@ -170,7 +165,7 @@ def _task(options: argparse.Namespace) -> _Task:
     given = {**asdict(SteeringPrior()), **constants(options.prior)}
     return _Task(
         target,
-        *made(options.needle, options.set),
+        *found.changed(constants(options.set))[:2],
         from_values(SteeringPrior, given),
         step_depths(target[1], options.step),
     )
@@ -193,7 +188,6 @@ def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print the final tip positions of both needles."""
     target, needle, steering, prior, depths = _task(options)
     aim = target[[0, 2]]
-    model = SteeringModel(needle, steering, depths, prior)
     limits = replace(
         SIMULATION_LIMITS,
         guide_limit=options.limit,
@@ -201,7 +195,9 @@ def _run(options: argparse.Namespace) -> int:
         load_limit=options.load_limit,
     )
     try:
-        law = build_law(options.law, model, aim, limits)
+        with ProgressLine('model and first plan', brief=True):
+            model = SteeringModel(needle, steering, depths, prior)
+            law = build_law(options.law, model, aim, limits)
     except OutOfReachError as error:
         if options.output is not None:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
@@ -214,11 +210,13 @@ def _run(options: argparse.Namespace) -> int:
         return np.asarray(tip + prior.noise * noise.standard_normal(2))
 
     def watch(plant: SteeringPlant) -> None:
-        shapes.append(_line(plant.needle.shape))
+        shapes.append(_line(plant.needle.shape, truth.frame))
+        show(f'step {len(shapes)} of {len(depths) - 1}')
 
     ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
-    done = simulate_steering(law, ours, sensor, watch)
-    alone.insert()
+    with ProgressLine('steering', brief=True) as show:
+        done = simulate_steering(law, ours, sensor, watch)
+        alone.insert()
     tip, other, expected = ours.tip, alone.tip, law.expected()
     found: dict[str, Any] = {
         'target [m]': aim.tolist(),
@@ -238,19 +236,17 @@ def _run(options: argparse.Namespace) -> int:
     }
     print_each('warning', found['warnings'])
     if options.output is not None:
-        # In the frame of the needle, to which the sensor frame is rotated.
-        mark = target - np.array([truth.frame[0], 0.0, truth.frame[1]]) * target[1]
         figure = draw_needle(
             evenly(shapes, min(_SHOWN, len(shapes))),
-            _line(ours.needle.path),
-            mark,
-            _line(alone.needle.shape),
+            _line(ours.needle.path, truth.frame),
+            target,
+            _line(alone.needle.shape, truth.frame),
         )
         write_whole(options.output, png(figure))
     text = (
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
-        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.travel:.1f} mm in total '
-        f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
+        f'{1e3 * target[1]:g} mm, guide travel {1e3 * done.travel:.1f} mm, load on the guide up '
+        f'to {done.load:.1f} N, {done.turns} turns of the needle\n\n'
         f'{_text(found)}'
     )
     print_result(found, text, filter(None, [options.output]), as_json=options.json)
@@ -274,4 +270,4 @@ def _text(found: Mapping[str, Any]) -> str:
     return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
 
 
-COMMAND = Subcommand(_add_arguments, _run, signed=('--target',))
+COMMAND = Subcommand(_add_arguments, _run)

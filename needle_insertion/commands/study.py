@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle study`: simulate a population of insertions on all cores or on a cluster."""
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import check_folder, Subcommand
+from needle_insertion.commands.common import check_folder, print_result, Subcommand
+from needle_insertion.progress import ProgressLine
+from needle_insertion.report.text import table
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.process_pool import processes
 
@@ -50,7 +53,6 @@ def _run(options: argparse.Namespace) -> int:
             f"needle study needs {error.name}: pip install 'needle_insertion[study]'"
         ) from error
     from needle_study.study import read_study
-    from tqdm import tqdm
 
     study = read_study(options.study)
     folder = options.output or Path(f'{options.study.stem}_study')
@@ -66,17 +68,25 @@ def _run(options: argparse.Namespace) -> int:
         sys.stdout.write(f'sample {options.replay}: {bag}; {same}\n')
         return 0
     if not results.table.exists():
-        missing = sum(end - first for first, end in results.missing())
+        done = study.samples - sum(end - first for first, end in results.missing())
         with (
-            tqdm(
-                total=study.samples, initial=study.samples - missing, disable=None, unit=' samples'
-            ) as bar,
+            ProgressLine('study', brief=True) as show,
             _executor(options.scheduler, workers) as (executor, count),
         ):
-            engine.compute(results, executor, count, bar.update)
+
+            def count_samples(more: int) -> None:
+                nonlocal done
+                done += more
+                show(f'{done} of {study.samples} samples', done / study.samples)
+
+            show('starting the processes, and loading or compiling')
+            engine.compute(results, executor, count, count_samples)
     file = folder / 'study.html'
-    write_study(results, file)
-    sys.stdout.write(f'{study.samples} samples: {results.table}\npage: {file}\n')
+    with ProgressLine('page', brief=True):
+        found = write_study(results, file)
+    print_result(
+        found, table(found, ('result', 'value', 'interval')), (results.table, file), as_json=False
+    )
     return 0
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages to and from running nodes: targets, and the status of each node."""
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.errors import printable
 from needle_ros.requests import RequestStatus
-from needle_ros.status import NodeStatus, read_status
+from needle_ros.status import node_of, NodeStatus, read_status
 from needle_ros.timing import NANOSECONDS
 from rclpy.node import Node
 
@@ -44,7 +45,7 @@ def listen_states(
 
     def on_array(array: DiagnosticArray) -> None:
         for status in array.status:
-            name = printable(status.name.rpartition('/')[2])
+            name = printable(node_of(status.name).rpartition('/')[2])
             values = {printable(one.key): printable(one.value) for one in status.values}
             states[name] = State(
                 # rclpy represents a byte as bytes.

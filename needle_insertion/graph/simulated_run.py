@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run simulated nodes in lock-step, so that the result depends on simulated time only."""
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def start_nodes(
     lockstep: bool,
 ) -> list[NodeProcess]:
     """
-    Start nodes with their parameters, and wait until all except the plant are active.
+    Start nodes with their parameters, and wait until all are active, and the plant inactive.
 
     `file` is the parameter file of all nodes except the recorder. See `activate_plant`.
     """
@@ -124,6 +125,9 @@ def start_nodes(
     for name in nodes:
         if name != 'plant':
             graph.wait_active(node, name, show)
+    if 'plant' in nodes:
+        # A recorder subscribes to publishers that exist.
+        graph.change(node, 'plant', CONFIGURE)
     return processes
 
 
@@ -136,7 +140,6 @@ def activate_plant(
     ready: Callable[[], bool] = lambda: True,
 ) -> None:
     """Activate the plant when `ready`, and the plant has discovered the nodes in lock-step."""
-    graph.change(node, 'plant', CONFIGURE)
 
     def found() -> bool:
         status = states['plant'].status if 'plant' in states else None

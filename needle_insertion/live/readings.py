@@ -1,13 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read the newest measurements of a running graph on demand."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from time import time_ns
 from typing import Final
 
+from needle_controller.hardware import Robot, STAMPS
 from needle_insertion.live.waiting import waiting
 from needle_ros import contract
 from needle_ros.contract import Topic
-from needle_ros.errors import MessageError
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader, Reading
 from rclpy.node import Node
@@ -28,22 +32,34 @@ class Readings:
     Newest message of each sensor and of the reference.
 
     Messages arrive at 1 kHz: only a message that is requested is taken from the middleware. The
-    node subscribes and must not be spun.
+    node subscribes and must not be spun. A `robot` has topics, joints and units of its own.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, robot: Robot | None = None) -> None:
+        self._robot = robot
+        topics = dict(zip(_TOPICS, _TOPICS, strict=True))
+        if robot is not None:
+            own = robot.settings
+            for topic, name in (
+                (contract.JOINT_STATES, own.state_topic),
+                (contract.BASE_WRENCH, own.wrench_topic),
+            ):
+                topics[topic] = replace(topic, name=name or topic.name)
         #: Kept alive for its subscriptions.
         self._node = node
         self._newest: dict[str, bytes] = {}
+        #: Time of the last message [ns], for a robot without stamps.
+        self._received = 0
         self._readers = {topic.name: MessageReader(topic.type_name) for topic in _TOPICS}
         self._waiting = {
-            topic.name: waiting(node, topic, topic.qos._replace(depth=1)) for topic in _TOPICS
+            topic.name: waiting(node, used, topic.qos._replace(depth=1))
+            for topic, used in topics.items()
         }
 
     def newest(self, topic: Topic) -> Reading | None:
         """Return the newest message of a topic; None before the first, or if unreadable."""
         for message in self._waiting[topic.name]():
-            self._newest[topic.name] = message
+            self._newest[topic.name], self._received = message, time_ns()
         data = self._newest.get(topic.name)
         try:
             return None if data is None else self._readers[topic.name].read(data)
@@ -54,6 +70,8 @@ class Readings:
     def insertion(self, topic: Topic = contract.JOINT_STATES) -> tuple[float, float] | None:
         """Return insertion depth [m] and velocity [m/s] of a topic; None if unknown."""
         reading = self.newest(topic)
+        if topic is contract.JOINT_STATES and self._robot is not None:
+            return self._measured(self._robot)
         if reading is None or contract.INSERTION not in reading.names:
             return None
         at = reading.names.index(contract.INSERTION)
@@ -62,10 +80,28 @@ class Readings:
             return None
         return positions[at], velocities[at]
 
+    def _measured(self, robot: Robot) -> tuple[float, float] | None:
+        """Return insertion depth [m] and velocity [m/s] of a robot; None if unknown."""
+        reading = self._state()
+        try:
+            measured = None if reading is None else robot.measurement(reading)
+        except ParameterError:
+            # The controller reports the missing joint.
+            return None
+        return None if measured is None else (measured.depth, measured.velocity)
+
+    def _state(self) -> Reading | None:
+        """Return the newest joint states, with the time of arrival if they have no stamp."""
+        reading = self.newest(contract.JOINT_STATES)
+        stamped = self._robot is None or self._robot.settings.stamps == STAMPS[0]
+        if reading is None or stamped:
+            return reading
+        return reading._replace(stamp=self._received)
+
     @property
     def time(self) -> float:
         """Stamp of the newest measurement [s], by the clock of the robot; 0 before the first."""
-        reading = self.newest(contract.JOINT_STATES)
+        reading = self._state()
         return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
     def reference_rests_at(self, target: float) -> bool:
@@ -83,6 +119,7 @@ class Readings:
             words.append(f'depth {1e3 * insertion[0]:.2f} mm')
             words.append(f'{1e3 * insertion[1]:+.1f} mm/s')
         if (wrench := self.newest(contract.BASE_WRENCH)) is not None:
+            wrench = wrench if self._robot is None else self._robot.wrench(wrench)
             words.append(f'force {wrench.values[0][1]:+.2f} N')
         if (tip := self.newest(contract.TIP_DEFLECTION)) is not None:
             x, _, z = tip.values[0]

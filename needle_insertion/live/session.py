@@ -1,9 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Start nodes for a person or a script, and end them with the session."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 import os
 from pathlib import Path
 import signal
@@ -11,6 +12,7 @@ import sys
 from time import monotonic
 from typing import Any, Final
 
+from needle_controller.hardware import BY_TYPE, HardwareSettings, Robot
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import (
@@ -24,10 +26,14 @@ from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
 from needle_insertion.live.terminal import Terminal
 from needle_ros import contract
-from needle_ros.contract import Topic
+from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
+from needle_ros.settings import from_values
+from needle_ros.wire import JOINT_STATE, WRENCH
 from rclpy.node import Node
+from std_msgs.msg import String
+import yaml
 
 #: Folder of the parameter files, below the prefix of pip or colcon.
 _SHARE: Final = Path('share/needle_insertion/config')
@@ -79,7 +85,6 @@ def run(session: Session) -> int:
         node = graph.node('operator')
         _check_alone(session, graph, node, own=0, discovery=1.0)
         operator = Operator(node)
-        readings = Readings(Node('readings', context=graph.context))
         screen.say(f'starting {", ".join(session.nodes)}')
         # The first commands of a script are always executed at the same sample: time continues
         # until all sensors have reported.
@@ -87,7 +92,7 @@ def run(session: Session) -> int:
         witness = (
             Witness(node, lambda sample: sample.time < WARM_UP, lockstep=True) if holds else None
         )
-        processes = _bring_up(session, graph, node, operator, screen, holds=holds)
+        processes, readings = _bring_up(session, graph, node, operator, screen, holds=holds)
         terminal = Terminal(graph, operator, readings, screen)
         terminal.begin(session.nodes)
         screen.say(f'on domain {graph.domain}; `help` lists the words')
@@ -119,7 +124,7 @@ def _bring_up(
     screen: Screen,
     *,
     holds: bool,
-) -> list[NodeProcess]:
+) -> tuple[list[NodeProcess], Readings]:
     """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
     begin = monotonic()
 
@@ -131,16 +136,19 @@ def _bring_up(
         graph, node, session.nodes, show, session.file, lockstep=session.lockstep
     )
     own = 'plant' in session.nodes
-
-    def count(topic: Topic) -> int:
-        return node.count_subscribers(topic.name)
+    robot = None if own else _robot(graph, node)
+    readings = Readings(Node('readings', context=graph.context), robot)
+    state = (robot and robot.settings.state_topic) or contract.JOINT_STATES.name
+    # The node `steering` reads the topic of the contract.
+    others = own + ('steering' in session.nodes and state != contract.JOINT_STATES.name)
 
     def listen() -> bool:
         # This process subscribes, too.
-        subscribed = count(contract.JOINT_STATES) >= len(processes) + 1 + holds - own
-        return subscribed and count(contract.TARGET) >= len(processes) - own
+        subscribed = node.count_subscribers(state) >= len(processes) + 1 + holds - others
+        aimed = node.count_subscribers(contract.TARGET.name) >= len(processes) - own
+        return subscribed and aimed
 
-    what = 'the nodes' if own else 'a robot that publishes joint_states, and for the nodes'
+    what = 'the nodes' if own else f'a robot that publishes {state}, and for the nodes'
     graph.spin_until(listen, what, _START)
     _check_alone(session, graph, node, own=1)
     if own:
@@ -148,7 +156,24 @@ def _bring_up(
         followers = [name for name in session.nodes if name in ('recorder', 'steering')]
         number = session.lockstep * (holds + len(followers))
         activate_plant(graph, node, operator.states, number)
-    return processes
+    return processes, readings
+
+
+def _robot(graph: Graph, node: Node) -> Robot | None:
+    """Return the robot of the controller, by its configuration; None for the contract."""
+    topic = contract.CONFIGURATION.name.replace('~', 'controller')
+    latest = graph.latest(node, String, topic, LATCHED)
+    graph.spin_until(lambda: latest.message, topic, _START)
+    (document,) = yaml.safe_load(latest.message.data).values()
+    values, prefix = document['ros__parameters'], 'hardware.'
+    own = {item.name: values[f'{prefix}{item.name}'] for item in fields(HardwareSettings)}
+    # The controller has found the topics of their type.
+    for name, field in ((JOINT_STATE, 'state_topic'), (WRENCH, 'wrench_topic')):
+        if own[field] == BY_TYPE:
+            read = node.get_subscriber_names_and_types_by_node('controller', node.get_namespace())
+            found = [topic for topic, types in read if name in types]
+            own[field] = found[0] if len(found) == 1 else ''
+    return Robot(from_values(HardwareSettings, own, prefix))
 
 
 def _check_alone(

@@ -1,16 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
 """Execute the commands of `needle run`, typed by a person or read from a script."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
-from math import inf, isfinite
+from math import inf
 import re
 import shlex
 from time import monotonic
 from typing import Final
 
 from needle_controller import LAWS
+from needle_dynamics import DEFAULT_NEEDLE
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
@@ -20,7 +22,9 @@ from needle_insertion.live.requests import CONTROLLER, STEERING
 from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
+from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.quantities import quantity, target, TARGET_HELP
 from needle_ros.status import (
     CommissioningPhase,
     ControllerStatus,
@@ -29,7 +33,6 @@ from needle_ros.status import (
     SteeringStatus,
 )
 from rclpy.task import Future
-import yaml
 
 #: Timeout of the first status and the first measurements of a node [s].
 _ANSWER: Final = 30.0
@@ -54,9 +57,6 @@ _NEEDED: Final = (
 #: Shortest time between two prints of the same warning [s].
 _AGAIN: Final = 30.0
 
-#: Meters in a unit.
-_UNITS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
-
 _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
 _ERROR: Final = _LEVELS.index('ERROR')
 
@@ -66,10 +66,10 @@ _AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE, SteeringPhase.STOPPED
 #: Arguments and description of each command.
 WORDS: Final = {
     'target': (
-        'DEPTH | X Y Z',
-        'insert to a depth, or steer the tip to a point: 0.05 or 50mm [m]',
+        'DEPTH | X,Y,Z',
+        f'insert to a depth, 50mm, or steer the tip to {TARGET_HELP}',
     ),
-    'wait': ('[SECONDS]', 'wait until the needle is at its target'),
+    'wait': ('[TIME]', 'wait until the needle is at its target, at most 20s'),
     'pause': ('', 'brake to rest and hold'),
     'resume': ('', 'continue after a pause'),
     'retract': ('', 'withdraw to retract_depth'),
@@ -214,12 +214,13 @@ class Terminal:
 
     def _target(self, *words: str) -> None:
         aims = self._operator.aims
-        if len(words) not in (1, 3):
+        if not words:
             raise _unfit('target', words)
-        at = [_length(word) for word in words]
-        if len(at) == 3 and aims != STEERING:
-            raise ParameterError('a target off the axis needs the node steering: --steering')
-        x, y, z = at if len(at) == 3 else (0.0, at[0], 0.0)
+        x, y, z = target(' '.join(words))
+        if (x or z) and aims != STEERING:
+            raise ParameterError(
+                f'a target off the axis needs a needle that bends: --needle {DEFAULT_NEEDLE}'
+            )
         pending = self._operator.target(x, y, z)
 
         def answered() -> bool:
@@ -235,10 +236,7 @@ class Terminal:
         self._say(f'{aims}: on its way')
 
     def _wait(self, *words: str) -> None:
-        try:
-            (longest,) = map(float, words or ('inf',))
-        except ValueError:
-            longest = -inf
+        longest = quantity(' '.join(words) or 'inf', 's')
         if not longest >= 0.0:
             raise _unfit('wait', words)
         # Time of the robot: simulated time may be slower than the time of this machine.
@@ -278,8 +276,8 @@ class Terminal:
             raise _unfit('set', words)
         node, name, text = words
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
+            value = read_document(text)
+        except DocumentError as error:
             raise ParameterError(f'{text!r} is not a value in YAML') from error
         if isinstance(value, dict) or value is None:
             raise ParameterError(f'{text!r} is not a value of a parameter')
@@ -311,18 +309,6 @@ class Terminal:
 def _unfit(word: str, given: Sequence[str]) -> ParameterError:
     takes, _ = WORDS[word]
     return ParameterError(f'{word} takes {takes or "nothing"}, got {" ".join(given) or "nothing"}')
-
-
-def _length(word: str) -> float:
-    """Parse a length in m, or with a unit."""
-    found = re.fullmatch(r'(.*?)\s*(mm|cm|m)?', word)
-    try:
-        value = float(found[1]) * _UNITS[found[2] or 'm'] if found else inf
-    except ValueError:
-        value = inf
-    if not isfinite(value):
-        raise ParameterError(f'{word!r} is not a length, such as 0.05 or 50mm')
-    return value
 
 
 def _has_accepted(state: State, topic: str) -> bool:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read a recorded plant run from a bag: events, commands and measurements by sample number."""
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray, NeedleError
+from needle_dynamics.needles import FILES
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.assembly import SETTINGS
 from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRun, TRAJECTORY
 from needle_identification import Bag, BagTopic, deserialize, RecordingError
@@ -141,6 +144,9 @@ class RecordedRun:
         made = (event.content for _, _, event in recorded if event.kind == CONFIGURED)
         #: Parameters and constants at the start, and topics by full name.
         self.values = {**_UNLIMITED, **next(made, configurations[0][1])}
+        # `model.preset` in older versions. All constants are recorded: no file is read.
+        needle = self.values.pop('needle', self.values.pop('model.preset', PAPER_NEEDLE))
+        self.values['needle'] = PAPER_NEEDLE if str(needle).endswith(FILES) else needle
         lacking = next((name for name in _NEEDED if name not in self.values), None)
         if lacking:
             raise RecordingError(f'{path}: the parameters of {name} lack {lacking!r}')
@@ -262,6 +268,5 @@ class RecordedRun:
         known = {f'{prefix}{x.name}' for prefix, kind in SETTINGS.items() for x in fields(kind)}
         namespaces = tuple(filter(None, SETTINGS))
         given = {name for name in self.values if name.startswith(namespaces)}
-        foreign = given - known - {'model.preset'}
-        if foreign:
+        if foreign := given - known:
             yield f'recorded by another version, with {", ".join(sorted(foreign))}'

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Report pages of identified friction and stiffness: results, data and warnings."""
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from needle_insertion.report.identify_text import (
     MEAN_HEADS,
     mean_row,
     parameter_cells,
+    prediction_lines,
     PUNCTURE_HEADS,
     puncture_rows,
     short_names,
@@ -92,6 +94,7 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
         ],
         'heads': ('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
         'puncture_rows': puncture_rows(summary),
+        'predictions': prediction_lines(summary),
         'puncture_heads': PUNCTURE_HEADS,
         'values': values,
         'live': [
@@ -191,6 +194,7 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
                 'by the curl of the force, within its uncertainty',
             ),
         ],
+        'predictions': prediction_lines(summary),
         'places': _counted(len(estimates), 'place'),
         'heads': ('force', *_ENTRY_HEADS),
         'mean_rows': [

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Format identified parameters as text, tables for the terminal, and JSON."""
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from needle_identification import (
 )
 from needle_identification.estimation.estimate import statistic
 from needle_identification.estimation.formatting import between, measured, spread
+from needle_identification.estimation.prediction import Moments
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.text import table
 import numpy as np
@@ -102,7 +104,22 @@ def _friction_text(summary: FrictionSummary) -> str:
     tables = [table([mean_row(one) for one in means], MEAN_HEADS), table(rows, heads)]
     if found := puncture_rows(summary):
         tables.append(table(found, PUNCTURE_HEADS))
+    tables += prediction_lines(summary)
     return '\n\n'.join(tables)
+
+
+def prediction_lines(summary: FrictionSummary | StiffnessSummary) -> list[str]:
+    """Return a sentence with the error of predicted recordings, for each level of force."""
+    if isinstance(summary, FrictionSummary):
+        found = [('', summary.prediction)]
+    else:
+        found = [(f'{level.force:.2f} N: ', level.prediction) for level in summary.levels]
+    return [
+        f'{where}force of a recording predicted from the others: error {one.rms:.3g} N rms, '
+        f'95 % interval {between(one.interval)}; residual {one.residual:.3g} N'
+        for where, one in found
+        if one is not None
+    ]
 
 
 def puncture_rows(summary: FrictionSummary) -> list[tuple[str, ...]]:
@@ -136,8 +153,10 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
     ]
     matrices = table(rows, ('mean ± SE (STD)', *forces))
     intervals = table(by_force, ('95 % interval', *(one.symbol for one in entries), 'bags'))
+    predictions = '\n'.join(prediction_lines(summary))
+    predictions += '\n\n' if predictions else ''
     return (
-        f'{matrices}\n\n{intervals}\n\n'
+        f'{matrices}\n\n{intervals}\n\n{predictions}'
         f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
         f'95 % interval {between(result.interval)}'
     )
@@ -186,7 +205,9 @@ def plain(value: Any) -> Any:
         named = {item.name: getattr(value, item.name) for item in fields(value)}
         # Arrays as long as the recording are only for figures.
         return {
-            name: plain(one) for name, one in named.items() if not isinstance(one, (Fit, Presses))
+            name: plain(one)
+            for name, one in named.items()
+            if not isinstance(one, (Fit, Moments, Presses))
         }
     if isinstance(value, dict):
         return {str(key): plain(one) for key, one in value.items()}

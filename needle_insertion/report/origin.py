@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Provenance of an identified result: recordings, files, settings and losses."""
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
+from needle_insertion.progress import ProgressLine
 from needle_ros.errors import NeedleError
-from tqdm import tqdm
 
 _PIECE: Final = 1 << 20  #: block size for reading a file [bytes]
 
@@ -109,26 +110,28 @@ def identify_all(
     """Identify recordings except copies and unusable ones; return estimates and origin."""
     estimates, sources, failures, copies = [], [], [], []
     seen: dict[bytes, str] = {}
-    for bag in tqdm(bags, desc='bags', disable=None, leave=False):
-        try:
-            recording = read(bag)
-            if recording.digest in seen:
-                copies.append((recording.name, seen[recording.digest]))
+    with ProgressLine('identification', brief=True) as show:
+        for number, bag in enumerate(bags, 1):
+            show(f'recording {number} of {len(bags)}')
+            try:
+                recording = read(bag)
+                if recording.digest in seen:
+                    copies.append((recording.name, seen[recording.digest]))
+                    continue
+                seen[recording.digest] = recording.name
+                estimates.append(identify(recording))
+            except (NeedleError, OSError) as error:
+                failures.append((str(bag), str(error)))
                 continue
-            seen[recording.digest] = recording.name
-            estimates.append(identify(recording))
-        except (NeedleError, OSError) as error:
-            failures.append((str(bag), str(error)))
-            continue
-        sources.append(
-            RecordingSource(
-                name=recording.name,
-                losses=recording.losses,
-                clock_offset=recording.clock_offset,
-                samples=len(recording.time),
-                files=_digests(bag) if digest else (),
+            sources.append(
+                RecordingSource(
+                    name=recording.name,
+                    losses=recording.losses,
+                    clock_offset=recording.clock_offset,
+                    samples=len(recording.time),
+                    files=_digests(bag) if digest else (),
+                )
             )
-        )
     return estimates, replace(
         origin, sources=tuple(sources), failures=tuple(failures), copies=tuple(copies)
     )

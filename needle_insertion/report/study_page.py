@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write the page of a study."""
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ _MISSING: Final = 'Samples without a value of a metric are excluded from it.'
 _WORST: Final = 10  #: number of worst samples in the list
 
 
-def write_study(results: Results, path: Path) -> None:
-    """Write the page of a study whose table is complete."""
+def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
+    """Write the page of a study whose table is complete; return its main results as rows."""
     study, table = results.study, results.table
     metrics, drawn = study.scenario.metrics, list(study.population)
     main = next(iter(metrics))
@@ -142,6 +143,7 @@ def write_study(results: Results, path: Path) -> None:
         sections=sections,
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
+    return cards
 
 
 def _section(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Report a simulated trajectory as summary, CSV, figure and bag."""
 
 from __future__ import annotations
@@ -96,26 +97,14 @@ def _csv(trajectory: Trajectory) -> bytes:
 
 
 def _figure(trajectory: Trajectory) -> Figure:
-    """Draw insertion depth, modal coordinates and tip deflection over time."""
+    """Draw the trajectory, with the time at which the hub reaches the skin."""
     from matplotlib.figure import Figure
 
-    result = Figure(figsize=(9.0, 7.0), layout='constrained')
-    above, middle, below = result.subplots(3, 1, sharex=True)
-    time = trajectory.time * 1e3
-    above.plot(time, trajectory.depth * 1e3)
-    above.set_ylabel('insertion depth [mm]')
-    for i in range(trajectory.parameters.modes):
-        middle.plot(time, trajectory.states[:, 2 + i] * 1e3, label=f'q{i + 1}')
-    middle.set_ylabel('modal coordinates [1e-3 m^3/2]')
-    below.plot(time, trajectory.tip_deflection * 1e3)
-    below.set_ylabel('tip deflection [mm]')
-    below.set_xlabel('time [ms]')
-    at_hub = time[trajectory.depth >= trajectory.parameters.length]
-    for axis in (above, middle, below):
+    result = Figure(figsize=(9.0, 9.0), layout='constrained')
+    at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]
+    for axes in trajectory.plot(result):
         if at_hub.size:
-            axis.axvline(at_hub[0], color='0.5', linestyle='--', label='hub at the skin')
-        axis.grid(visible=True, alpha=0.3)
-    middle.legend()
+            axes.axvline(at_hub[0], color='0.5', linestyle='--', label='hub at the skin')
     return result
 
 

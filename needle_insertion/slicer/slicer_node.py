@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `slicer`: OpenIGTLink connection to 3D Slicer, targets in and needle pose out."""
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.publishers_node import request_stamp
 from needle_ros.requests import PendingRequest, RequestStatus
 from needle_ros.run_node import run
-from needle_ros.status import Diagnosis, SlicerPhase, SlicerStatus
+from needle_ros.status import Diagnosis, node_of, SlicerPhase, SlicerStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
 
@@ -74,15 +75,6 @@ class SlicerNode(BaseNode):
         #: Unanswered target with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
 
-        self._target = self.publisher(contract.TARGET)
-        self._tip_pose = self.publisher(contract.TIP_POSE)
-        # Sensor drivers may publish their shapes with the QoS of sensors.
-        self.subscribe(replace(contract.NEEDLE_POSES, qos=contract.SENSOR), self._on_poses)
-        self.listen(contract.JOINT_STATES, self._on_joints)
-        self.listen(contract.TIP_DEFLECTION, self._on_tip)
-        self.subscribe(contract.TIP_EXPECTED, self._on_expected)
-        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
-
     # Transitions.
 
     def configure(self) -> None:
@@ -98,6 +90,14 @@ class SlicerNode(BaseNode):
         registration = self.settings('registration.', Registration)
         self._interpreter = Interpreter(registration, settings.reach)
         self._link = Connection(settings, is_wanted, self._events)
+        self._target = self.publisher(contract.TARGET)
+        self._tip_pose = self.publisher(contract.TIP_POSE)
+        # Sensor drivers may publish their shapes with the QoS of sensors.
+        self.subscribe(replace(contract.NEEDLE_POSES, qos=contract.SENSOR), self._on_poses)
+        self.listen(contract.JOINT_STATES, self._on_joints)
+        self.listen(contract.TIP_DEFLECTION, self._on_tip)
+        self.subscribe(contract.TIP_EXPECTED, self._on_expected)
+        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
         """Discard the connection."""
@@ -167,7 +167,7 @@ class SlicerNode(BaseNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            name, level = status.name.lstrip('/'), int.from_bytes(status.level, 'little')
+            name, level = node_of(status.name).lstrip('/'), int.from_bytes(status.level, 'little')
             self._states.take(name, level, printable(status.message), monotonic())
             if self._sending is not None:
                 values = {one.key: one.value for one in status.values}
@@ -299,7 +299,8 @@ def _quaternion(orientation: Any) -> list[float]:
 
 
 def _check_frame(frame: str) -> None:
-    if frame not in ('', contract.ENTRY):
+    # The plant may have a prefix.
+    if frame and not frame.endswith(contract.ENTRY):
         raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
 
 

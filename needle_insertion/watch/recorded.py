@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frames of a bag at any time."""
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import RATE, row, SPAN, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.status import node_of
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader, read_line, read_string, Reading
 
@@ -122,7 +124,7 @@ class ShownRecording:
         elif name == contract.DIAGNOSTICS.name:
             for status in deserialize(message.topic, data).status:
                 # Called at once.
-                self._nodes.setdefault(status.name, _Kept()).add(time, lambda: status)  # noqa: B023
+                self._nodes.setdefault(node_of(status.name), _Kept()).add(time, lambda: status)  # noqa: B023
         else:
             parameters = parameters_of(read_string(data))
             self._configurations[name].add(time, lambda: parameters)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 HTTP and WebSocket server of the page: its files, frames and commands.
 
@@ -152,8 +153,8 @@ class Server:
             await self.end()
             other = self._port + 1 if self._port < 65535 else PORT
             raise ParameterError(
-                f'cannot listen on {self._host}, port {self._port}: {_reason(error)}; valid: '
-                f'another --port, such as {other}, or 0 for a free one'
+                f'cannot listen on {self._host}, port {self._port}: {_reason(error)}; '
+                f'use another one, such as --port {other}, or --port 0 for a free one'
             ) from error
         self._port = self._runner.addresses[0][1]
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State of the page: stores messages of all topics and returns frames."""
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from needle_dynamics import FloatArray
 from needle_insertion.watch.scene import scene
 from needle_ros import contract
 from needle_ros.errors import printable
-from needle_ros.status import ControllerStatus, NodeStatus, read_status, SteeringStatus
+from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -90,9 +91,10 @@ class View:
 
     def status(self, status: Any, now: float) -> None:
         """Store the status of a node at a time [s]."""
-        if status.name in self._nodes or len(self._nodes) < _NODES:
+        node = node_of(status.name)
+        if node in self._nodes or len(self._nodes) < _NODES:
             values = {pair.key: pair.value for pair in status.values}
-            self._nodes[status.name] = now, status, read_status(values)
+            self._nodes[node] = now, status, read_status(values)
 
     # Output.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Record, check and draw a steered insertion, and the same insertion with a guide at rest."""
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ PLANT: Final[dict[str, object]] = {
 
 #: Node `steering`: half the default measurement time of the tip, for a short demo.
 STEERING: Final[dict[str, object]] = {
-    'model.preset': bending.PRESET,
+    'needle': bending.PRESET,
     'speed': SPEED,
     'guide_speed': 0.02,
     'settle_time': 0.05,
@@ -58,7 +59,7 @@ STEERING: Final[dict[str, object]] = {
 
 #: Node `controller`.
 CONTROLLER: Final[dict[str, object]] = {
-    'model.preset': bending.PRESET,
+    'needle': bending.PRESET,
     'rate': RATE,
     'deflection_feedback': 'none',
     'reference.speed': SPEED,

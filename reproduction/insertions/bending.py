@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Record, check and draw an insertion of a bending needle whose guide and roll move."""
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from typing import Final
 from builtin_interfaces.msg import Duration
 from matplotlib.figure import Figure
 from needle_dynamics import bending_length, FloatArray
-from needle_dynamics.steering.parameters import NEEDLES
+from needle_dynamics.needles import NEEDLES
 from needle_identification import (
     identify_steering,
     read_steering_recording,
@@ -28,7 +29,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 #: Preset of needle and tissue, and plant with a bevel load and a tracker in the tip.
 PRESET: Final = 'bending_35mm'
 PLANT: Final[dict[str, object]] = {
-    'model.preset': PRESET,
+    'needle': PRESET,
     'steered': True,
     'steering.bevel_load': [0.6],
     'steering.cutting_force': [1.0],
@@ -66,7 +67,7 @@ def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) 
 
 def bending_checks(bag: Path) -> list[Check]:
     """Check the deflection, the replay of the run, and the identified bending length."""
-    needle = NEEDLES[PRESET]
+    needle = NEEDLES[PRESET].needle
     truth = bending_length(needle.bending_stiffness, needle.tissue_stiffness)
     (tip, _) = read_needles(bag)
     aside = float(np.hypot(tip[-1][-1, 0], tip[-1][-1, 2]))

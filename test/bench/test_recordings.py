@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering and identification on recorded insertions, here on tables that the test writes."""
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from benchmarks.recordings.plants import (
 from benchmarks.recordings.replay import figures, follow, LAWS, replay, ReplaySettings
 from needle_controller.steering.law import GuideSetpoint
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
-from needle_dynamics.steering.parameters import NEEDLES, tissue_of
+from needle_dynamics.needles import NEEDLES
+from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import RecordingError, SteeringRecording
 from needle_identification.steering.prediction import predict, Prediction, rms_of
 from needle_identification.steering.search import Search, Tips
@@ -46,7 +48,7 @@ def _insertion(seed: int, *, moves: bool = True) -> tuple[FloatArray, FloatArray
     rng = np.random.default_rng(seed)
     guide = np.cumsum(rng.normal(0.0, 1e-3, (_STEPS + 1, 2)), axis=0) * moves
     guide -= guide[0]
-    nominal = NEEDLES['phantom']
+    nominal = NEEDLES['phantom'].needle
     tissue = tissue_of(nominal.bending_stiffness, _LENGTH)
     needle = SteeredNeedle(
         replace(nominal, tissue_stiffness=tissue),

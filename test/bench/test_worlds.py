@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Laws of the simulated needles, guides and sensors that are independent of the model."""
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from benchmarks.worlds.world import CELL, DrawnConstants, IndependentNeedle
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
-from needle_dynamics.steering.parameters import NEEDLES
+from needle_dynamics.needles import NEEDLES
 from needle_dynamics.steering.reference_models import bicycle
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -72,7 +73,7 @@ def inserted(
 
 def own(c: DrawnConstants) -> SteeringPlant:
     """Return the needle of the project's model, with its elements of 0.5 mm."""
-    needle = replace(NEEDLES['phantom'], tissue_stiffness=c.tissue)
+    needle = replace(NEEDLES['phantom'].needle, tissue_stiffness=c.tissue)
     steering = SteeringParameters(
         free_length=c.free,
         skin_stiffness=c.skin,

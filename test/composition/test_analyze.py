@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Output, written files and error messages of `needle analyze`."""
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
 
 def test_json_contains_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str]) -> None:
     """Every combination of the values has the matrices and metrics of the library."""
-    words = ('--preset', 'paper_si', '--formulation', 'as_printed', '--modes', '1')
+    words = ('--needle', 'paper_si', '--formulation', 'as_printed', '--modes', '1')
     points = ('--depth', '0.05', '0.1', '--tip-deflection', '0', '1e-3', '--speed', '0.01')
     found = found_by(capsys, *words, *points, '--force', '2')
     assert [(point['depth'], point['tip_deflection']) for point in found['points']] == [

@@ -1,23 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
 """Gymnasium environments: checker, seeds, and vector environments."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+from benchmarks.policies import EXPERT, returns
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.errors import InsertionDepthError
-from needle_ros.errors import ParameterError
+from needle_ros.errors import ParameterError, ShapeError
 from needle_study.gym.insertion import (
     DRAWN,
     InsertionEnv,
     InsertionVectorEnv,
     SPREAD,
-    START,
     TARGETS,
 )
-from needle_study.gym.pushed import FORCE, PERIOD, STEP
+from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
 from needle_study.gym.steering import SteeringEnv
 import numpy as np
 import pytest
@@ -27,26 +29,31 @@ import pytest
 @pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
 def test_environments_pass_the_gymnasium_checker(name: str) -> None:
     """Environments are registered by module and name; the same seed gives the same episode."""
-    with gymnasium.make(f'needle_study.gym:{name}') as environment:
-        check_env(environment.unwrapped, skip_render_check=True)
+    with gymnasium.make(f'needle_study.gym:{name}', render_mode='rgb_array') as environment:
+        check_env(environment.unwrapped)
 
 
 def test_vector_equals_single_environments_with_separate_seeds() -> None:
     """Bitwise equal at each step, also across truncated episodes."""
     many = InsertionVectorEnv(3, max_episode_steps=20)
     single = [gymnasium.wrappers.TimeLimit(InsertionEnv(), 20) for _ in range(3)]
-    observations, _ = many.reset(seed=5)
+    observations, infos = many.reset(seed=5)
     for k, one in enumerate(single):
-        assert np.array_equal(one.reset(seed=5 + k)[0], observations[k])
+        observation, info = one.reset(seed=5 + k)
+        assert np.array_equal(observation, observations[k])
+        assert info == {name: infos[name][k] for name in info}
     rng, begins = np.random.default_rng(1), np.zeros(3, dtype=bool)
     for _ in range(30):
         actions = rng.uniform(-1.0, 1.0, (3, 1))
-        observations, rewards, ended, broken, _ = many.step(actions)
+        observations, rewards, ended, broken, infos = many.step(actions)
         for k, one in enumerate(single):
             if begins[k]:
-                expected, reward, over, late = one.reset()[0], 0.0, False, False
+                expected, info = one.reset()
+                reward, over, late = 0.0, False, False
             else:
-                expected, reward, over, late, _ = one.step(actions[k])
+                expected, reward, over, late, info = one.step(actions[k])
+            assert info == {name: infos[name][k] for name in info}
+            assert all(infos[f'_{name}'][k] for name in info)
             assert np.array_equal(observations[k], expected)
             assert (rewards[k], ended[k], broken[k]) == (reward, over, late)
         begins = ended | broken
@@ -89,15 +96,20 @@ def test_environment_equals_the_integrator() -> None:
     one = Integrator(parameters, NeedleModel(parameters).state_at(START), STEP)
     # Insert, withdraw, and leave the range.
     for force in [FORCE] * 20 + [-FORCE] * 200:
-        seen, reward, over, _, _ = environment.step(np.array([force / FORCE]))
+        before = abs(target - one.depth)
+        seen, reward, over, _, info = environment.step(np.array([force / FORCE]))
         try:
             one.advance(PERIOD, force)
         except InsertionDepthError:
-            assert over
-            assert reward == -1.0
+            left = True
+        else:
+            left = False
+        progress = (before - abs(target - one.depth)) / abs(target - START)
+        assert reward == progress - 0.001 - 0.003 - (2.0 if left else 0.0)
+        assert info == {'error': target - one.depth, 'force': force, 'success': False}
+        assert over == left
+        if left:
             break
-        assert not over
-        assert reward == -abs(target - one.depth) - 1e-5 * force * force
         tip = one.model.tip_deflection(one.state)
         expected = [10.0 * (target - one.depth), 10.0 * one.velocity, 10.0 * one.depth, 1e3 * tip]
         # Observations have the precision of 32 bits.
@@ -106,28 +118,79 @@ def test_environment_equals_the_integrator() -> None:
         pytest.fail('the needle did not come out')
 
 
-def test_force_that_is_not_finite_is_rejected() -> None:
-    environment = InsertionEnv()
+@pytest.mark.parametrize(
+    ('actions', 'error', 'complaint'),
+    [
+        (np.full((64, 1), np.nan), ParameterError, r'actions must be finite, got nan'),
+        (np.zeros((3, 1)), ShapeError, r'actions must have shape \(64, 1\), got \(3, 1\)'),
+        (np.zeros(64), ShapeError, r'actions must have shape \(64, 1\), got \(64,\)'),
+        (0.5, ShapeError, r'actions must have shape \(64, 1\), got \(\)'),
+        ('in', ShapeError, r"actions must be numbers, got 'in'"),
+    ],
+)
+def test_invalid_actions_are_rejected(
+    actions: Any, error: type[Exception], complaint: str
+) -> None:
+    """With one line, before a needle moves."""
+    many = InsertionVectorEnv(64)
+    before, _ = many.reset(seed=1)
+    with pytest.raises(error, match=f'^{complaint}$'):
+        many.step(actions)
+    after, *_ = many.step(np.zeros((64, 1)))
+    assert np.array_equal(after, before)
+
+
+@pytest.mark.parametrize('kind', [InsertionEnv, SteeringEnv])
+def test_invalid_action_of_one_needle_is_rejected(kind: Any) -> None:
+    environment = kind()
+    size = environment.action_space.shape[0]
     environment.reset(seed=1)
-    with pytest.raises(ParameterError, match='an action must be finite'):
-        environment.step(np.array([np.nan]))
+    with pytest.raises(ParameterError, match=r'^actions must be finite, got nan$'):
+        environment.step(np.full(size, np.nan))
+    for action, shape in ((0.5, r'\(\)'), (np.zeros(5), r'\(5,\)')):
+        with pytest.raises(
+            ShapeError, match=rf'^actions must have shape \({size},\), got {shape}$'
+        ):
+            environment.step(action)
 
 
-def test_push_toward_the_target_has_a_higher_reward_than_no_push() -> None:
-    """The reward distinguishes policies."""
+@pytest.mark.parametrize('kind', [InsertionEnv, SteeringEnv])
+def test_images_show_needle_and_target(kind: Any) -> None:
+    """The needle is longer after an insertion; without a render mode there is no image."""
+    environment = kind(render_mode='rgb_array')
+    environment.reset(seed=2)
+    before = environment.render()
+    for _ in range(5):
+        environment.step(np.ones(environment.action_space.shape))
+    after = environment.render()
+    needle, target = (40, 40, 60), (200, 30, 30)
+    assert (before == target).all(axis=2).any()
+    lengths = [(image == needle).all(axis=2).any(axis=0).sum() for image in (before, after)]
+    assert lengths[1] > lengths[0]
+    without = kind()
+    without.reset(seed=2)
+    assert without.render() is None
+    with pytest.raises(ParameterError, match=r'render_mode must be one of rgb_array, got .human'):
+        kind(render_mode='human')
 
-    def earned(law: float) -> float:
-        environment = InsertionEnv()
-        seen, _ = environment.reset(seed=3)
-        total = 0.0
-        for _ in range(200):
-            seen, reward, over, _, _ = environment.step(np.array([law * seen[0]]))
-            total += reward
-            if over:
-                break
-        return total
 
-    assert earned(3.0) > 0.5 * earned(0.0)
+def test_vector_environment_has_an_image_of_each_needle() -> None:
+    many = InsertionVectorEnv(3, render_mode='rgb_array')
+    one = InsertionEnv(render_mode='rgb_array')
+    many.reset(seed=4)
+    one.reset(seed=6)
+    assert np.array_equal(many.render()[2], one.render())
+    assert InsertionVectorEnv(3).render() is None
+
+
+def test_a_good_controller_earns_more_than_every_trivial_policy() -> None:
+    """For each of 100 needles; the benchmark of studies has a thousand."""
+    totals = returns(100)
+    best = totals.pop(EXPERT)
+    for name, values in totals.items():
+        assert (best > values).all(), name
+    # All needles arrive: progress and arrival are 2, less time and force.
+    assert best.min() > 0.5
 
 
 def test_moving_guide_reduces_the_mean_miss() -> None:

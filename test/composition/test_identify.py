@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Output, warnings, written files and exit status of `needle identify`."""
 
 import json
@@ -52,7 +53,8 @@ def test_tables_contain_every_parameter_with_error_and_interval(
 ) -> None:
     """Means over the bags with 95 % interval and STD, and each bag; breakaway follows mu_s."""
     out, _ = identify(capsys, 'friction', *BAGS)
-    whole, each = out.split('\n\n')
+    whole, each, predicted = out.split('\n\n')
+    assert predicted.startswith('force of a recording predicted from the others: error ')
     heads = whole.splitlines()[0]
     assert re.split(r' {2,}', heads) == [
         'parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags',
@@ -271,7 +273,8 @@ def test_stiffness_table_has_a_column_per_force_as_table_2(
 ) -> None:
     """Each entry of the matrix at each force, and k_a at the largest force."""
     out, _ = identify(capsys, 'stiffness', *places)
-    matrices, intervals, result = out.strip().split('\n\n')
+    matrices, intervals, predicted, result = out.strip().split('\n\n')
+    assert re.findall(r'^1\.\d\d N: force of a recording', predicted, re.MULTILINE)
     assert re.split(r' {2,}', matrices.splitlines()[0])[1:] == ['1.10 N', '1.50 N']
     assert re.findall(r'^1\.\d\d N', intervals, re.MULTILINE) == ['1.10 N', '1.50 N']
     for i, entry in enumerate(('k_xx', 'k_xz', 'k_zx', 'k_zz')):

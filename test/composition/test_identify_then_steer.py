@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Insert three times, identify the needle, and steer it with the parameter file."""
 
 from __future__ import annotations
@@ -12,9 +13,8 @@ from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
-from needle_dynamics import SteeredNeedle, SteeringParameters
-from needle_dynamics.simulated.assembly import defaults_of
-from needle_dynamics.steering.parameters import DEFAULT_STEERING_PRESET, tissue_of
+from needle_dynamics import find_needle, SteeredNeedle, SteeringParameters
+from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import identify_steering
 from needle_identification.result import steering_yaml
 import numpy as np
@@ -33,17 +33,15 @@ SENSOR = 4e-5
 
 def model(parameters: Mapping[str, Any]) -> SteeringModel:
     """Return the model of a law with the default needle and these parameters of the node."""
+    given = dict(parameters)
+    needle = find_needle(given.pop('needle', 'bending_35mm'))
     groups: dict[str, dict[str, Any]] = {'model': {}, 'steering': {}, 'prior': {}}
-    for name, value in parameters.items():
+    for name, value in given.items():
         group, _, key = name.partition('.')
         groups[group][key] = value
-    preset = groups['model'].pop('preset', DEFAULT_STEERING_PRESET)
-    return SteeringModel(
-        replace(defaults_of('model.', preset), **groups['model']),
-        replace(defaults_of('steering.', preset), **groups['steering']),
-        DEPTHS,
-        SteeringPrior(**groups['prior']),
-    )
+    preset = needle.changed({**groups['model'], **groups['steering']})
+    prior = SteeringPrior(**groups['prior'])
+    return SteeringModel(preset.needle, preset.steering, DEPTHS, prior)
 
 
 def miss(steered: SteeringModel, target: tuple[float, float], seed: int) -> float:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Example of inference: simulation and summary statistics, without the optional package sbi."""
 
 from __future__ import annotations
@@ -7,7 +8,7 @@ from pathlib import Path
 import runpy
 import sys
 
-from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import FloatArray, NEEDLES, SteeredNeedle
 import numpy as np
 import pytest
 
@@ -27,7 +28,7 @@ def test_tip_measurements_equal_single_needles() -> None:
         drawn(20, **quiet, tilt_x=0.0, tilt_z=0.01, frame_x=0.0, frame_z=0.02), 2
     )
     depths, layer, stiffer = (EXAMPLE[name] for name in ('DEPTHS', 'LAYER', 'STIFFER'))
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    needle, steering, _ = NEEDLES['bending_35mm']
     k = needle.tissue_stiffness
     one = SteeredNeedle(
         replace(needle, layer_depths=(layer,), layer_stiffnesses=(stiffer * k,)),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress display of long jobs: activity and elapsed time."""
 
 import io
@@ -64,3 +65,14 @@ def test_terminal_line_is_updated_during_the_job(
     assert text.endswith('\n')
     assert text.count('inserting 35 %') >= 2
     assert all('insertion' in part for part in text.split('\r\033[K')[1:])
+
+
+def test_brief_line_is_removed_from_a_terminal_and_absent_elsewhere() -> None:
+    stream, elsewhere = Terminal(), io.StringIO()
+    for one in (stream, elsewhere):
+        with ProgressLine('reading', one, brief=True) as show:
+            show('recording 1 of 2')
+    assert elsewhere.getvalue() == ''
+    # Carriage return and clearing of the line.
+    assert stream.getvalue().endswith('\r\033[K')
+    assert '\n' not in stream.getvalue()

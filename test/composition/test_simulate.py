@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle simulate`: the same run as table, CSV, picture and bag."""
 
 import csv
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-SHORT = ['simulate', '--preset', 'paper_si', '--duration', '0.005', '--interval', '1e-4']
+SHORT = ['simulate', '--needle', 'paper_si', '--duration', '0.005', '--interval', '1e-4']
 
 
 def test_csv_and_bag_contain_the_run(tmp_path: Path) -> None:
@@ -104,7 +105,7 @@ def test_output_reports_speed_and_accuracy(capsys: pytest.CaptureFixture[str]) -
 
 def test_limits_of_model_and_sampling_are_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
     """A mode beyond half the sampling rate, and a deflection beyond a linear beam."""
-    few = ['simulate', '--preset', 'paper_si', '--duration', '0.002', '--depth', '0.05']
+    few = ['simulate', '--needle', 'paper_si', '--duration', '0.002', '--depth', '0.05']
     bent = ['--tip-deflection', '0.02']
     assert main([*few, *bent, '--interval', '1e-3']) == 0
     err = capsys.readouterr().err
@@ -118,7 +119,7 @@ def test_hub_contact_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     """Only if the needle is inserted up to the hub."""
     name = 'hub at the skin after [s]'
     for preset, time in (('paper_si', 0.0287), ('phantom', 22.13)):
-        assert main(['simulate', '--json', '--preset', preset]) == 0
+        assert main(['simulate', '--json', '--needle', preset]) == 0
         said = capsys.readouterr()
         # The default is 2000 samples; modes above their Nyquist frequency have decayed.
         assert abs(json.loads(said.out)[name] - time) < 3e-3 * time

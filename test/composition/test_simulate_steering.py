@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle simulate --model steering`: outputs, and errors of invalid input."""
 
 from __future__ import annotations
@@ -69,11 +70,13 @@ def test_membranes_start_depth_and_seed_take_effect(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
+        (['--force', '3N'], 'the model of bending_35mm; try --needle phantom'),
+        (['--needle', 'phantom', '--to', '9cm'], 'of phantom; try --needle bending_35mm'),
         (
             ['--model', 'steering', '--force', '3'],
             '--force is an option of --model modes, not of steering',
         ),
-        (['--to', '0.1'], '--to is an option of --model steering, not of modes'),
+        (['--model', 'modes', '--to', '0.1'], '--to is an option of --model steering, not'),
         (['--model', 'steering', '--to', '0.3'], 'the needle reached 160 mm, where its hub stops'),
         (['--model', 'steering', '--speed', '0'], '--speed must be positive and finite'),
         (['--model', 'steering', '--depth', '0.2'], '--to must be beyond --depth'),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle steer`: accuracy, expected tip, and errors of invalid input."""
 
 from __future__ import annotations
@@ -6,9 +7,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+from matplotlib.image import imread
+from needle_controller import SteeringPrior
+from needle_dynamics import DEFAULT_NEEDLE, NEEDLES
 from needle_insertion.cli import main
+from needle_insertion.commands import steer
 import numpy as np
 import pytest
+
+IMAGES = Path(__file__).parents[2] / 'docs' / 'images'
 
 
 def steered(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[Any, str]:
@@ -77,10 +84,11 @@ def test_unreachable_targets_are_rejected_or_warned_of(
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--target', '0.1'], '--target takes X,Y,Z in m with a depth Y > 0, got'),
-        (['--target', 'a,b,c'], '--target takes X,Y,Z in m with a depth Y > 0, got'),
-        (['--target=0,nan,0'], '--target takes X,Y,Z in m with a depth Y > 0, got'),
-        (['--target=0,0.3,0'], r'depths must be in [0, 0.16] m'),
+        (['--target', '1mm,2mm'], "'1mm,2mm' is not a target: x,y,z, where y is the depth"),
+        (['--target', 'a,b,c'], "'a' is not a length, such as 0.05 or 50mm"),
+        (['--target=0,nan,0'], "'0,nan,0' is not a target"),
+        (['--target=0,300mm,0'], 'the depth must be in (0, 160] mm'),
+        (['--needle', 'bendin'], "got 'bendin'; did you mean bending_"),
         (['--step', '0'], '--step must be in (0, 0.1] m'),
         (['--limit', '-1'], 'guide_limit must be finite, >= 0 m'),
         (['--prior', 'spread=2'], 'spread must be finite'),
@@ -91,7 +99,7 @@ def test_unreachable_targets_are_rejected_or_warned_of(
         (['--limit', '0'], 'guide_limit and turns cannot both be 0: nothing would move'),
         (['--load-limit', '0'], 'load_limit must be > 0 N, got 0.0'),
         (['--seed', '-1'], '--seed must be >= 0, got -1'),
-        (['--target=0,-0.1,0'], 'with a depth Y > 0, got'),
+        (['--target=0,-0.1,0'], 'the depth must be in (0, 160] mm'),
         (['-o', 'needle.csv'], 'the picture must be .png'),
         (['-o', '/no/such/folder/x.png'], 'its folder does not exist'),
     ],
@@ -102,3 +110,24 @@ def test_invalid_input_is_a_one_line_error(
     _, said = steered(capsys, *words, status=2)
     assert complaint in said
     assert len(said.strip().splitlines()) == 1
+
+
+def test_needle_is_drawn_in_the_frame_of_target_and_sensor() -> None:
+    """The drawn tip is where the sensor, whose frame is rotated, sees it."""
+    needle, steering, _ = NEEDLES[DEFAULT_NEEDLE]
+    truth = steer.sample_needle(needle, steering, SteeringPrior(frame=0.05), 0)
+    plant = truth.plant(np.array([0.0, 0.1]))
+    plant.insert()
+    assert np.abs(truth.frame).max() > 5e-3
+    drawn = steer._line(plant.needle.shape, truth.frame)
+    # The shape ends at the depth of the tip up to the rounding of its elements.
+    assert drawn[-1] == pytest.approx([plant.tip[0], 0.1, plant.tip[1]], abs=1e-9)
+
+
+def test_shipped_picture_is_the_picture_of_the_default_command(tmp_path: Path) -> None:
+    """Of the command in the README."""
+    assert main(['steer', '--target', '4mm,100mm,-2mm', '-o', str(tmp_path / 'now.png')]) == 0
+    now, kept = imread(tmp_path / 'now.png'), imread(IMAGES / 'steered.png')
+    assert now.shape == kept.shape
+    # Tolerance for the rounding of colors.
+    assert np.abs(now - kept).mean() < 3e-4

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle study`: reproducible tables, and recovery after interruptions."""
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 from math import sqrt
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -92,6 +94,14 @@ def test_samples_are_independent_of_their_batch(law: str, count: int) -> None:
     for number in (0, count // 2, count - 1):
         for name, values in study.rows(number, 1).items():
             assert np.array_equal(values, whole[name][[number]], equal_nan=True)
+
+
+@pytest.mark.parametrize('radius', [2e-4, 1e-3, 3e-3])
+def test_hits_are_misses_up_to_the_hit_radius(radius: float) -> None:
+    settings = {**SMALL['settings'], 'law': 'open_loop', 'hit_radius': radius}
+    rows = made({**SMALL, 'settings': settings}).rows(0, 40)
+    assert np.array_equal(rows['hit'], rows['miss'] <= radius)
+    assert rows['hit'].any() or radius < 1e-3
 
 
 @pytest.mark.parametrize('design', DESIGNS)
@@ -240,7 +250,10 @@ def test_page_and_replay_match_the_table(
     file.write_text(yaml.safe_dump(SMALL, sort_keys=False))
     words = ['study', str(file), '-o', str(folder), '--workers', '1']
     assert main(words) == 0
-    assert '40 samples' in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert re.search(r'^Samples +40 ', said, re.MULTILINE)
+    assert re.search(r'^Hit +[\d.]+% +95 %: ', said, re.MULTILINE)
+    assert f'wrote {tmp_path}' in said
     seen = look_at(folder / 'study.html')
     assert seen.requests == []
     table = folder / 'samples.parquet'
@@ -485,9 +498,9 @@ def test_damaged_tables_and_other_versions_are_rejected(
                            ['skin', 'target_x', -0.9]]}, 'correlations are inconsistent'),
         ({'settings': {'deep': 1}}, "settings: unknown parameter 'deep'; did you mean 'depth'?"),
         ({'settings': {'depth': -1}}, 'settings.depth must be finite, > 0 m, got -1'),
-        ({'settings': {'needle': 'bone'}}, 'settings: needle must be one of'),
+        ({'settings': {'needle': 'bone'}}, 'needle must be one of'),
         ({'settings': {'law': 'me'}}, 'law must be one of multi_hypothesis'),
-        ({'settings': {'needle': [1]}}, 'settings: needle must be one of'),
+        ({'settings': {'needle': [1]}}, 'needle must be one of'),
         ({'settings': {'law': [1]}}, 'law must be one of multi_hypothesis'),
         ({'settings': {'constants': 1}}, 'settings: constants must be names with values, got 1'),
         ({'settings': {'constants': {1: 1}}}, "unknown parameter '1'"),

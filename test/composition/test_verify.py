@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of recorded runs: identical results, and the location and reason of differences."""
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ NODE: dict[str, Any] = {
     'force_limit': 100.0,
     'torque_limit': 1.0,
     'real_time_factor': 1.0,
-    'model.preset': 'phantom',
+    'needle': 'phantom',
 }
 MODEL = NeedleParameters.preset('phantom')
 TIP = TipParameters(rate=50.0, noise=1e-5, delay=0.012)
@@ -802,7 +803,7 @@ def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
         ('seed', 'x', "seed must be an integer from 0 to 2^62, got 'x'"),
         ('seed', 1.5, 'seed must be an integer from 0 to 2^62, got 1.5'),
         ('seed', True, 'seed must be an integer from 0 to 2^62, got True'),
-        ('model.preset', ['phantom'], 'model.preset must be one of '),
+        ('needle', ['phantom'], 'needle must be one of '),
         ('mode', {}, 'mode must be one of '),
     ],
 )

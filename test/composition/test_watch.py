@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Page of `needle watch`: frames, recordings, and access control."""
 
 from __future__ import annotations
@@ -767,8 +768,8 @@ async def test_port_in_use_is_reported() -> None:
         with pytest.raises(ParameterError) as error:
             await Server(Counting, port=port).start()
     assert str(error.value) == (
-        f'cannot listen on 127.0.0.1, port {port}: the port is in use; valid: another --port, '
-        f'such as {port + 1}, or 0 for a free one'
+        f'cannot listen on 127.0.0.1, port {port}: the port is in use; use '
+        f'another one, such as --port {port + 1}, or --port 0 for a free one'
     )
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands of the axial supervisor for any sequence of events, without ROS."""
 
 from __future__ import annotations
@@ -17,11 +18,10 @@ from needle_controller import (
     SafetyLimits,
 )
 from needle_controller.supervisor import Supervisor
-from needle_controller.waiting_request import JointPath
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
-from needle_ros.trajectories import MOST_POINTS
+from needle_ros.trajectories import JointPath, MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
 

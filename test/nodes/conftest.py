@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Graph of real nodes over DDS for each test: own context and domain, node errors fail it."""
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ def quick_collection() -> None:
 
 
 @pytest.fixture
-def ros_graph(tmp_path: Path) -> Iterator[RosGraph]:
+def ros_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RosGraph]:
+    # Files of the nodes, such as the record of an insertion.
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros'))
     with RosGraph(tmp_path / 'logs') as graph:
         yield graph

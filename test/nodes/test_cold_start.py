@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slow imports and compilation happen before `configure`, while services respond."""
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ RESPONSES = 10
 #: Rate of the nodes [Hz]: other tests load the machine, and a late measurement stops the needle.
 RATE = {'rate': 200.0}
 
-STEERED = {'model.preset': 'bending_35mm', 'steered': True, 'depth': 0.001, **RATE}
+STEERED = {'needle': 'bending_35mm', 'steered': True, 'depth': 0.001, **RATE}
 STEERING = {
     'step_length': 0.01,
     'speed': 0.05,
@@ -190,7 +191,7 @@ def test_steering_preloads_an_insertion(
     nodes = {'plant': {'mode': mode, **STEERED}, 'steering': {**STEERING, **options}}
     if mode == 'simulation':
         nodes['controller'] = {
-            'model.preset': 'bending_35mm', 'steered': True, **RATE,
+            'needle': 'bending_35mm', 'steered': True, **RATE,
             'deflection_feedback': 'none', 'reference.speed': 0.05,
         }  # fmt: skip
     one = rig(**nodes)

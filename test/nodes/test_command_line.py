@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line, signals and log of a node process."""
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(
     node = started(ros_graph, 'plant', '--ros-args', '-p', 'rate:=500.0')
     assert node.stdout is not None
     said = next(line for line in node.stdout if 'active' in line)
-    assert 'active: mode simulation, preset phantom, 500 Hz; takes wrench_command' in said
+    assert 'active: mode simulation, needle phantom, 500 Hz; takes wrench_command' in said
     ros_graph.spin_until(lambda: came, 'joint_states')
     deadline = time.monotonic() + 30.0
     while node.poll() is None and time.monotonic() < deadline:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller node in the graph, alone and with a plant."""
 
 from collections.abc import Callable
@@ -46,8 +47,12 @@ class Bench:
         self.commands = graph.listen(self.node, WrenchStamped, 'wrench_command', COMMAND)
         self.controller = graph.add(ControllerNode, start=False, parameters={**SLOW, **parameters})
         if start:
-            assert self.controller.start(), self.controller.failure
-        graph.spin_until(
+            self.start()
+
+    def start(self) -> None:
+        """Start the controller, and wait for the discovery."""
+        assert self.controller.start(), self.controller.failure
+        self.graph.spin_until(
             lambda: (
                 self.states.get_subscription_count()
                 and self.target.get_subscription_count()
@@ -885,7 +890,7 @@ def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
     """Services report the state, targets are rejected, and a stop applies after activation."""
     bench = Bench(ros_graph, start=False)
     assert bench.call('stop').success
-    assert bench.controller.start()
+    bench.start()
     assert bench.controller.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert 'stopped' in bench.call('pause', SetBool, data=True).message
     assert 'stopped' in bench.call('retract').message

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robot drivers with their own topics, joints and units, controlled by parameters only."""
 
 from __future__ import annotations
@@ -393,12 +394,23 @@ def test_missing_package_is_reported(ros_graph: RosGraph) -> None:
     )
 
 
-def test_topic_parameters_are_read_only(ros_graph: RosGraph) -> None:
-    """A later change is rejected."""
-    controller = ros_graph.add(ControllerNode, start=False)
-    controller.set_parameters([Parameter('hardware.joint', value='slide')])
-    assert not controller.start()
-    assert str(controller.failure).startswith('hardware.* is read when the node starts')
+def test_topics_of_a_robot_may_change_between_configurations(ros_graph: RosGraph) -> None:
+    """The publishers of the configuration before are destroyed."""
+    user, topics = ros_graph.node('user'), ('wrench_command', 'slide/commands')
+    controller = ros_graph.add(ControllerNode)
+
+    def offered(*names: str) -> bool:
+        return [name for name in topics if user.count_publishers(name)] == [*names]
+
+    ros_graph.spin_until(lambda: offered('wrench_command'), 'the topic of the contract')
+    changes = [Parameter(name, value=value) for name, value in FORCE.items()]
+    assert not all(one.successful for one in controller.set_parameters(changes))
+    controller.trigger_deactivate()
+    controller.trigger_cleanup()
+    ros_graph.spin_until(offered, 'no commands')
+    assert all(one.successful for one in controller.set_parameters(changes))
+    assert controller.start(), controller.failure
+    ros_graph.spin_until(lambda: offered('slide/commands'), 'the topic of the robot')
 
 
 def test_axis_y_is_not_read_as_true(ros_graph: RosGraph) -> None:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Launch file, parsed as source, and executed if launch is installed."""
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def test_launch_rejects_invalid_arguments_before_starting_nodes(
 
 def test_failed_node_ends_the_others_and_launch() -> None:
     """`paper_si` has no carriage, so that the controller rejects its gains."""
-    launch = start('preset:=paper_si')
+    launch = start('needle:=paper_si')
     said, _ = launch.communicate(timeout=120)
     assert launch.returncode != 0
     assert said.count('process started') == 2

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plant and controller in lockstep over DDS: reproducible runs, and agreement with theory."""
 
 from collections import defaultdict
@@ -24,14 +25,14 @@ from needle_controller import (
 from needle_controller.steering.law import build_law, DEFAULT_LAW
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.simulation import sample_truth, simulate_steering, step_depths
-from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, STEERING_PRESETS
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, NEEDLES
 from needle_identification import Bag, deserialize, encode, read_topic
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.graph.simulated_run import RunSample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import ControllerStatus, SteeringPhase, SteeringStatus
+from needle_ros.status import ControllerStatus, node_of, SteeringPhase, SteeringStatus
 from needle_ros.timing import seconds
 import numpy as np
 import pytest
@@ -90,7 +91,7 @@ def drive(
         def take(message: DiagnosticArray) -> None:
             for status in message.status:
                 values = {pair.key: pair.value for pair in status.values}
-                health[status.name] = ControllerStatus.from_values(values)
+                health[node_of(status.name)] = ControllerStatus.from_values(values)
 
         probe.create_subscription(DiagnosticArray, '/diagnostics', take, 10)
         probe.create_subscription(JointState, 'tracking_error', errors.append, EVERY)
@@ -207,7 +208,7 @@ def test_tracking_at_1_khz_agrees_with_the_continuous_loop(tmp_path: Path, prese
     needle is straight and the tissue equals the prior: sensor noise would otherwise cause a load
     of 1 uN, which is 0.5 mm / s^2 of the moving 2 g.
     """
-    common = {'model.preset': preset, 'rate': RATE}
+    common = {'needle': preset, 'rate': RATE}
     gains = {
         f'inverse_dynamics.{axis}.{name}': value
         for axis in ('insertion', 'rotation')
@@ -272,7 +273,7 @@ def test_steered_run_is_reproduced_by_replay(tmp_path: Path) -> None:
     """
     point = JointTrajectoryPoint(positions=[2e-3, -0.02, 1.5], time_from_start=Duration(sec=2))
     course = JointTrajectory(joint_names=['guide_x', 'guide_tilt_z', 'roll'], points=[point])
-    bag, common = tmp_path / 'bag', {'model.preset': 'bending_35mm', 'rate': RATE}
+    bag, common = tmp_path / 'bag', {'needle': 'bending_35mm', 'rate': RATE}
     drive(
         tmp_path / 'logs',
         0.05,
@@ -330,7 +331,7 @@ def steer(
     plant: dict[str, Any] | None = None,
 ) -> Path:
     """Steer a needle by nodes, by default in two steps; return the bag."""
-    bag, common = folder / 'bag', {'model.preset': 'bending_35mm'}
+    bag, common = folder / 'bag', {'needle': 'bending_35mm'}
     end = inf
     with Graph(folder / 'logs') as graph:
         run = SimulatedRun(graph, lambda *_: None)
@@ -381,7 +382,7 @@ def test_nodes_end_at_the_tip_of_the_simulated_loop(tmp_path: Path, seed: int) -
     plant has no tilt.
     """
     target, prior, path_noise = (2e-3, 0.06, -1e-3), SteeringPrior(), 1e-12
-    needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    needle, steering, _ = NEEDLES['bending_35mm']
     drawn = sample_truth(needle, steering, prior, np.random.default_rng(seed), seed)
     bevel = float(np.hypot(*drawn.bevel))
     truth = replace(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Package for colcon, pip and rosdep."""
 
 import ast
@@ -5,6 +6,7 @@ import json
 import os
 from pathlib import Path
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -49,7 +51,7 @@ KEYS = {
 }
 
 #: Extras of setup.py without a rosdep key; the code that needs them reports the installation.
-EXTRAS = {'distributed', 'gymnasium', 'pyarrow', 'pyigtl'}
+EXTRAS = {'distributed', 'gymnasium', 'pandas', 'pyarrow', 'pyigtl'}
 
 OWN = {*(path.parent.name for path in ROOT.glob('needle_*/__init__.py')), 'reproduction'}
 
@@ -116,8 +118,8 @@ def test_manifest_is_valid() -> None:
     [
         ('</version>', '.x</version>'),
         ('<license>Apache-2.0</license>', ''),
-        (' email="maintainers@needle-insertion.example"', ''),
-        ('maintainers@', 'maint..ainers@'),
+        (' email="noreply@needle-insertion.invalid"', ''),
+        ('noreply@', 'no..reply@'),
         ('exec_depend>rclpy</exec_depend', 'run_depend>rclpy</run_depend'),
         ('<name>needle_insertion</name>', '<name>Needle__Insertion</name>'),
         ('<package format="3">', '<package format="2">'),
@@ -139,6 +141,22 @@ def test_rosdep_resolves_every_dependency() -> None:
     wanted = declared('exec_depend', 'test_depend')
     assert wanted <= packages | keys
     assert keys <= wanted
+
+
+def test_pages_install_the_keys_of_pip() -> None:
+    """On Ubuntu 24.04 rosdep skips them, and pip installs them for the user."""
+    keys = yaml.safe_load((DATA / 'rosdep.yaml').read_text())['pip']
+    texts = [
+        page.read_text(encoding='utf-8')
+        for page in [*ROOT.glob('*.md'), *ROOT.glob('docs/**/*.md')]
+    ]
+    texts = [text for text in texts if re.search('^rosdep install', text, re.MULTILINE)]
+    assert len(texts) >= 2
+    for text in texts:
+        assert f"--skip-keys '{' '.join(keys)}'" in text
+        (line,) = re.findall(r'^python3 -m pip install --user (.*)', text, re.MULTILINE)
+        words = shlex.split(line.removeprefix('--break-system-packages '))
+        assert [word.partition('>')[0] for word in words] == [*keys.values()]
 
 
 @pytest.fixture(scope='module')
@@ -300,7 +318,9 @@ def test_sdist_installs_and_runs(environment: Path, ros_graph: RosGraph, tmp_pat
     assert version == MANIFEST.findtext('version')
     assert Path(file).is_relative_to(environment)
     needle = environment / 'bin/needle'
-    simulated = shell(tmp_path, needle, 'simulate', '--duration', '0.01', '-o', 'run.csv')
+    simulated = shell(
+        tmp_path, needle, 'simulate', '--needle', 'phantom', '--duration', '0.01', '-o', 'run.csv'
+    )
     assert simulated.returncode == 0, simulated.stderr
     assert len((tmp_path / 'run.csv').read_text().splitlines()) > 1
     probe = ros_graph.node('probe')

@@ -1,14 +1,18 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters from users: dumped and reloaded, as text, shared, and for other nodes."""
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 import subprocess
 import sys
 
+from diagnostic_msgs.msg import DiagnosticArray
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.nodes import NODES
+from needle_ros.status import node_of, STALE
 import pytest
 from rclpy.parameter import Parameter
 from support.installed import node_class
@@ -41,7 +45,7 @@ def test_unchanged_values_may_be_set_while_configured(ros_graph: RosGraph) -> No
     node = ros_graph.add(ControllerNode)
     values = {name: value for name, value in node.values().items() if value != []}
     # rclpy rejects setting read-only parameters to any value.
-    del values['model.preset']
+    del values['needle']
     same = [Parameter(name, value=value) for name, value in values.items()]
     assert {r.reason for r in node.set_parameters(same)} == {''}
     assert node.set_parameters([Parameter('rate', value='1e3')])[0].successful
@@ -88,3 +92,46 @@ def test_unused_sections_of_parameter_files_are_reported(
         finally:
             plant.kill()
             plant.wait()
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_descriptions_of_parameters_are_complete(ros_graph: RosGraph, name: str) -> None:
+    """Finite bounds, and the valid values of parameters that are not numbers."""
+    node = ros_graph.add(node_class(name), start=False)
+    names = [
+        one for one in node._parameters if not one.startswith(('qos_overrides', 'start_type'))
+    ]
+    for descriptor in node.describe_parameters(names):
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        bounds = [bound for one in ranges for bound in (one.from_value, one.to_value)]
+        assert all(map(isfinite, bounds)), descriptor.name
+        if descriptor.name != 'use_sim_time':
+            assert descriptor.description, descriptor.name
+            assert ranges or descriptor.additional_constraints, descriptor.name
+        value = node.get_parameter(descriptor.name).value
+        if descriptor.additional_constraints.startswith('one of '):
+            valid = descriptor.additional_constraints.removeprefix('one of ').split(', ')
+            assert value in valid
+
+
+@pytest.mark.parametrize(('namespace', 'hardware'), [('', 'needle'), ('left', 'left')])
+def test_status_names_node_task_and_hardware(
+    ros_graph: RosGraph, namespace: str, hardware: str
+) -> None:
+    """In the form of diagnostic_updater; stale when the values are no longer updated."""
+    probe = ros_graph.node('probe')
+    received = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    node = ros_graph.add(ControllerNode, namespace=namespace)
+    full = f'/{namespace}/controller' if namespace else '/controller'
+
+    def levels() -> set[bytes]:
+        found = [status for array in received for status in array.status]
+        assert {status.name for status in found} <= {f'{full}: state'}
+        assert {status.hardware_id for status in found} <= {hardware}
+        assert {node_of(status.name) for status in found} <= {full}
+        return {status.level for status in found}
+
+    ros_graph.spin_until(levels, 'the status')
+    assert STALE not in levels()
+    node.trigger_shutdown()
+    ros_graph.spin_until(lambda: STALE in levels(), 'the last status')

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The plant node in the graph."""
 
 from collections.abc import Callable
@@ -225,7 +226,7 @@ def test_configuration_is_a_latched_parameter_file(ros_graph: RosGraph) -> None:
     values = yaml.safe_load(late[0].data)['/plant']['ros__parameters']
     assert values['model.coulomb_friction'] == 1
     assert values['model.viscous_friction'] == 300.0
-    assert values['model.preset'] == 'phantom'
+    assert values['needle'] == 'phantom'
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
@@ -257,7 +258,7 @@ def test_shipped_parameter_file_is_valid(
     ('parameters', 'complaint'),
     [
         ({'model.lenght': 0.3}, "unknown parameter 'model.lenght'; did you mean 'model.length'"),
-        ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom'),
+        ({'needle': 'steel'}, 'needle must be one of paper_si, paper_mm, phantom'),
         ({'depth': 0.3}, 'insertion depth 0.3 m is outside'),
         ({'seed': -1}, 'seed out of range'),
     ],
@@ -376,7 +377,7 @@ def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) ->
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     limits = {'force_limit': 20.0, 'power_limit': 1e3}
-    free = {'model.hub_stop': False, 'model.preset': 'paper_si', 'depth': 0.1, **limits}
+    free = {'model.hub_stop': False, 'needle': 'paper_si', 'depth': 0.1, **limits}
     ros_graph.add(PlantNode, parameters={**RATE, **free})
     ros_graph.spin_until(commands.get_subscription_count, 'discovery')
 
@@ -390,7 +391,7 @@ def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) ->
 def test_preset_is_read_only(ros_graph: RosGraph) -> None:
     """The preset determines the defaults."""
     plant = ros_graph.add(PlantNode, start=False)
-    changed = plant.set_parameters([Parameter('model.preset', value='paper_si')])[0]
+    changed = plant.set_parameters([Parameter('needle', value='paper_si')])[0]
     assert not changed.successful
 
 
@@ -492,7 +493,7 @@ def test_trajectory_before_activation_starts_with_it(ros_graph: RosGraph) -> Non
             ros_graph.executor.spin_once(timeout_sec=0.02)
         # Only the newest command applies: the rejection of the next command shows that the first
         # was received.
-        course.publish(trajectory(['insertion']))
+        course.publish(trajectory(['elbow']))
         ros_graph.spin_until(partial(has_refused_one, plant), 'the refusal')
         (sender,) = (p for p in plant.publishers if p.topic_name.endswith('base_wrench'))
         ros_graph.spin_until(sender.get_subscription_count, 'the reader')
@@ -544,7 +545,7 @@ def test_end_effector_position_follows_the_tissue_stiffness(ros_graph: RosGraph)
     ('mode', 'message', 'reason'),
     [
         ('robot', trajectory(['x'], (1.0, [0.1], [])), "needs the joint 'insertion', got ['x']"),
-        ('robot', trajectory(['insertion']), 'trajectory has no points'),
+        ('robot', trajectory(['elbow']), "moves none of the joints ['elbow']"),
         (
             'robot',
             trajectory(['insertion'], (1.0, [], [])),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """
 The plant as ros2_control hardware, over DDS.
 
@@ -30,7 +31,7 @@ from needle_identification.recorder_node import is_hidden
 from needle_insertion.replay.rerun import verify
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, message_class, SENSOR
-from needle_ros.status import PlantStatus
+from needle_ros.status import node_of, PlantStatus
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
@@ -45,7 +46,7 @@ SENT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 HEARD = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 GUIDE = ('guide_x', 'guide_z', 'guide_tilt_x', 'guide_tilt_z', 'roll')
-STEERED: dict[str, Any] = {'steered': True, 'model.preset': 'bending_35mm', 'depth': 0.02}
+STEERED: dict[str, Any] = {'steered': True, 'needle': 'bending_35mm', 'depth': 0.02}
 
 
 class Driver:
@@ -81,7 +82,7 @@ class Driver:
 
     def _on_health(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == '/plant':
+            if node_of(status.name) == '/plant':
                 values = {item.key: item.value for item in status.values}
                 self.status = PlantStatus.from_values(values)
 
@@ -450,6 +451,13 @@ def test_missing_tf2_msgs_is_reported(ros_graph: RosGraph) -> None:
     assert plant.last_line.endswith(reason)
 
 
+def test_invalid_prefix_is_rejected(ros_graph: RosGraph) -> None:
+    """As tf does."""
+    node = ros_graph.add(PlantNode, parameters={'frame_prefix': '/left'}, start=False)
+    assert not node.start()
+    assert node.failure == "frame_prefix must not begin with a slash, got '/left'"
+
+
 def test_publish_tf_is_rejected_without_a_needle(ros_graph: RosGraph) -> None:
     parameters = {'publish_tf': True, 'mode': 'indenter'}
     node = ros_graph.add(PlantNode, parameters=parameters, start=False)
@@ -473,8 +481,10 @@ def transforms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     sys.path.remove(str(folder))
 
 
-@pytest.mark.parametrize('steered', [False, True])
-def test_tip_transform_is_published(ros_graph: RosGraph, transforms: str, steered: bool) -> None:
+@pytest.mark.parametrize(('steered', 'prefix'), [(False, ''), (True, 'left/')])
+def test_tip_transform_is_published(
+    ros_graph: RosGraph, transforms: str, steered: bool, prefix: str
+) -> None:
     """In `needle_base`, equal to the last pose of `needle_poses`, with the QoS of tf listeners."""
     kind = import_module('tf2_msgs.msg').TFMessage
     reader = ros_graph.node('reader')
@@ -484,7 +494,8 @@ def test_tip_transform_is_published(ros_graph: RosGraph, transforms: str, steere
     ros_graph.environment['PYTHONPATH'] = os.pathsep.join(
         filter(None, (transforms, os.environ.get('PYTHONPATH')))
     )
-    ros_graph.start('plant', {'rate': 200.0, 'publish_tf': True, **more})
+    more |= {'rate': 200.0, 'publish_tf': True, 'frame_prefix': prefix}
+    ros_graph.start('plant', more)
     found: list[tuple[Any, Any]] = []
 
     def matched() -> bool:
@@ -498,7 +509,9 @@ def test_tip_transform_is_published(ros_graph: RosGraph, transforms: str, steere
 
     ros_graph.spin_until(matched, 'a transform and a picture of one sample')
     one, tip = found[0]
-    assert (one.header.frame_id, one.child_frame_id) == (contract.BASE, contract.TIP)
+    frames = one.header.frame_id, one.child_frame_id
+    assert frames == (prefix + contract.BASE, prefix + contract.TIP)
+    assert {message.header.frame_id for message in poses} == {prefix + contract.ENTRY}
     depth = STEERED['depth'] if steered else 0.05
     place, turn = one.transform.translation, one.transform.rotation
     assert (place.x, place.z) == (tip.position.x, tip.position.z)

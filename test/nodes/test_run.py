@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle run` with typed commands and with scripts."""
 
 from __future__ import annotations
@@ -28,16 +29,20 @@ _LONGEST = 120.0
 #: Invalid or rejected lines, and the expected messages.
 MISTAKES = [
     ('targte 0.05', "unknown word 'targte'; did you mean target? Valid are target, wait"),
-    ('target', 'target takes DEPTH | X Y Z, got nothing'),
+    ('target', 'target takes DEPTH | X,Y,Z, got nothing'),
     ('target deep', "'deep' is not a length, such as 0.05 or 50mm"),
-    ('target 1e400', "'1e400' is not a length"),
-    ('target 0.001 0.05 0', 'a target off the axis needs the node steering: --steering'),
-    ('wait soon', 'wait takes [SECONDS], got soon'),
+    ('target 1e400', "'1e400' is not a target: x,y,z"),
+    ('target 0.001 0.05 0', 'a target off the axis needs a needle that bends: --needle bending_'),
+    ('wait soon', "'soon' is not a time, such as 20 or 20s"),
     ('wait 1', 'there is no target to wait for'),
     ('law bang', "law takes one of adaptive, inverse_dynamics, pid, got 'bang'"),
     ('pause now', 'pause takes nothing, got now'),
     ('set controller force_limit', 'set takes NODE NAME VALUE, got controller force_limit'),
     ('set nobody x 1', 'nobody x = 1: no node nobody'),
+    (
+        'set controller force_limt 3',
+        "unknown parameter 'force_limt'; did you mean 'force_limit'?",
+    ),
     ('set controller force_limit 3', 'force_limit: cannot change while configured'),
     ("target '0.05", 'no closing quotation'),
     ('set plant fault.kind "[1, {"', 'is not a value in YAML'),
@@ -180,6 +185,35 @@ def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path
     assert 'first motion refused: the insertion depth is 0.022' in said + complained
 
 
+def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The position is read with the topic, joint and units of the controller."""
+    drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
+    remaps = ['--ros-args', '-r', 'joint_states:=stage/states']
+    ros_graph.add(drivers['PositionRobot'], cli_args=remaps)
+    words = [
+        f'-pcontroller.{name}={value}'
+        for name, value in {
+            'deflection_feedback': 'none',
+            'hardware.joint': 'stage',
+            'hardware.state_topic': 'stage/states',
+            'hardware.scale': 0.001,
+            'hardware.zero': 100.0,
+            'hardware.command': 'position',
+            'hardware.command_topic': 'stage/joint_trajectory',
+            'hardware.command_type': 'joint_trajectory',
+            'hardware.commissioning.enabled': 'false',
+        }.items()
+    ]
+    script = ['status', 'target 22mm', 'wait 100', 'status']
+    status, said, complained = told(ros_graph, tmp_path / 'run', script, '--hardware', *words)
+    assert (status, complained) == (0, ''), said
+    before, *_, after = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
+    assert float(before) == pytest.approx(20.0, abs=0.01)
+    # A stage without friction: the lag of 20 ms has passed.
+    assert float(after) == pytest.approx(22.0, abs=0.1)
+    assert 'no measurements' not in said
+
+
 def test_second_plant_is_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Before any motion."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})
@@ -198,8 +232,8 @@ def test_tip_is_steered_to_a_target(ros_graph: RosGraph, tmp_path: Path) -> None
     status, said, complained = told(
         ros_graph,
         tmp_path / 'run',
-        ['target 1mm 31mm -0.5mm', 'wait', 'status', 'retract', 'wait'],
-        '--steering',
+        ['target 1mm,31mm,-0.5mm', 'wait', 'status', 'retract', 'wait'],
+        '--needle', 'bending_35mm',
         '-p', 'steering.measurement_time=0.3',
         '-p', 'steering.patience=60',
         '-p', 'steering.measurement_timeout=5',

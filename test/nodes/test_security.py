@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """SROS2 policies match the nodes, and no node starts without credentials."""
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
-from typing import NamedTuple
 
 from lxml import etree
 from needle_insertion.graph.node_process import GraphError
@@ -18,10 +18,9 @@ from needle_ros.base_node import BaseNode
 from needle_ros.network import LOCAL, PROFILES, RANGE, stay_local
 import pytest
 from reproduction.protocol import SHIPPED_BAGS
-from support.installed import node_class, ROOT
+from support.installed import node_class
+from support.policies import NOT_RECORDED, POLICY, Profile, REPORTS
 from support.ros_graph import RosGraph
-
-POLICIES = ROOT / 'config/security/policies.xml'
 
 #: Parameters required by each node, and parameters that enable all of its topics.
 SETTINGS: Mapping[str, list[dict[str, object]]] = {
@@ -36,43 +35,6 @@ SETTINGS: Mapping[str, list[dict[str, object]]] = {
 
 #: Topics that depend on the other nodes.
 FOR_ALL = {'recorder': 'subscribe', 'player': 'publish'}
-
-#: Published by every node, and not recorded.
-NOT_RECORDED = {'/rosout', '/parameter_events'}
-
-#: Reports to a plant in lockstep, not recorded.
-REPORTS = {'/joint_states/_processed', '/joint_states/_recorded'}
-
-
-class Profile(NamedTuple):
-    """Permitted or used names of a node."""
-
-    publish: frozenset[str]
-    subscribe: frozenset[str]
-    reply: frozenset[str]
-    request: frozenset[str]
-
-
-def policies() -> dict[str, Profile]:
-    """Parse the policy file like sros2: includes first, then names."""
-    tree = etree.parse(POLICIES)
-    tree.xinclude()
-    found = {}
-    for context in tree.iterfind('contexts/context'):
-        (profile,) = context.iterfind('profiles/profile')
-        node, namespace = profile.get('node'), profile.get('ns')
-        allowed: dict[str, set[str]] = {rule: set() for rule in Profile._fields}
-        for block in profile.iterchildren('topics', 'services'):
-            for rule in allowed.keys() & block.attrib.keys():
-                assert block.get(rule) == 'ALLOW'
-                for name in (item.text.replace('~', f'{namespace}{node}') for item in block):
-                    allowed[rule].add(name if name.startswith('/') else namespace + name)
-        assert context.get('path') == f'/needle_insertion/{node}'
-        found[node] = Profile(**{rule: frozenset(names) for rule, names in allowed.items()})
-    return found
-
-
-POLICY = policies()
 
 
 def used(node: BaseNode) -> Profile:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One session of `needle run` per domain, and the end of a session: the needle stops first."""
 
 from __future__ import annotations
@@ -333,7 +334,7 @@ CAUSES: Mapping[str, tuple[Callable[[Session], object], int, str]] = {
     'error in the script': (
         lambda running: running.say('wait now'),
         2,
-        r'error: line 2: wait takes \[SECONDS\], got now',
+        r"error: line 2: 'now' is not a time, such as 20 or 20s",
     ),
     'quit': (lambda running: running.say('quit'), 0, r'recorded to .*'),
     'quit after Ctrl-Z': (suspend_and_quit, 0, r'recorded to .*'),
@@ -436,7 +437,7 @@ def test_killed_steering_stops_the_needle_within_its_step(
         'steering.measurement_timeout=5',
     ]
     words = [word for one in options for word in ('-p', one)]
-    with session(ros_graph, tmp_path / 'run', '--steering', *words) as running:
+    with session(ros_graph, tmp_path / 'run', '--needle', 'bending_35mm', *words) as running:
         insert(watcher, running, '0', '70mm', '0')
         begin = time_ns()
         kill('steering')(running)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulation features of the plant: pause, step, reset, lockstep, command stamps, faults."""
 
 from collections.abc import Callable
@@ -112,7 +113,7 @@ class Bench:
 
 def test_command_has_one_period_of_delay(ros_graph: RosGraph) -> None:
     """The answer to sample k moves the needle from k + 1 to k + 2."""
-    bench = Bench(ros_graph, lockstep=True, **{'model.preset': 'paper_mm'})
+    bench = Bench(ros_graph, lockstep=True, needle='paper_mm')
     forces = {}
 
     def answer(message: JointState) -> None:
@@ -318,7 +319,7 @@ def test_steered_needle_publishes_shape_and_path(ros_graph: RosGraph) -> None:
     values: dict[str, bool | float | str] = {
         'mode': 'robot',
         'steered': True,
-        'model.preset': 'bending_35mm',
+        'needle': 'bending_35mm',
         'guide.position_limit': 0.01,
         'tip.noise': 0.0,
     }

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slicer node with a plant, a pyigtl peer, and faults."""
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from needle_insertion.slicer.needle import LINE, MEASURED
 from needle_insertion.slicer.registration import Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import SlicerPhase, SlicerStatus
+from needle_ros.status import node_of, SlicerPhase, SlicerStatus
 import numpy as np
 import pyigtl
 import pytest
@@ -34,7 +35,7 @@ from support.ros_graph import RosGraph, statuses
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
 PLANT = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'steered': True,
     'mode': 'robot',
     'rate': 200.0,
@@ -231,6 +232,8 @@ def test_invalid_needle_poses_are_rejected(room: Room) -> None:
     room.until(poses.get_subscription_count, 'the node')
     good = PoseArray(poses=[Pose(), Pose()])
     good.poses[1].position.y = 0.1
+    # As of a plant with a prefix.
+    good.header.frame_id = 'left/needle_entry'
     bad = [
         (PoseArray(), 'it has 0 poses'),
         (PoseArray(poses=[Pose(), Pose()]), 'a position is not within 10 m'),
@@ -288,7 +291,7 @@ def test_port_in_use_is_reported_and_retried(room: Room) -> None:
         room.slicer()
         room.until(lambda: room.status().phase is SlicerPhase.ERROR, 'the error')
         assert 'the port is in use' in room.status().error
-        levels = [s.level for a in room.states for s in a.status if s.name == '/slicer']
+        levels = [s.level for a in room.states for s in a.status if node_of(s.name) == '/slicer']
         assert DiagnosticStatus.ERROR in levels
     room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the port')
     with closing(socket.create_connection(('127.0.0.1', room.port))):

@@ -1,30 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering node over DDS: with a robot, with a controller, and with faulty sensors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+import json
 import re
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.controller_node import ControllerNode
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
-from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict
 from needle_ros.status import ControllerPhase, SteeringPhase, SteeringStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.installed import ROOT
-from support.ros_graph import RosGraph
+from support.ros_graph import RosGraph, statuses
 from trajectory_msgs.msg import JointTrajectory
 
 #: Needle of the paper in tissue softer than the prior (k = 6.8e4 N/m^2), and its tracker.
 PLANT = {
-    'model.preset': 'bending_35mm',
+    'needle': 'bending_35mm',
     'steered': True,
     'rate': 200.0,
     'depth': 0.001,
@@ -226,7 +230,7 @@ def test_steered_controller_follows_the_node(ros_graph: RosGraph, continuous: bo
             'rate': 200.0,
             'reference.speed': 0.05,
             'reference.acceleration': 1.0,
-            'model.preset': 'bending_35mm',
+            'needle': 'bending_35mm',
         },
     )
     bench.takers = 2
@@ -318,7 +322,7 @@ def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.accepted('tip_deflection'), 'the sensors')
     bench.send(TARGET)
     bench.until(lambda: bench.status.phase is SteeringPhase.PLANNING, 'the plan')
-    job, before = bench.steering._loop._planner.job, bench.accepted('joint_states')
+    job, before = bench.steering._loop.planner.job, bench.accepted('joint_states')
     bench.until(lambda: bench.accepted('joint_states') != before, 'measurements')
     answer = bench.stop.call_async(Trigger.Request())
     bench.until(answer.done, 'the answer')
@@ -342,7 +346,7 @@ def test_rejected_motion_stops_the_insertion(
             'steered': True,
             'rate': 200.0,
             'reference.speed': 0.01,
-            'model.preset': 'bending_35mm',
+            'needle': 'bending_35mm',
         },
     )
     bench.takers = 2
@@ -381,7 +385,7 @@ def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> Non
         ('model.tissue_stiffness', 'soft', "model.tissue_stiffness must be a number, got 'soft'"),
         ('steering.path_noise', 0.1, "unknown parameter 'steering.path_noise'"),
         ('turns', 0.5, 'turns must be a whole number, got 0.5'),
-        ('model.preset', 'bone', 'model.preset must be one of paper_si'),
+        ('needle', 'bone', 'needle must be one of paper_si'),
         ('law', 'mine', "or module:Class, got 'mine'"),
     ):
         node = ros_graph.add(SteeringNode, start=False, parameters={name: value})
@@ -417,44 +421,90 @@ def test_shipped_parameters_start_the_three_nodes(ros_graph: RosGraph) -> None:
     assert 'target' not in steering.diagnose().status.last_rejection
 
 
+class Kill:
+    """A robot, and the node as a process that is killed in the second step."""
+
+    def __init__(self, graph: RosGraph) -> None:
+        self.graph = graph
+        robot = {**PLANT, 'mode': 'robot', 'steering.bevel_load': [0.1]}
+        graph.add(PlantNode, parameters=robot)
+        self.user = user = graph.node('user')
+        self.states = graph.latest(user, JointState, 'joint_states', SENSOR)
+        self.moves = graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
+        self.reports = graph.listen(user, DiagnosticArray, '/diagnostics', 10)
+        self.target = user.create_publisher(PointStamped, 'target', COMMAND)
+        steering = graph.start('steering', {**STEERING, 'speed': 0.01})
+        self.sent = 0
+        graph.spin_until(self.goes_in, 'the second step', 180.0)
+        steering.kill()
+        self.seen: list[tuple[float, ...]] = []
+        graph.spin_until(self.rests, 'rest')
+
+    def at(self, name: str) -> float:
+        message = self.states.message
+        return float(message.position[message.name.index(name)])
+
+    def aim(self) -> None:
+        """Send the target, at most once a second."""
+        # Targets before the first measurements are rejected: repeat after 1 s.
+        if (
+            self.target.get_subscription_count()
+            and self.states.message.header.stamp.sec > self.sent
+        ):
+            self.sent = self.states.message.header.stamp.sec
+            message = PointStamped()
+            message.header.frame_id = 'needle_entry'
+            message.point.x, message.point.y, message.point.z = TARGET
+            self.target.publish(message)
+
+    def goes_in(self) -> bool:
+        """Send the target until a motion begins; return whether the second step is under way."""
+        if self.states.message is None:
+            return False
+        if not self.moves:
+            self.aim()
+        return 0.012 < self.at('insertion') < 0.019
+
+    def rests(self) -> bool:
+        self.seen.append((self.at('insertion'), self.at('guide_x'), self.at('guide_z')))
+        return len(self.seen) > 40 and bool((np.ptp(self.seen[-40:], axis=0) < 1e-6).all())
+
+
 @pytest.mark.requirement('S-117', 'S-118', 'S-138')
 def test_needle_and_guide_rest_after_a_kill_of_the_node(ros_graph: RosGraph) -> None:
     """A robot completes its last motion; no other follows."""
-    ros_graph.add(PlantNode, parameters={**PLANT, 'mode': 'robot', 'steering.bevel_load': [0.1]})
-    user = ros_graph.node('user')
-    states = ros_graph.latest(user, JointState, 'joint_states', SENSOR)
-    moves = ros_graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
-    target = user.create_publisher(PointStamped, 'target', COMMAND)
-    steering = ros_graph.start('steering', {**STEERING, 'speed': 0.01})
-    message = PointStamped()
-    message.header.frame_id = 'needle_entry'
-    message.point.x, message.point.y, message.point.z = TARGET
-    sent = 0
-
-    def at(name: str) -> float:
-        return float(states.message.position[states.message.name.index(name)])
-
-    def goes_in() -> bool:
-        nonlocal sent
-        if states.message is None or target.get_subscription_count() == 0:
-            return False
-        stamp = states.message.header.stamp
-        if not moves and stamp.sec > sent:
-            # Targets before the first measurements are rejected: repeat after 1 s.
-            sent = stamp.sec
-            target.publish(message)
-        return 0.012 < at('insertion') < 0.019
-
-    ros_graph.spin_until(goes_in, 'the second step', 180.0)
-    steering.kill()
-    seen: list[tuple[float, ...]] = []
-
-    def rests() -> bool:
-        now = (at('insertion'), at('guide_x'), at('guide_z'))
-        seen.append(now)
-        return len(seen) > 40 and bool((np.ptp(seen[-40:], axis=0) < 1e-6).all())
-
-    ros_graph.spin_until(rests, 'rest')
+    kill = Kill(ros_graph)
     # The step ends at 21 mm.
-    assert seen[-1][0] < 0.0215
-    assert moves[-1].points[-1].positions[0] == pytest.approx(seen[-1][0], abs=1e-3)
+    assert kill.seen[-1][0] < 0.0215
+    end = kill.moves[-1].points[-1].positions[0]
+    assert end == pytest.approx(kill.seen[-1][0], abs=1e-3)
+
+
+@pytest.mark.requirement('S-226', 'S-227')
+def test_killed_node_resumes_its_insertion(ros_graph: RosGraph) -> None:
+    """It publishes the plan before the kill, moves nothing, and continues at the target."""
+    kill = Kill(ros_graph)
+    before = len(kill.moves)
+    # A busy machine delays measurements while the process starts.
+    ros_graph.start('steering', {**STEERING, 'speed': 0.05, 'measurement_timeout': 30.0})
+
+    def said(words: str) -> bool:
+        found = [one.message for array in kill.reports for one in array.status]
+        return any(words in line for line in found)
+
+    line = 'was interrupted in step 2 of 5: send its target again to resume it'
+    ros_graph.spin_until(lambda: said(line), 'the advice', 180.0)
+    records = ros_graph.listen(kill.user, String, 'insertion_record', LATCHED)
+    ros_graph.spin_until(lambda: records, 'the record')
+    assert len(json.loads(records[0].data)['depths']) == 6
+    assert len(kill.moves) == before
+
+    def ended() -> bool:
+        phases = [one.phase for one in statuses(kill.reports, SteeringStatus)]
+        if len(kill.moves) == before and phases[-1] is SteeringPhase.IDLE:
+            kill.aim()
+        return SteeringPhase.DONE in phases
+
+    ros_graph.spin_until(ended, 'the end', 180.0)
+    assert kill.at('insertion') == pytest.approx(TARGET[1], abs=5e-4)
+    assert said('mm from the target')

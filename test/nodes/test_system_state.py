@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One state of controller, steering and plant over DDS, whichever node receives a request."""
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class System(Bench):
             'rate': 200.0,
             'reference.speed': 0.06,
             'reference.acceleration': 1.0,
-            'model.preset': 'bending_35mm',
+            'needle': 'bending_35mm',
             'deflection_feedback': 'none',
         }
         self.controller = graph.add(ControllerNode, parameters=parameters)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`needle watch` with real nodes: frames, buttons, rejections, and a browser."""
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from support.ros_graph import RosGraph
 from support.watched import write_watched
 
 #: A needle moved by a controller; low rate for a busy machine.
-PLANT = {'model.preset': 'bending_35mm', 'steered': True, 'rate': 100.0, 'depth': 0.02}
+PLANT = {'needle': 'bending_35mm', 'steered': True, 'rate': 100.0, 'depth': 0.02}
 CONTROLLER = {
-    'model.preset': 'bending_35mm', 'rate': 100.0, 'deflection_feedback': 'none',
+    'needle': 'bending_35mm', 'rate': 100.0, 'deflection_feedback': 'none',
     'measurement_timeout': 5.0,
 }  # fmt: skip
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Batches of steered needles."""
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ from hypothesis.extra.numpy import arrays, broadcastable_shapes
 from needle_dynamics import (
     insert_batch,
     NeedleParameters,
+    NEEDLES,
     ParameterError,
     ShapeError,
     SteeredNeedle,
-    STEERING_PRESETS,
     SteeringParameters,
 )
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
 
-NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, STEERING, _ = NEEDLES['bending_35mm']
 DEPTHS = np.linspace(0.0, 0.1, 12)
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The needle that cuts its path."""
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from needle_dynamics import (
     insert_batch,
     NeedleModel,
     NeedleParameters,
+    NEEDLES,
     NeedleShape,
     ParameterError,
     ShapeError,
     SteeredNeedle,
-    STEERING_PRESETS,
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import tissue_of
@@ -335,9 +336,9 @@ def test_tissue_shift_equals_another_free_length() -> None:
     assert_allclose(moved.compliance, plain.compliance, rtol=1e-12)
 
 
-@pytest.mark.parametrize('name', STEERING_PRESETS)
+@pytest.mark.parametrize('name', NEEDLES)
 def test_presets_cut_a_path(name: str) -> None:
-    needle, steering, source = STEERING_PRESETS[name]
+    needle, steering, source = NEEDLES[name]
     assert source
     one = SteeredNeedle(needle, replace(steering, bevel_load=(0.01,)))
     one.move(depth=0.1)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steering controller against its formulas in plain NumPy, over a hundred insertions."""
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ from needle_controller import (
 )
 from needle_controller.compiled.hypotheses import HypothesisResponses
 from needle_controller.steering.simulation import sample_truth, simulate_steering
-from needle_dynamics import FloatArray, STEERING_PRESETS
+from needle_dynamics import FloatArray, NEEDLES
 from needle_dynamics.arrays import ComplexArray
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
 DEPTHS = np.linspace(0.0, 0.1, 11)
 TRUE = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A steered insertion whose messages are lost, delayed or duplicated; without a graph."""
 
 from __future__ import annotations
@@ -119,6 +120,21 @@ def test_single_lost_delayed_or_duplicated_message_is_tolerated(
     robot.insert()
     assert robot.loop.phase is Phase.DONE, robot.loop.fault
     check_end(robot)
+
+
+@pytest.mark.requirement('S-129')
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('number', range(1, 9))
+def test_lost_motion_is_repeated_if_the_robot_rests_beside_its_goal(
+    number: int, sign: float
+) -> None:
+    """Within the tolerances, in either direction: this is not the begin of the next motion."""
+    robot = Relayed({('joint_trajectory', number): []}, own=QUICK)
+    tolerances = np.array([QUICK.depth_tolerance, QUICK.guide_tolerance, QUICK.guide_tolerance])
+    # In the tissue, so that a repeated motion does not begin in front of it.
+    robot.says = lambda at: at + 0.7 * sign * tolerances * (at[0] > 1e-3)
+    robot.insert()
+    assert robot.loop.phase is Phase.DONE, robot.loop.fault
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Needles that are steered by roll along arcs, with windup: responses, estimates and errors."""
 
 from __future__ import annotations
@@ -9,13 +10,13 @@ from needle_controller import MultiHypothesisLaw, SteeringLimits, SteeringModel,
 from needle_controller.steering.law import SteeringLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.simulation import simulate_steering
-from needle_dynamics import STEERING_PRESETS
+from needle_dynamics import NEEDLES
 from needle_dynamics.steering.reference_models import bicycle
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
-NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 STEERING = replace(_STEERING, bevel_load=(0.8,))
 DEPTHS = np.linspace(0.0, 0.1, 21)
 MODEL = SteeringModel(NEEDLE, STEERING, DEPTHS)

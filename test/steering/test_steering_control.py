@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The steering laws: predictions, accuracy, and rejected inputs."""
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from needle_dynamics import (
     FloatArray,
     JobError,
     NeedleParameters,
+    NEEDLES,
     ParameterError,
     ShapeError,
     SteeredNeedle,
-    STEERING_PRESETS,
     SteeringParameters,
 )
 import numpy as np
@@ -42,7 +43,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 LIMITS = SIMULATION_LIMITS
-NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
 DEPTHS = np.linspace(0.0, 0.1, 21)
 #: The hypotheses, created once: that takes a fifth of a second.

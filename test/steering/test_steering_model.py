@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Responses of the steering model: superposition, computing time and cancellation."""
 
 from __future__ import annotations
@@ -7,12 +8,12 @@ from math import pi
 import time
 
 from needle_controller import SteeringModel, SteeringPrior
-from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import NEEDLES, SteeredNeedle
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 #: Two layers, and elements of the same length as in the model.
 NEEDLE = replace(NEEDLE, layer_depths=(0.03125,), layer_stiffnesses=(4e4,))
 STEERING = replace(_STEERING, skin_stiffness=400.0, bevel_load=(1.0, 0.5), element=1.25e-3)
@@ -79,7 +80,7 @@ def test_two_hundred_steps_take_less_than_a_second() -> None:
     # The first use of memory takes longer than the computation on some machines.
     for _ in range(3):
         begun = time.process_time()
-        model = SteeringModel(*STEERING_PRESETS['bending_35mm'][:2], np.linspace(0.0, 0.1, 201))
+        model = SteeringModel(*NEEDLES['bending_35mm'][:2], np.linspace(0.0, 0.1, 201))
         taken.append(time.process_time() - begun)
     assert model.responses.guide.shape == (52, 201, 200)
     # 0.2 s on the machine for which the bar was set; five times that for a slower one.

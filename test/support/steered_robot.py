@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steering executive with a simulated robot, needle and tracker, in simulated time."""
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ from typing import Any
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
 from needle_controller.steering.law import DEFAULT_LAW
 from needle_controller.steering.motion import JointMotion
-from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import NEEDLES, SteeredNeedle
 from needle_ros.contract import JOINT_TRAJECTORY
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.wire import Reading
 import numpy as np
 import pytest
 
-NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
+NEEDLE, STEERING, _ = NEEDLES['bending_35mm']
 SETTINGS = ExecutiveSettings(measurement_time=0.2)
 #: Period of the robot and its tracker [ns].
 PERIOD = 10_000_000

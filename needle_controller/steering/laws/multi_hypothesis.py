@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""
 Steering law for all hypotheses: bring the tip to a target by guide and roll, one step at a time.
 
@@ -119,8 +120,8 @@ class MultiHypothesisLaw(SteeringLaw):
     >>> from dataclasses import replace
     >>> import numpy as np
     >>> from needle_controller import MultiHypothesisLaw, SteeringLimits, SteeringModel
-    >>> from needle_dynamics import SteeredNeedle, STEERING_PRESETS
-    >>> nominal, steering, _ = STEERING_PRESETS['bending_35mm']
+    >>> from needle_dynamics import SteeredNeedle, NEEDLES
+    >>> nominal, steering, _ = NEEDLES['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
     >>> model = SteeringModel(nominal, steering, depths)
     >>> control = MultiHypothesisLaw(model, (2e-3, -1e-3), SteeringLimits())

@@ -235,10 +235,10 @@ function tellAim() {
   const parts = [`Target x ${fixed(mm(target[0]), 2)}, y ${fixed(mm(target[1]), 1)}, z ${fixed(mm(target[2]), 2)} mm.`];
   if (frame.expected) {
     const {at, half} = frame.expected;
-    parts.push(`Predicted tip: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
+    parts.push(`Predicted tip if the guide stays: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
   }
   if (frame.hit_probability !== null) {
-    parts.push(`Probability of a hit within 1 mm: ${fixed(frame.hit_probability, 3)}.`);
+    parts.push(`Probability that moves of the guide can still hit within 1 mm: ${fixed(frame.hit_probability, 3)}.`);
   }
   put(find('reach'), parts.join(' '));
 }

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Record of a steered insertion, from which a restarted executive resumes it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, NamedTuple
+
+from needle_controller.steering.continuous import ContinuousInsertion
+from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.motion_control import LAGGING
+from needle_controller.steering.settings import ExecutiveSettings
+from needle_dynamics.arrays import FloatArray
+from needle_ros.errors import JobError, MessageError
+from needle_ros.status import SteeringPhase
+from needle_ros.system_state import Authority
+import numpy as np
+
+#: Largest slope of the path of a tip.
+_STEEPEST: Final = 0.5
+
+#: Tolerance of a computed setpoint [m, rad].
+_SAME: Final = 1e-9
+
+
+class PlannedInsertion(NamedTuple):
+    """Request of an insertion."""
+
+    #: Stamp of its message [ns].
+    stamp: int
+    #: Target of the tip, x, y, z [m].
+    point: tuple[float, float, float]
+    #: Positions of the joints now [m, rad].
+    at: FloatArray
+    #: Depths of the tip measurements [m], shape (n + 1,).
+    depths: FloatArray = np.empty(0)
+    #: Record of the insertion that is resumed, if it is.
+    record: SteeringRecord | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringRecord:
+    """
+    Plan and estimate of an insertion; its fields are values of JSON.
+
+    `history` has the inputs of the steering law in their order and its setpoints, see
+    `GuardedLaw.history`: a law with the same inputs has the same estimate.
+    """
+
+    point: Sequence[float]  #: target of the tip at the start, x, y, z [m]
+    depths: Sequence[float]  #: depths of the tip measurements [m]
+    start: Sequence[float]  #: positions of the joints at the start [m, rad]
+    continuous: bool  #: whether the needle is inserted without rests
+    history: Sequence[Mapping[str, Any]]
+    #: Expected position of the tip at the target depth, x, z [m], and its covariance [m^2].
+    expected: Sequence[float]
+    covariance: Sequence[Sequence[float]]
+    ended: str  #: reason why it has ended, '' while it is under way
+    state: int  #: time of the newest change of the system state [ns]
+
+    def to_values(self) -> dict[str, Any]:
+        """Return the fields as values of JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_values(cls, values: Any) -> SteeringRecord:
+        """Parse the values of `to_values`, or raise `MessageError`."""
+        try:
+            return cls(**values)
+        except TypeError as error:
+            raise MessageError(f'not a record of an insertion: {error}') from error
+
+    @property
+    def plans(self) -> list[Sequence[float]]:
+        """Setpoints so far: guide at x, z [m], roll [rad]."""
+        return [entry['plan'] for entry in self.history if 'plan' in entry]
+
+    def check(
+        self, at: FloatArray, tip: Sequence[float] | None, state: int, own: ExecutiveSettings
+    ) -> None:
+        """
+        Check that needle, guide and tip are where the record leaves them, or raise `JobError`.
+
+        ``at`` are the positions of the joints [m, rad], ``tip`` is a reading of the tip, x, y, z
+        [m], and ``state`` the time of the newest change of the system state [ns].
+        """
+        if self.ended:
+            raise JobError(self.ended)
+        if self.continuous or own.continuous:
+            raise JobError('the needle is inserted without rests')
+        if state > self.state:
+            raise JobError('the system was stopped, paused or retracted')
+        before, goal = self._motion
+        low = np.minimum(before, goal)[: len(at)] - LAGGING * own.tolerances
+        high = np.maximum(before, goal)[: len(at)] + LAGGING * own.tolerances
+        for k in np.flatnonzero((at < low) | (at > high)):
+            raise JobError(
+                f'{own.joints[k]} is at {at[k]:.5f}, outside its last motion from {before[k]:.5f} '
+                f'to {goal[k]:.5f}'
+            )
+        self._check_tip(float(at[0]), tip, own.slip_tolerance)
+
+    @property
+    def _motion(self) -> tuple[FloatArray, FloatArray]:
+        """Positions between which the joints are: the last depth and setpoint, and the next."""
+        roll = self.start[3] if len(self.start) > len('xyz') else 0.0
+        plans, step = [(0.0, 0.0, roll), *self.plans], len(self.plans)
+        before = np.array([self.depths[max(step - 1, 0)], *plans[max(step - 1, 0)]])
+        return before, np.array([self.depths[min(step, len(self.depths) - 1)], *plans[step]])
+
+    def _check_tip(self, depth: float, tip: Sequence[float] | None, slip: float) -> None:
+        """Compare a reading of the tip [m] with the last measurement."""
+        looks = [entry for entry in self.history if entry.get('tip') is not None]
+        if tip is None or not looks:
+            raise JobError('the tip is not measured')
+        last = looks[-1]
+        off, moved = np.subtract(tip, last['tip']), depth - last['depth']
+        across = slip + _STEEPEST * abs(moved)
+        if abs(off[1] - moved) > slip or np.hypot(off[0], off[2]) > across:
+            x, y, z = (1e3 * off).tolist()
+            raise JobError(
+                f'the tip has moved by {x:.2f}, {y:.2f}, {z:.2f} mm since its last measurement, '
+                f'the needle by {1e3 * moved:.2f} mm'
+            )
+
+    def restore(self, law: GuardedLaw) -> None:
+        """Repeat the inputs of a law, or raise `JobError` if it does not plan the same."""
+        for entry in self.history:
+            if 'plan' not in entry:
+                law.repeat(entry)
+            elif np.abs(np.subtract(law.plan(), entry['plan'])).max() > _SAME:
+                raise JobError('its law or constants have changed')
+
+
+class RecordKeeper:
+    """The record of the latest insertion, created when it has changed."""
+
+    def __init__(self) -> None:
+        self._insertion: InsertionStrategy | None = None
+        self._key: tuple[Any, ...] = ()
+
+    def begin(
+        self, request: PlannedInsertion, insertion: InsertionStrategy, authority: Authority
+    ) -> None:
+        """Keep the record of an insertion from now on."""
+        self._insertion, self._request, self._authority = insertion, request, authority
+
+    def changed(self, fault: str) -> SteeringRecord | None:
+        """Return the record if it has changed since the last call; ``fault`` ends it."""
+        insertion = self._insertion
+        if insertion is None:
+            return None
+        law, request, state = insertion.law, self._request, self._authority.state.newest
+        ended = fault or ('it is done' if insertion.phase is SteeringPhase.DONE else '')
+        if self._key == (key := (law, len(law.history), ended, state)):
+            return None
+        self._key, there, before = key, law.expected, request.record
+        return SteeringRecord(
+            point=request.point if before is None else before.point,
+            depths=law.depths.tolist(),
+            start=request.at.tolist() if before is None else before.start,
+            continuous=isinstance(insertion, ContinuousInsertion),
+            history=law.history,
+            expected=[] if there is None else there.mean.tolist(),
+            covariance=[] if there is None else there.covariance.tolist(),
+            ended=ended,
+            state=state,
+        )

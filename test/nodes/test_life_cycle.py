@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishers, subscriptions and services exist only while a node is configured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from needle_controller.controller_node import ControllerNode
+from needle_controller.steering_node import SteeringNode
+from needle_dynamics.plant_node import PlantNode
+from needle_insertion.slicer.slicer_node import SlicerNode
+from needle_ros.base_node import BaseNode
+import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
+from support.ros_graph import RosGraph
+
+DONE = TransitionCallbackReturn.SUCCESS
+
+
+def entities(node: BaseNode) -> Counter[str]:
+    """Count the publishers, subscriptions, services, clients and timers of a node by name."""
+    return Counter(
+        [
+            *(f'publisher {one.topic_name}' for one in node.publishers),
+            *(f'subscription {one.topic_name}' for one in node.subscriptions),
+            *(f'service {one.service_name}' for one in node.services),
+            *(f'client {one.service_name}' for one in node.clients),
+            *('timer' for _ in node.timers),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ('kind', 'topic'),
+    [
+        (PlantNode, 'publisher /joint_states'),
+        (ControllerNode, 'publisher /wrench_command'),
+        (SteeringNode, 'publisher /joint_trajectory'),
+        (SlicerNode, 'publisher /target'),
+    ],
+)
+@pytest.mark.parametrize('end', ['cleanup', 'shutdown', 'shutdown while active'])
+def test_cleanup_and_shutdown_destroy_what_was_created(
+    ros_graph: RosGraph, kind: Any, topic: str, end: str
+) -> None:
+    """Requests of a user are answered in every state."""
+    node = ros_graph.add(kind, start=False)
+    before = entities(node)
+    assert not before[topic]
+    if kind is not SlicerNode:
+        assert before[f'service /{node.get_name()}/stop']
+    for _ in range(2):
+        assert node.start(), node.failure
+        assert entities(node)[topic] == 1
+        if end != 'shutdown while active':
+            assert node.trigger_deactivate() == DONE
+        assert (node.trigger_cleanup() if end == 'cleanup' else node.trigger_shutdown()) == DONE
+        assert entities(node) == before
+        if end != 'cleanup':
+            break
+
+
+def test_failed_configuration_leaves_nothing(ros_graph: RosGraph) -> None:
+    """Its publishers were created before the error."""
+    parameters = {'publish_tf': True, 'mode': 'indenter'}
+    node = ros_graph.add(PlantNode, start=False, parameters=parameters)
+    before = entities(node)
+    assert not node.start()
+    assert node.failure is not None
+    assert node.failure.startswith('publish_tf must be false')
+    assert entities(node) == before
+
+
+@pytest.mark.requirement('S-225')
+def test_only_a_configured_controller_counts_as_commander(ros_graph: RosGraph) -> None:
+    """Not one that is unconfigured, cleaned up or finalized."""
+    plant = ros_graph.add(PlantNode)
+    ros_graph.add(ControllerNode)
+    other = ros_graph.add(
+        ControllerNode,
+        start=False,
+        namespace='other',
+        cli_args=['--ros-args', '-r', 'wrench_command:=/wrench_command'],
+    )
+
+    def count(number: int) -> None:
+        ros_graph.spin_until(lambda: plant._commanders.count() == number, f'{number} commanders')
+
+    names = ros_graph.node('user')
+    ros_graph.spin_until(
+        lambda: ('controller', '/other') in names.get_node_names_and_namespaces(), 'the node'
+    )
+    count(1)
+    for end in (other.trigger_cleanup, other.trigger_shutdown):
+        assert other.trigger_configure() == DONE
+        count(2)
+        assert end() == DONE
+        count(1)

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Restart of the steering executive: an insertion is resumed, or the user is told what to do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from typing import Any
+
+from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
+from needle_controller.steering.insertion_record import SteeringRecord
+from needle_controller.steering.motion import JointMotion
+from needle_ros.errors import MessageError
+from needle_ros.status import SteeringPhase
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
+import numpy as np
+import pytest
+from support.steered_robot import CONTINUOUS, NEEDLE, PERIOD, Robot, SETTINGS, STEERING, TARGET
+
+
+class Rig(Robot):
+    """A robot whose executive can be killed; its record is kept as JSON before each motion."""
+
+    def __init__(self, own: ExecutiveSettings = SETTINGS, **options: Any) -> None:
+        self.text = ''
+        self.sent: list[JointMotion] = []
+        #: Periods of a whole insertion.
+        self.length = 0
+        super().__init__(own, **options)
+
+    def follow(self, move: JointMotion | None) -> None:
+        """Keep the record, then send the motion."""
+        self.keep()
+        if move is not None:
+            self.sent.append(move)
+        super().follow(move)
+
+    def keep(self) -> None:
+        """Write the record as the node does."""
+        record = self.loop.keeper.changed(self.loop.fault)
+        if record is not None:
+            self.text = json.dumps(record.to_values())
+
+    def restart(self, own: ExecutiveSettings | None = None, **options: Any) -> None:
+        """Replace the executive by a new one, which has the record and the system state."""
+        state = self.loop.authority.state
+        given: dict[str, Any] = {'prior': SteeringPrior(), 'settings': own or SETTINGS, **options}
+        self.loop = SteeringExecutive(NEEDLE, STEERING, steady=lambda: self.seconds, **given)
+        self.loop.authority.receive(state)
+        if self.text:
+            self.loop.planner.recalled = SteeringRecord.from_values(json.loads(self.text))
+        self.sent.clear()
+
+    def begin(self, ticks: int) -> None:
+        """Send a target, and run for a number of periods."""
+        self.tick(20)
+        assert self.aim() == ''
+        self.tick(ticks)
+
+    def finish(self) -> None:
+        """Run until the end of the insertion."""
+        for _ in range(8000):
+            if not self.loop.steers:
+                return
+            self.tick()
+        pytest.fail(f'steering does not end: {self.loop.phase}')
+
+    @property
+    def said(self) -> str:
+        return self.loop.diagnose(self.now)[1]
+
+
+@pytest.fixture(scope='module')
+def whole() -> Rig:
+    """Return an insertion without a restart."""
+    rig = Rig()
+    rig.begin(0)
+    begin = rig.now
+    rig.finish()
+    assert rig.loop.phase is SteeringPhase.DONE
+    rig.length = (rig.now - begin) // PERIOD
+    return rig
+
+
+@pytest.mark.requirement('S-226', 'S-227')
+@pytest.mark.parametrize('seed', range(8))
+def test_killed_insertion_is_resumed_by_its_target(whole: Rig, seed: int) -> None:
+    """At a random time; nothing moves before the request, and it ends at the target."""
+    rng = np.random.default_rng(seed)
+    rig = Rig()
+    rig.begin(int(rng.integers(1, whole.length)))
+    # The last motion is followed to its end, or the restart is immediate.
+    steers = rig.loop.steers
+    rig.restart()
+    rig.tick(int(rng.integers(1, 300)))
+    assert rig.sent == []
+    phase = rig.loop.phase
+    assert phase is SteeringPhase.IDLE
+    assert steers
+    # A needle at its start is not resumed, but begins again.
+    assert ('was interrupted in step' in rig.said) == (rig.at[0] > 1e-3)
+    assert rig.aim() == ''
+    rig.finish()
+    assert rig.loop.phase is SteeringPhase.DONE, rig.said
+    # Both within the accuracy of the law for this needle.
+    assert rig.miss < max(1.5 * whole.miss, 5e-4)
+
+
+def test_estimate_is_restored_exactly() -> None:
+    """The replayed law has the same expected tip, and the record continues."""
+    rig = Rig()
+    rig.begin(1300)
+    before, expected = json.loads(rig.text), rig.loop.expected
+    assert expected is not None
+    assert np.allclose(before['expected'], expected.mean, rtol=0.0, atol=0.0)
+    rig.restart()
+    rig.tick(300)
+    assert rig.aim() == ''
+    restored = rig.loop.expected
+    assert restored is not None
+    assert restored.mean.tolist() == expected.mean.tolist()
+    assert restored.covariance.tolist() == expected.covariance.tolist()
+    rig.keep()
+    assert json.loads(rig.text)['history'] == before['history']
+    # A second restart, too.
+    rig.tick(400)
+    rig.restart()
+    rig.tick(100)
+    assert rig.aim() == ''
+    rig.finish()
+    assert rig.loop.phase is SteeringPhase.DONE
+
+
+def test_target_may_change_with_the_restart() -> None:
+    rig = Rig()
+    rig.begin(900)
+    rig.restart()
+    rig.tick(200)
+    x, y, z = TARGET
+    assert rig.aim((x + 3e-4, y, z)) == ''
+    assert rig.loop.law is not None
+    assert rig.loop.law.target.tolist() == [x + 3e-4, z]
+    rig.keep()
+    rig.restart()
+    rig.tick(200)
+    assert rig.aim() == ''
+    assert rig.loop.law.target.tolist() == [x, z]
+
+
+MOVED = 'outside its last motion'
+
+
+@pytest.mark.requirement('S-226', 'S-228', 'S-229')
+@pytest.mark.parametrize(
+    ('event', 'reason'),
+    [
+        ('deeper', MOVED),
+        ('withdrawn', MOVED),
+        ('guide', MOVED),
+        ('tip', 'the tip has moved by'),
+        ('slip', 'the tip has moved by'),
+        ('stop', 'the system was stopped, paused or retracted'),
+        ('pause', 'the system was stopped, paused or retracted'),
+        ('constants', 'its law or constants have changed'),
+        ('law', 'its law or constants have changed'),
+        ('continuous', 'the needle is inserted without rests'),
+    ],
+)
+def test_contradicted_record_names_the_action(event: str, reason: str) -> None:
+    """Retract the needle to where it began: then a target is accepted again."""
+    rig = Rig()
+    rig.begin(1300)
+    options: dict[str, Any] = {}
+    if event == 'constants':
+        options['prior'] = replace(SteeringPrior(), noise=3e-4)
+    elif event == 'law':
+        options['law'] = 'springs'
+    rig.restart(CONTINUOUS if event == 'continuous' else None, **options)
+    rig.tick(300)
+    shift = {'deeper': [8e-3, 0, 0], 'withdrawn': [-8e-3, 0, 0], 'guide': [0, 0, 5e-3]}
+    for k, change in enumerate(shift.get(event, [0.0, 0.0, 0.0])):
+        times, positions = rig.ways[k]
+        rig.ways[k] = times, positions + change
+    if event in ('tip', 'slip'):
+        off = np.array([8e-3, 0.0, 0.0] if event == 'tip' else [0.0, -5e-3, 0.0])
+        rig.sees = lambda tip: tip + off
+    rig.tick(20)
+    for word in {'stop': (STOP, CLEAR_STOP), 'pause': (PAUSE, RESUME)}.get(event, ()):
+        rig.loop.authority.request(word)
+        rig.loop.obey(rig.now)
+    rig.tick(20)
+    said = rig.aim()
+    assert 'the insertion cannot be resumed: ' in said
+    assert reason in said
+    assert said.endswith('; retract the needle to 0.00 mm first')
+    rig.tick(50)
+    assert rig.sent == []
+    assert rig.loop.phase is SteeringPhase.IDLE
+
+
+@pytest.mark.requirement('S-228')
+def test_needle_without_a_record_is_retracted() -> None:
+    rig = Rig()
+    rig.begin(1300)
+    rig.text = ''
+    rig.restart()
+    rig.tick(300)
+    assert rig.aim().endswith('a needle has to be straight at the start: retract it first')
+    assert rig.sent == []
+
+
+@pytest.mark.requirement('S-229')
+def test_ended_insertion_is_not_resumed(whole: Rig) -> None:
+    """Done, or stopped: the needle is retracted before the next target."""
+    rig = Rig()
+    rig.begin(1300)
+    assert rig.request(STOP)
+    rig.tick(100)
+    assert rig.request(CLEAR_STOP)
+    rig.keep()
+    rig.restart()
+    rig.tick(50)
+    assert 'has ended (requested by a user): retract the needle' in rig.said
+    assert 'cannot be resumed: requested by a user' in rig.aim()
+    assert rig.request(RETRACT)
+    rig.tick(3000)
+    assert json.loads(whole.text)['ended'] == 'it is done'
+
+
+def test_invalid_record_is_an_error() -> None:
+    for values in ({}, {'point': [0.0, 0.0, 0.0]}, {'other': 1}):
+        with pytest.raises(MessageError, match='not a record of an insertion'):
+            SteeringRecord.from_values(values)
