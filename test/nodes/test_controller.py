@@ -8,7 +8,6 @@ from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.compiled.laws import INTEGRAL
 from needle_controller.controller_node import ControllerNode
@@ -27,7 +26,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from std_srvs.srv._set_bool import SetBool_Request, SetBool_Response
 from std_srvs.srv._trigger import Trigger_Request, Trigger_Response
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Both nodes in the thread of the test.
@@ -591,7 +590,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
     """Zero force and reason on /diagnostics; the stop cannot be cleared while it persists."""
     exceed, reason = BEYOND[limit]
     bench = Bench(ros_graph)
-    arrays = ros_graph.listen(bench.node, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(bench.node, ControllerStatus)
     bench.aim(0.1)
     assert bench.push() > 0.5
 
@@ -603,8 +602,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
     assert reason in bench.status.stop
     ros_graph.spin_until(
         lambda: any(
-            reason in one.stop and one.phase is ControllerPhase.STOPPED
-            for one in statuses(arrays, ControllerStatus)
+            reason in one.stop and one.phase is ControllerPhase.STOPPED for one in reports
         ),
         'the reason on /diagnostics',
     )

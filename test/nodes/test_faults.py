@@ -7,7 +7,6 @@ import re
 import resource
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
@@ -24,7 +23,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 
 RATE, START, TARGET = 200.0, 0.02, 0.025
 
@@ -272,7 +271,7 @@ def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> Non
     first.kill()
     ros_graph.spin_until(lambda: truth.message.velocity[0] == 0.0, 'rest')
     assert plant.diagnose().status.rejected == 0
-    health = ros_graph.latest(probe, DiagnosticArray, '/diagnostics', COMMAND)
+    reports = ros_graph.statuses(probe, ControllerStatus, COMMAND)
     ros_graph.start('controller', parameters)
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
     # The graph may list the dead controller until its lease of 20 s is over.
@@ -280,8 +279,7 @@ def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> Non
     assert plant.diagnose().status.commanders == 0
 
     def is_well() -> bool:
-        arrays = [health.message] if health.message else []
-        return any(one.stops == 0 for one in statuses(arrays, ControllerStatus))
+        return bool(reports) and reports[-1].stops == 0
 
     ros_graph.spin_until(is_well, 'no stop')
 
@@ -319,19 +317,13 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     """The recording ends, the node continues, and the bag can be read."""
     loop = Loop(ros_graph)
     bag = tmp_path / 'bag'
-    health: list[Any] = []
-
-    def take(message: DiagnosticArray) -> None:
-        health.append(message)
-
-    listen = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-    loop.probe.create_subscription(DiagnosticArray, '/diagnostics', take, listen)
+    reports = ros_graph.statuses(loop.probe, RecorderStatus, 100)
     recorder = ros_graph.start('recorder', {'path': str(bag), 'compression': 'none'})
     loop.until(lambda: list(bag.glob('*.mcap')) and loop.depth, 'the bag')
     size = 200_000
     resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
     loop.until(
-        lambda: any('File too large' in one.failure for one in statuses(health, RecorderStatus)),
+        lambda: any('File too large' in one.failure for one in reports),
         'the report',
     )
     recorder.check()
@@ -413,7 +405,7 @@ def test_command_flood_does_not_stop_sampling(ros_graph: RosGraph) -> None:
         'joint_states',
         QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT),
     )
-    health = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(probe, PlantStatus)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     # At 20 Hz; a process can publish hundreds of times as many.
     plant = ros_graph.start('plant', {'rate': 20.0, 'publish_clock': True})
@@ -430,8 +422,7 @@ def test_command_flood_does_not_stop_sampling(ros_graph: RosGraph) -> None:
 
     def warned() -> bool:
         flood()
-        found = statuses(health, PlantStatus)
-        return any(one.command_rate > 60.0 for one in found)
+        return any(one.command_rate > 60.0 for one in reports)
 
     ros_graph.spin_until(warned, 'the warning')
     first = len(samples)

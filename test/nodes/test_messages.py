@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from itertools import chain, pairwise
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,7 +25,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from reproduction.protocol import SHIPPED_BAGS
 from sensor_msgs.msg import JointState
 from support.installed import node_class
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 
 numbers = st.lists(st.floats(allow_nan=False), min_size=9, max_size=9)
 stamps = st.integers(0, 2**31 * 10**9 - 1)
@@ -133,11 +132,9 @@ def test_node_parses_any_message(
     empty = ('', (), [0, 0, 0] if type_name == JOINT_STATE else [len(taken[0].values[0])])
     assert len(made) == sum(a != b for a, b in pairwise([empty, *shapes]))
     assert node.invalid['words'] == len(JUNK)
-    arrays = ros_graph.listen(teller, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(teller, NodeStatus)
     ros_graph.spin_until(
-        lambda: any(
-            one.invalid_messages == {'words': len(JUNK)} for one in statuses(arrays, NodeStatus)
-        ),
+        lambda: any(one.invalid_messages == {'words': len(JUNK)} for one in reports),
         'the count',
     )
 

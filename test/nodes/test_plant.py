@@ -11,7 +11,6 @@ import sys
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters
@@ -31,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
@@ -206,14 +205,14 @@ def test_base_follows_a_trajectory_with_friction_force(ros_graph: RosGraph) -> N
 def test_needle_below_the_minimum_depth_stops(ros_graph: RosGraph) -> None:
     """/diagnostics reports the reason."""
     probe = ros_graph.node('probe')
-    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(probe, PlantStatus)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     ros_graph.add(PlantNode, parameters={**RATE, 'depth': 0.002})
     ros_graph.spin_until(commands.get_subscription_count, 'discovery')
 
     def reported() -> bool:
         commands.publish(wrench(-3.0))
-        return any('minimum_depth' in one.halt for one in statuses(reports, PlantStatus))
+        return any('minimum_depth' in one.halt for one in reports)
 
     ros_graph.spin_until(reported, 'the report')
 
@@ -374,7 +373,7 @@ def test_invalid_ros_arguments_end_the_process(tmp_path: Path, arguments: list[s
 def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) -> None:
     """The plant stops the needle and reports; the node continues."""
     probe = ros_graph.node('probe')
-    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(probe, PlantStatus)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     limits = {'force_limit': 20.0, 'power_limit': 1e3}
     free = {'model.hub_stop': False, 'needle': 'paper_si', 'depth': 0.1, **limits}
@@ -383,7 +382,7 @@ def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) ->
 
     def reported() -> bool:
         commands.publish(wrench(20.0))
-        return any('insertion depth' in one.halt for one in statuses(reports, PlantStatus))
+        return any('insertion depth' in one.halt for one in reports)
 
     ros_graph.spin_until(reported, 'the report')
 

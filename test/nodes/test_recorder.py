@@ -30,7 +30,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.installed import ROOT
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 import yaml
 
 
@@ -385,10 +385,10 @@ def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     """After SIGINT the bag has every message and its metadata."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
     probe = ros_graph.node('probe')
-    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    reports = ros_graph.statuses(probe, RecorderStatus)
     publish(ros_graph, probe, 50)
     ros_graph.spin_until(
-        lambda: any(one.recorded.get('/text') == 50 for one in statuses(reports, RecorderStatus)),
+        lambda: any(one.recorded.get('/text') == 50 for one in reports),
         'messages',
     )
     process.interrupt()

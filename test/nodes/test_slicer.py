@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from benchmarks.igtl_peer import free_port, Peer, Told
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import (
     PointStamped,
     Pose,
@@ -31,7 +31,7 @@ import numpy as np
 import pyigtl
 import pytest
 from sensor_msgs.msg import JointState
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
 PLANT = {
@@ -58,7 +58,7 @@ class Room:
         self.port = free_port()
         self.probe = graph.node('probe')
         self.targets = graph.listen(self.probe, PointStamped, 'target', COMMAND)
-        self.states = graph.listen(self.probe, DiagnosticArray, '/diagnostics', 10)
+        self.states = graph.statuses(self.probe, SlicerStatus)
 
     def peer(self, target: Any = ()) -> Peer:
         """Start a peer, which repeats an optional target [m]."""
@@ -83,7 +83,7 @@ class Room:
 
     def status(self) -> SlicerStatus:
         """Return the latest status of the node."""
-        return (statuses(self.states, SlicerStatus) or [SlicerStatus()])[-1]
+        return (self.states or [SlicerStatus()])[-1]
 
 
 @pytest.fixture
@@ -287,12 +287,17 @@ def test_target_flood_is_reported_once_and_the_newest_is_used(
 
 def test_port_in_use_is_reported_and_retried(room: Room) -> None:
     """On /diagnostics; the node listens as soon as the port is free."""
+    levels: list[bytes] = []
+
+    def take(message: DiagnosticArray) -> None:
+        levels.extend(one.level for one in message.status if node_of(one.name) == '/slicer')
+
+    room.probe.create_subscription(DiagnosticArray, '/diagnostics', take, 10)
     with closing(socket.create_server(('127.0.0.1', room.port))):
         room.slicer()
         room.until(lambda: room.status().phase is SlicerPhase.ERROR, 'the error')
         assert 'the port is in use' in room.status().error
-        levels = [s.level for a in room.states for s in a.status if node_of(s.name) == '/slicer']
-        assert DiagnosticStatus.ERROR in levels
+        room.until(lambda: DiagnosticStatus.ERROR in levels, 'the level')
     room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the port')
     with closing(socket.create_connection(('127.0.0.1', room.port))):
         room.until(lambda: room.status().phase is SlicerPhase.CONNECTED, 'the peer')

@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.installed import ROOT
-from support.ros_graph import RosGraph, statuses
+from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory
 
 #: Needle of the paper in tissue softer than the prior (k = 6.8e4 N/m^2), and its tracker.
@@ -431,7 +431,9 @@ class Kill:
         self.user = user = graph.node('user')
         self.states = graph.latest(user, JointState, 'joint_states', SENSOR)
         self.moves = graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
-        self.reports = graph.listen(user, DiagnosticArray, '/diagnostics', 10)
+        self.lines: list[str] = []
+        user.create_subscription(DiagnosticArray, '/diagnostics', self._read, 10)
+        self.reports = graph.statuses(user, SteeringStatus)
         self.target = user.create_publisher(PointStamped, 'target', COMMAND)
         steering = graph.start('steering', {**STEERING, 'speed': 0.01})
         self.sent = 0
@@ -439,6 +441,9 @@ class Kill:
         steering.kill()
         self.seen: list[tuple[float, ...]] = []
         graph.spin_until(self.rests, 'rest')
+
+    def _read(self, message: DiagnosticArray) -> None:
+        self.lines += [status.message for status in message.status]
 
     def at(self, name: str) -> float:
         message = self.states.message
@@ -489,8 +494,7 @@ def test_killed_node_resumes_its_insertion(ros_graph: RosGraph) -> None:
     ros_graph.start('steering', {**STEERING, 'speed': 0.05, 'measurement_timeout': 30.0})
 
     def said(words: str) -> bool:
-        found = [one.message for array in kill.reports for one in array.status]
-        return any(words in line for line in found)
+        return any(words in line for line in kill.lines)
 
     line = 'was interrupted in step 2 of 5: send its target again to resume it'
     ros_graph.spin_until(lambda: said(line), 'the advice', 180.0)
@@ -500,10 +504,10 @@ def test_killed_node_resumes_its_insertion(ros_graph: RosGraph) -> None:
     assert len(kill.moves) == before
 
     def ended() -> bool:
-        phases = [one.phase for one in statuses(kill.reports, SteeringStatus)]
-        if len(kill.moves) == before and phases[-1] is SteeringPhase.IDLE:
+        phase = kill.reports[-1].phase
+        if len(kill.moves) == before and phase is SteeringPhase.IDLE:
             kill.aim()
-        return SteeringPhase.DONE in phases
+        return phase is SteeringPhase.DONE
 
     ros_graph.spin_until(ended, 'the end', 180.0)
     assert kill.at('insertion') == pytest.approx(TARGET[1], abs=5e-4)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -49,9 +49,14 @@ class RosGraph(Graph):
         node.create_subscription(kind, topic, received.append, qos)
         return received
 
+    def statuses(self, node: Node, kind: type[_Status], qos: Any = 10) -> list[_Status]:
+        """Subscribe to /diagnostics; return the list of received statuses of a kind of node."""
+        received: list[_Status] = []
 
-def statuses(arrays: Iterable[DiagnosticArray], kind: type[_Status]) -> list[_Status]:
-    """Return the status of each node of a kind in messages of /diagnostics."""
-    pairs = [status.values for array in arrays for status in array.status]
-    found = [read_status({one.key: one.value for one in values}) for values in pairs]
-    return [status for status in found if isinstance(status, kind)]
+        # Each once: a condition is evaluated after each event of the graph.
+        def take(message: DiagnosticArray) -> None:
+            pairs = [{one.key: one.value for one in status.values} for status in message.status]
+            received.extend(one for one in map(read_status, pairs) if isinstance(one, kind))
+
+        node.create_subscription(DiagnosticArray, '/diagnostics', take, qos)
+        return received
