@@ -18,8 +18,10 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import LifeCycle
 from needle_ros.parameter_node import ParameterNode
 from needle_ros.preparation import imports, Preparation, PreparationProgress
+from needle_ros.realtime import HIGHEST, set_priority
 from needle_ros.status import Diagnosis, HARDWARE, NodeStatus, STALE, TASK
 from needle_ros.wire import MessageReader, Reading
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -75,6 +77,9 @@ LATCHED, COMMAND, SENSOR = (
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
+#: Parameter with the real-time priority.
+_PRIORITY = 'realtime_priority'
+
 #: Period of log lines about a running preparation [s].
 _LONG = 2.0
 
@@ -113,6 +118,15 @@ class BaseNode(ParameterNode):
         #: Publishers, subscriptions and others of the unconfigured node; None in this state.
         self._lasting: set[Any] | None = None
         self.declare_text('autostart', True, 'configure and activate at start')
+        self.declare_parameter(
+            _PRIORITY,
+            0,
+            ParameterDescriptor(
+                description='priority of the process under the Linux policy SCHED_FIFO while the '
+                'node is active; 0: no real-time scheduling',
+                integer_range=[IntegerRange(from_value=0, to_value=HIGHEST)],
+            ),
+        )
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
         self._last_severity = Severity.INFO
@@ -268,14 +282,31 @@ class BaseNode(ParameterNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call `activate`, and log the activation; rclpy calls this."""
-        done = self._attempt(self.activate, super().on_activate, state)
+
+        def activate() -> None:
+            # Threads of new timers inherit the priority.
+            self._schedule(realtime=True)
+            self.activate()
+
+        done = self._attempt(activate, super().on_activate, state)
         if done == _SUCCESS:
             self.get_logger().info(': '.join(filter(None, ('active', self.about()))))
+        elif done == TransitionCallbackReturn.FAILURE:
+            self._schedule(realtime=False)
         return done
+
+    def _schedule(self, *, realtime: bool) -> None:
+        """Begin or end the real-time scheduling of the process."""
+        if priority := self.get_parameter(_PRIORITY).value:
+            set_priority(priority if realtime else 0)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call `deactivate`; rclpy calls this."""
-        return self._attempt(self.deactivate, super().on_deactivate, state)
+        return self._attempt(self._deactivate, super().on_deactivate, state)
+
+    def _deactivate(self) -> None:
+        self.deactivate()
+        self._schedule(realtime=False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call `cleanup`, and unlock the parameters; rclpy calls this."""
@@ -287,7 +318,7 @@ class BaseNode(ParameterNode):
 
         def leave() -> None:
             if state.label == 'active':
-                self.deactivate()
+                self._deactivate()
             self._clean_up()
 
         return self._attempt(leave, super().on_shutdown, state)
@@ -296,6 +327,7 @@ class BaseNode(ParameterNode):
         """Return to unconfigured after an unexpected error; rclpy calls this."""
         self._configured = False
         self._clean_up()
+        self._schedule(realtime=False)
         return super().on_error(state)
 
     def _entities(self) -> set[Any]:

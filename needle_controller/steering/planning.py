@@ -9,6 +9,7 @@ from threading import Thread
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from needle_ros.errors import JobError
+from needle_ros.realtime import leave_realtime
 
 _Result = TypeVar('_Result')
 
@@ -76,5 +77,9 @@ class ThreadJob(Job[_Result]):
     """A job in its own thread."""
 
     def _start(self) -> None:
+        def run() -> None:
+            leave_realtime()
+            self._run()
+
         # A daemon: the end of the process does not wait for it.
-        Thread(target=self._run, name='plan', daemon=True).start()
+        Thread(target=run, name='plan', daemon=True).start()

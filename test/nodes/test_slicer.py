@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 from benchmarks.igtl_peer import free_port, Peer, Told
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
     PointStamped,
     Pose,
