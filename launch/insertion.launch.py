@@ -61,6 +61,8 @@ ARGUMENTS = {
         ['', 'true', 'false'],
     ),
     'namespace': ('', 'namespace of all nodes', []),
+    'frame_prefix': ('', 'prefix of the frames on /tf and displays, such as left/', []),
+    'publish_tf': ('', 'the plant publishes needle_tip on /tf', ['', 'true', 'false']),
     'bag': ('', 'folder to record to; empty: no recording', []),
     'rviz': ('false', 'show the needle in RViz, which must be installed', ['true', 'false']),
     'discovery': (
@@ -78,6 +80,8 @@ PARAMETERS = {
         'steered': 'steered',
         'lockstep': 'lockstep',
         'real_time_factor': 'real_time_factor',
+        'frame_prefix': 'frame_prefix',
+        'publish_tf': 'publish_tf',
     },
     'controller': {'needle': 'needle', 'law': 'law', 'use_sim_time': 'use_sim_time'},
     'steering': {'needle': 'needle', 'use_sim_time': 'use_sim_time'},

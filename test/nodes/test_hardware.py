@@ -182,6 +182,7 @@ def test_documented_parameters_equal_tested_parameters() -> None:
     lines = [
         {name: yaml.safe_load(value) for name, value in re.findall(r'-p (\S+?):=(\S+)', block)}
         for block in re.findall(r'^```bash\n(.*?)^```', page, flags=re.DOTALL | re.MULTILINE)
+        if 'hardware.' in block
     ]
     assert lines == [FORCE, POSITION]
 

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Kill and restart the node `steering` at random times of an insertion, over DDS.
+
+The plant (mode `robot`, real time) and the user are nodes of this process, `steering` is a
+process of its own. It is killed at a random time of the insertion, and started again when needle
+and guide rest. Without a request it must not move them. When its target is sent again, it must
+resume the insertion and end at the target, or name an action.
+Run it by ``python -m benchmarks.restarts --count 50 --seed 1``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+import sys
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Final, NamedTuple
+
+from needle_dynamics.plant_node import PlantNode
+from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.live.operator import Operator
+from needle_insertion.report.text import table
+from needle_ros import contract
+from needle_ros.base_node import message_class, profile
+from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus
+import numpy as np
+from rclpy.impl.logging_severity import LoggingSeverity
+from rclpy.logging import set_logger_level
+from rclpy.parameter import Parameter
+from tqdm import trange
+
+#: Target x, y, z [m], and largest distance of the tip from it at the end [m].
+TARGET: Final = (1.5e-3, 0.051, -1e-3)
+LARGEST_MISS: Final = 1e-3
+
+#: Latest time of the kill, after the first motion [s]: shortly before the end of an insertion.
+LATEST: Final = 10.0
+
+#: Timeout of an event [s], and displacement of a joint at rest [m].
+_HANGS: Final = 120.0
+_STILL: Final = 1e-6
+
+_PLANT: Final[dict[str, object]] = {
+    'needle': 'bending_35mm',
+    'mode': 'robot',
+    'steered': True,
+    'rate': 200.0,
+    'depth': 0.001,
+    'model.tissue_stiffness': 5e4,
+    'steering.bevel_load': [0.1],
+    'tip.noise': 1e-4,
+    'guide.speed_limit': 0.1,
+}
+_STEERING: Final[dict[str, object]] = {
+    'needle': 'bending_35mm',
+    'step_length': 0.01,
+    'speed': 0.02,
+    'guide_speed': 0.05,
+    'acceleration': 0.4,
+    'measurement_time': 0.15,
+    'settle_time': 0.02,
+    'measurement_timeout': 5.0,
+}
+
+#: Words of a rejected target that name an action.
+_ACTIONS: Final = ('retract', 'clear_stop', 'send', 'wait')
+
+
+class RestartOutcome(NamedTuple):
+    """
+    End of an interrupted insertion.
+
+    Attributes
+    ----------
+    end : str
+        ``target``, ``missed``, ``named`` (an action of the user), ``stopped``, ``moved`` (without
+        a request) or ``hangs``.
+    phase : str
+        Phase of the node at the last status before the kill.
+    line : str
+        Result or reason.
+
+    """
+
+    end: str
+    phase: str
+    line: str
+
+    @property
+    def met(self) -> bool:
+        """Whether the insertion reached its target, or the node named an action."""
+        return self.end in ('target', 'named')
+
+
+class InterruptedInsertion:
+    """An insertion whose node `steering` is killed at a time after its first motion [s]."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        parameters = [Parameter(name, value=value) for name, value in _PLANT.items()]
+        self._plant = graph.add(PlantNode, parameter_overrides=parameters)
+        if not self._plant.start():
+            raise GraphError(f'plant does not start: {self._plant.failure}')
+        self._user = user = graph.node('user')
+        self._operator = Operator(user)
+        self._moves = 0
+        topic = contract.JOINT_TRAJECTORY
+        user.create_subscription(
+            message_class(topic.type_name),
+            topic.name,
+            self._count,
+            profile(topic.qos, request=True),
+            raw=True,
+        )
+
+    def _count(self, _data: bytes) -> None:
+        self._moves += 1
+
+    def _status(self) -> SteeringStatus | None:
+        found = self._operator.states.get('steering')
+        status: NodeStatus | None = None if found is None else found.status
+        return status if isinstance(status, SteeringStatus) else None
+
+    def _is_ready(self) -> bool:
+        status = self._status()
+        return (
+            status is not None
+            and bool(status.input)
+            and all(one.accepted for one in status.input.values())
+        )
+
+    def _positions(self) -> np.ndarray:
+        found = self._plant._run._positions()
+        return np.array(list(found.values()))
+
+    def run(self, after: float) -> RestartOutcome:
+        """Interrupt the insertion, and resume it."""
+        graph, operator = self._graph, self._operator
+        node = graph.start('steering', _STEERING)
+        graph.spin_until(self._is_ready, 'the measurements', _HANGS)
+        operator.target(*TARGET)
+        graph.spin_until(lambda: self._moves, 'the first motion', _HANGS)
+        end = monotonic() + after
+        graph.spin_until(lambda: monotonic() > end, 'the time of the kill', _HANGS)
+        status = self._status()
+        phase = '' if status is None else status.phase.value
+        node.kill()
+        operator.states.pop('steering', None)
+        self._await_rest()
+        before = self._moves
+        graph.start('steering', _STEERING)
+        graph.spin_until(self._is_ready, 'the measurements after the restart', _HANGS)
+        # Two periods of the diagnostics without a request.
+        end = monotonic() + 2.0
+        graph.spin_until(lambda: monotonic() > end, 'two seconds', _HANGS)
+        if self._moves > before:
+            return RestartOutcome('moved', phase, 'a motion without a request')
+        return self._resume(phase)
+
+    def _await_rest(self) -> None:
+        """Wait until no joint has moved for half a second."""
+        last, since = self._positions(), monotonic()
+
+        def rests() -> bool:
+            nonlocal last, since
+            now = self._positions()
+            if np.abs(now - last).max() > _STILL:
+                last, since = now, monotonic()
+            return monotonic() > since + 0.5
+
+        self._graph.spin_until(rests, 'rest', _HANGS)
+
+    def _resume(self, phase: str) -> RestartOutcome:
+        """Send the target again, and wait for the end."""
+        pending = self._operator.target(*TARGET)
+
+        def ended() -> bool:
+            status = self._status()
+            if pending.done and not pending.outcome[0]:
+                return True
+            phases = (SteeringPhase.DONE, SteeringPhase.STOPPED)
+            return pending.done and status is not None and status.phase in phases
+
+        self._graph.spin_until(ended, 'the end', _HANGS)
+        success, line = pending.outcome
+        if not success:
+            named = any(word in line for word in _ACTIONS)
+            return RestartOutcome('named' if named else 'stopped', phase, line)
+        status = self._status()
+        if status is not None and status.phase is SteeringPhase.STOPPED:
+            return RestartOutcome('stopped', phase, status.fault)
+        x, y, z = np.array(self._plant._run.plant.insertion.needle.tip)
+        off = float(np.linalg.norm(np.array([x, y, z]) - TARGET))
+        kind = 'target' if off < LARGEST_MISS else 'missed'
+        return RestartOutcome(kind, phase, f'{1e3 * off:.2f} mm from the target')
+
+
+def interrupt(after: float, logs: Path) -> RestartOutcome:
+    """Insert a needle with a kill at a time after the first motion [s]."""
+    with Graph(logs) as graph:
+        try:
+            return InterruptedInsertion(graph).run(after)
+        except GraphError as error:
+            return RestartOutcome('hangs', '', str(error))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the insertions, print a table and the verdict; return the exit status."""
+    parser = argparse.ArgumentParser('benchmarks.restarts', description=__doc__)
+    parser.add_argument('--count', type=int, default=50, help='number of insertions')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the times of the kills')
+    given = parser.parse_args(words)
+    # Only outcomes are printed.
+    set_logger_level('plant', LoggingSeverity.FATAL)
+    rng, begun = np.random.default_rng(given.seed), monotonic()
+    rows: dict[str, Counter[str]] = {}
+    failed = 0
+    with TemporaryDirectory() as folder:
+        for number in trange(given.count, unit=' insertions', disable=None):
+            after = float(rng.uniform(0.0, LATEST))
+            outcome = interrupt(after, Path(folder) / str(number))
+            rows.setdefault(outcome.phase, Counter())[outcome.end] += 1
+            failed += not outcome.met
+            sys.stdout.write(
+                f'{number}: killed after {after:.2f} s, {outcome.phase}: {outcome.end}, '
+                f'{outcome.line}\n'
+            )
+            sys.stdout.flush()
+    ends = ('target', 'named', 'missed', 'stopped', 'moved', 'hangs')
+    lines = [(phase, *(str(found[end]) for end in ends)) for phase, found in rows.items()]
+    sys.stdout.write(f'{table(lines, ("killed while", *ends))}\n')
+    reached = sum(found['target'] for found in rows.values())
+    verdict = 'missed' if failed else 'met'
+    sys.stdout.write(
+        f'{verdict}: {given.count} kills, {reached} at the target, '
+        f'{given.count - reached - failed} with a named action, {failed} failed; '
+        f'{monotonic() - begun:.0f} s\n'
+    )
+    return int(bool(failed))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
