@@ -120,7 +120,8 @@ class PlantRun:
         """End the motion of joints at their positions, or every force of an indenter."""
         if self.constants.mode == 'indenter':
             self._follow(PRESS_JOINTS, _HALT, [], [0.0] * len(PRESS_JOINTS))
-        elif joints:
+        # Before the first sample, all joints rest.
+        elif joints and self._measured:
             at = self._positions()
             self._follow(joints, _HALT, [at[name] for name in joints], [])
 

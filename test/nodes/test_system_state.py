@@ -8,6 +8,7 @@ from typing import Any
 from needle_controller.controller_node import ControllerNode
 from needle_controller.steering.motion_control import STILL
 from needle_controller.steering_node import SteeringNode
+from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND
 from needle_ros.system_state import Mode
 from nodes.test_steering import Bench
@@ -109,6 +110,30 @@ def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> 
     assert system.call(f'{other}/retract').success
     system.until(lambda: abs(system.at('insertion') - 0.01) < 5e-4, 'the retract depth')
     system.until(lambda: abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4, 'the guide')
+
+
+@pytest.mark.requirement('S-004')
+@pytest.mark.parametrize(
+    'parameters',
+    [
+        {},
+        {'steered': True, 'needle': 'bending_35mm'},
+        {'mode': 'robot', 'steered': True, 'needle': 'bending_35mm'},
+        {'mode': 'indenter'},
+    ],
+    ids=['simulation', 'steered', 'robot', 'indenter'],
+)
+def test_a_stop_before_the_configuration_holds_after_it(
+    ros_graph: RosGraph, parameters: dict[str, object]
+) -> None:
+    user = ros_graph.node('user')
+    plant = ros_graph.add(PlantNode, parameters=parameters, start=False)
+    stop = user.create_client(Trigger, 'plant/stop')
+    answer = stop.call_async(Trigger.Request())
+    ros_graph.spin_until(answer.done, 'the answer')
+    assert answer.result().success
+    assert plant.start(), plant.failure
+    assert plant.diagnose().status.system is Mode.STOPPED
 
 
 @pytest.mark.requirement('S-006', 'S-088')
