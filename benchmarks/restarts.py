@@ -38,8 +38,8 @@ from tqdm import trange
 TARGET: Final = (1.5e-3, 0.051, -1e-3)
 LARGEST_MISS: Final = 1e-3
 
-#: Latest time of the kill, after the first motion [s]: shortly before the end of an insertion.
-LATEST: Final = 10.0
+#: Latest time of the kill, after the first motion [s]: the insertion takes about 6 s.
+LATEST: Final = 6.0
 
 #: Timeout of an event [s], and displacement of a joint at rest [m].
 _HANGS: Final = 120.0
