@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
-from math import atan2, hypot, isfinite
+from math import atan2, hypot, isfinite, sqrt
 from pathlib import Path
 from typing import Final
 
@@ -13,8 +13,10 @@ from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import between, UNKNOWN
 from needle_identification.friction.estimate import FrictionSummary
+from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.stiffness.estimate import StiffnessSummary
+from needle_ros.axes import AXES
 from needle_ros.files import write_whole
 import yaml
 
@@ -149,6 +151,43 @@ def steering_yaml(found: SteeringEstimate) -> str:
         '/**/controller': {'ros__parameters': model},
         '/**/steering': {'ros__parameters': {**model, **lengths, **prior}},
     }
+    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+
+
+def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool) -> str:
+    """
+    Return a ROS parameter file for the tip sensor of the plant, and the priors of steering.
+
+    ``measurement_time`` is the duration of an averaged measurement [s]; ``delayed``, whether the
+    times of the samples are of their messages, so that the delay is of the messages, too.
+    """
+    lines = ['# Tip sensor, identified by needle_identification.']
+    for one in found.parameters:
+        unit = '' if one.unit == '1' else f' {one.unit}'
+        text = f'{one.value:.6g}{unit}, {between(one.interval)}' if one.determined else UNKNOWN
+        lines.append(f'# {one.symbol} ({one.name}) = {text}')
+    lines.append(f'# from {" ".join(found.name.split())}, {found.samples} samples')
+    noise, slow = found['noise'], found['slow_noise']
+    plant: dict[str, float | list[float]] = {'tip.rate': float(f'{found.rate:.4g}')}
+    names = ['slow_noise', 'slow_time', 'dropout', 'dropout_time']
+    # Noise that is too small to be determined is next to nothing.
+    plant['tip.noise'] = _short(noise.value) if noise.determined else 0.0
+    plant |= {f'tip.{name}': _short(found[name].value) for name in names if found[name].determined}
+    plant['tip.offset'] = [
+        _short(found[f'bias_{axis}'].value) if axis in found.axes else 0.0 for axis in AXES
+    ]
+    delay = found['delay']
+    if delayed and delay.determined:
+        plant['tip.delay'] = _short(max(delay.value, 0.0))
+    prior: dict[str, float] = {}
+    if noise.determined:
+        readings = max(found.samples / found.duration * measurement_time, 1.0)
+        prior['prior.noise'] = _short(noise.value / sqrt(readings))
+    if slow.determined:
+        prior['prior.drift'] = _short(slow.value)
+    sections = {'/**/plant': {'ros__parameters': plant}}
+    if prior:
+        sections['/**/steering'] = {'ros__parameters': dict(prior)}
     return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from math import nan
 from typing import Any, Final
@@ -23,15 +23,17 @@ from needle_controller.steering.simulation import (
     simulate_steering,
     SteeringPlant,
     step_depths,
+    SteppedTipErrors,
+    SteppedTipSensor,
 )
 from needle_dynamics import (
     DEFAULT_NEEDLE,
     find_needle,
-    FloatArray,
     insert_batch,
     NeedleParameters,
     SteeringParameters,
 )
+from needle_dynamics.simulated.tip_errors import TipErrorParameters
 from needle_dynamics.steering.parameters import with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
@@ -48,10 +50,25 @@ _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 
 _JOINTS: Final = contract.steered_states().without_efforts()
 
+_EXACT: Final = SteppedTipErrors()  # of a sensor with white noise alone
+
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion
+_SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]
 _AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
+
+#: Variables of the errors of the tip sensor beyond white noise and losses.
+_ERRORS: Final = {
+    item.name: Variable(
+        getattr(_EXACT, item.name),
+        item.metadata['unit'],
+        item.metadata['description'],
+        _SHORTEST if item.metadata['open_low'] else 0.0,
+    )
+    for item in fields(TipErrorParameters)
+    if item.name != 'dropout'
+}
 
 METRICS: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
@@ -77,6 +94,9 @@ class SteeringStudy(SteeringLimits):
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
     step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
     hit_radius: float = constant(1e-3, 'm', 'largest miss of a hit', open_low=True)
+    interval: float = constant(
+        _EXACT.interval, 's', 'time from one tip measurement to the next', open_low=True
+    )  # fmt: skip
 
 
 class SteeringScenario(Scenario):
@@ -147,6 +167,7 @@ class SteeringScenario(Scenario):
                 self._prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
             ),
             'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
+            **_ERRORS,
         }
 
     @cached_property
@@ -244,11 +265,13 @@ class SteeringScenario(Scenario):
         except OutOfReachError:
             return {'refused': 1.0}
 
-        def sensor(tip: FloatArray) -> FloatArray | None:
-            noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
-            return None if lost else np.asarray(tip + row['tip_noise'] * noise)
-
         metrics, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
+        errors = SteppedTipErrors(
+            interval=self._numbers.interval,
+            dropout=row['lost'],
+            **{name: row[name] for name in _ERRORS},
+        )
+        sensor = SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
         try:
             done = simulate_steering(law, plant, sensor, watch)
         except SteeringFaultError:

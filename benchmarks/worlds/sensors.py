@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp, pi, sqrt
+from math import pi, sqrt
 from typing import Final, TypeAlias
 
 from needle_dynamics import FloatArray
+from needle_dynamics.simulated.tip_errors import SlowNoise
 import numpy as np
 
 #: Sensor as `simulate_steering` takes it.
@@ -79,14 +80,11 @@ class Colored:
     def __init__(
         self, of: Sensor, rng: np.random.Generator, size: float, time: float = 3.0
     ) -> None:
-        self._of, self._rng, self._size = of, rng, size
-        self._keep = exp(-_INTERVAL / time)
-        self._error = size * rng.standard_normal(2)
+        self._of, self._error = of, SlowNoise(size, time, rng, axes=2)
 
     def __call__(self, tip: FloatArray) -> FloatArray | None:
-        found = self._of(tip + self._error)
-        new = sqrt(1.0 - self._keep**2) * self._size * self._rng.standard_normal(2)
-        self._error = self._keep * self._error + new
+        found = self._of(tip + self._error.value)
+        self._error.advance(_INTERVAL)
         return found
 
 

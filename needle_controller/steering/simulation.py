@@ -13,8 +13,10 @@ from needle_controller.steering.law import GuideSetpoint, SteeringLaw
 from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.tip_errors import TipErrorParameters, TipErrors
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
+from needle_ros.settings import constant
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -109,6 +111,44 @@ class SteeringPlant:
         """Insert the needle to the next depth."""
         self.needle.move(depth=float(self.depths[self.step + 1]))
         self.step += 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteppedTipErrors(TipErrorParameters):
+    """Errors of averaged tip measurements beyond white noise, one measurement at each depth."""
+
+    interval: float = constant(
+        1.7, 's', 'time from one tip measurement to the next', open_low=True
+    )
+
+
+class SteppedTipSensor:
+    """
+    Averaged tip measurement of a plant at rest, in the frame of its sensor; None if it is lost.
+
+    ``noise`` is the standard deviation of the white noise [m], with random numbers ``random``;
+    ``losses`` are the random numbers of losses. ``seed`` determines all other ``errors``.
+    """
+
+    def __init__(
+        self,
+        plant: SteeringPlant,
+        noise: float,
+        errors: SteppedTipErrors,
+        seed: int,
+        random: np.random.Generator,
+        losses: np.random.Generator,
+    ) -> None:
+        self._plant, self._noise, self._random = plant, noise, random
+        self._interval = errors.interval
+        self._errors = TipErrors(errors, np.random.default_rng([seed, 2]), losses)
+
+    def __call__(self, tip: FloatArray) -> FloatArray | None:
+        x, z = tip.tolist()
+        depth = float(self._plant.depths[self._plant.step])
+        x, _, z = self._errors.shifted(x, depth, z, self._interval)
+        noise = self._noise * self._random.standard_normal(2)
+        return None if self._errors.lost(self._interval) else np.array([x, z]) + noise
 
 
 class SteeringRun(NamedTuple):

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from math import ceil, cos, pi, sin
 from typing import NamedTuple
 
+from needle_dynamics.simulated.tip_errors import TipErrorParameters, TipErrors
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TipParameters:
+class TipParameters(TipErrorParameters):
     """Constants of a tracker or imager of the tip, exposed during the whole sample interval."""
 
     rate: float = constant(0.0, 'Hz', 'samples per second; 0: rate of the plant')
     noise: float = constant(1e-4, 'm', 'standard deviation of a sample')
     delay: float = constant(0.0, 's', 'time from a sample to its message', high=1.0)
-    dropout: float = constant(0.0, '1', 'probability that a sample is lost', high=1.0)
     offset: tuple[float, ...] = constant(
         (0.0, 0.0, 0.0), 'm', 'measurement of a tip at the entry point: x, y, z', low=-1.0,
         high=1.0,
@@ -75,7 +75,10 @@ class TipSensor:
         # A message is published with the first plant sample after the delay.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
         self._random = np.random.default_rng([seed, 1])
-        self._losses = np.random.default_rng([seed, 3])
+        self._errors = TipErrors(
+            parameters, np.random.default_rng([seed, 4]), np.random.default_rng([seed, 3])
+        )
+        self._period = 1.0 / rate  # of the plant [s]
         #: Sums over the exposure of x, depth and z.
         self._sums = [0.0, 0.0, 0.0]
         #: Number of samples of the plant and of the sensor.
@@ -94,28 +97,30 @@ class TipSensor:
             self._taken += 1
             x, y, z = (value / number for value in sums)
             self._sums = [0.0, 0.0, 0.0]
-            self._take(x, y if self._spatial else depth, z)
+            self._take(x, y if self._spatial else depth, z, number * self._period)
         if not self._waiting or self._count - self._waiting[0][0] < self._late:
             return None
         taken, x, y, z = self._waiting.popleft()
         return TipReading(age=self._count - taken, depth=y, deflection=z, across=x)
 
-    def _take(self, x: float, y: float, z: float) -> None:
-        """Take a sample in the sensor frame, unless it is lost."""
+    def _take(self, x: float, y: float, z: float, interval: float) -> None:
+        """Take a sample in the sensor frame an interval after the previous, unless it is lost."""
         p = self._parameters
         if p.turn:
             c, s = cos(p.turn), sin(p.turn)
             x, z = c * x - s * z, s * x + c * z
         if any(p.offset):
             x, y, z = x + p.offset[0], y + p.offset[1], z + p.offset[2]
-        # A tip outside the slice is not measured; this test is free of noise.
+        # A tip outside the slice is not measured; this test is free of errors.
         visible = not p.slice or abs(x) <= p.slice
+        if self._spatial:
+            x, y, z = self._errors.shifted(x, y, z, interval)
+        else:
+            z = self._errors.shifted(x, y, z, interval)[2]
         if p.noise:
             z += p.noise * float(self._random.standard_normal())
             if self._spatial:
                 x += p.noise * float(self._random.standard_normal())
                 y += p.noise * float(self._random.standard_normal())
-        if p.dropout and self._losses.random() < p.dropout:
-            return
-        if visible:
+        if not self._errors.lost(interval) and visible:
             self._waiting.append((self._count, 0.0 if p.slice else x, y, z))

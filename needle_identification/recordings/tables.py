@@ -23,7 +23,7 @@ import struct
 from typing import Any, Final, NamedTuple
 import zlib
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
@@ -52,15 +52,19 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'tilt_x': _ANGLES,
     'tilt_z': _ANGLES,
     'tip_x': _LENGTHS,
+    'tip_y': _LENGTHS,
     'tip_z': _LENGTHS,
 }
 
 #: Roles of the columns for friction; depth or speed is sufficient.
 ROLES: Final = ('time', 'depth', 'speed', 'force')
 
+#: Usual names of a column of time.
+TIME_NAMES: Final = ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec')
+
 #: Usual column names by role, in order of preference; compared without case and signs.
 _USUAL: Final = {
-    'time': ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec'),
+    'time': TIME_NAMES,
     'depth': ('depth', 'insertion', 'position', 'pos', 'q', 'qm', 'x', 'displacement', 'joint'),
     'speed': ('speed', 'velocity', 'vel', 'v', 'qd', 'dq', 'qdot'),
     'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce'),
@@ -249,14 +253,34 @@ def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) 
     """Build a recording from columns in SI units: sort samples, discard invalid rows."""
     roles = [role for role in ('force', 'depth', 'speed') if role in values]
     rows = np.column_stack([values[role] for role in roles])
-    time = values['time']
+    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
+    found = dict(zip(roles, rows.T, strict=True))
+    times = 1e-9 * (stamps - stamps[0])
+    if 'depth' not in found:
+        losses.append('no depth: it is the integral of the speed from 0')
+        found['depth'] = integrated(times, found['speed'])
+    return Recording(
+        name=str(path),
+        time=times,
+        depth=found['depth'],
+        velocity=found.get('speed'),
+        force=found['force'],
+        losses=tuple(losses),
+    )
+
+
+def sorted_rows(
+    path: Path, time: FloatArray, rows: FloatArray, losses: list[str]
+) -> tuple[float, IntArray, FloatArray]:
+    """Return the start [s], stamps since then [ns], and usable rows (n, k), in order of time."""
     usable = np.isfinite(rows).all(axis=1) & np.isfinite(time)
     if lost := int(np.count_nonzero(~usable)):
         losses.append(f'{lost} rows with a value that is not a number, left out')
     time, rows = time[usable], rows[usable]
     if len(time) < 2:
         raise RecordingError('; '.join([f'{path} has {len(time)} usable rows', *losses]))
-    since = time - time.min()
+    start = float(time.min())
+    since = time - start
     if not since.max() < 1e9:
         raise RecordingError(f'{path}: time spans {since.max():.3g} s: is its unit right?')
     series = Series(rows.shape[1])
@@ -273,19 +297,7 @@ def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) 
     steps = np.diff(series.stamps)
     if (gaps := steps[are_gaps(steps)]).size:
         losses.append(f'pauses in {len(gaps)} places, {1e-9 * gaps.sum():.3g} s in all')
-    times = 1e-9 * (series.stamps - series.stamps[0])
-    found = dict(zip(roles, series.values.T, strict=True))
-    if 'depth' not in found:
-        losses.append('no depth: it is the integral of the speed from 0')
-        found['depth'] = integrated(times, found['speed'])
-    return Recording(
-        name=str(path),
-        time=times,
-        depth=found['depth'],
-        velocity=found.get('speed'),
-        force=found['force'],
-        losses=tuple(losses),
-    )
+    return start, series.stamps, series.values
 
 
 # Text.

@@ -34,6 +34,7 @@ from needle_insertion.commands.common import (
     Subcommand,
     with_unit,
 )
+from needle_insertion.commands.identify_sensor import add_sensor
 from needle_insertion.commands.identify_steering import add_steering, add_time
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
@@ -111,6 +112,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     stiffness.set_defaults(identify=_run_stiffness)
     add_steering(what)
+    add_sensor(what)
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -308,4 +310,6 @@ def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
     return True
 
 
-COMMAND = Subcommand(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))
+COMMAND = Subcommand(
+    _add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes', '--truth')
+)

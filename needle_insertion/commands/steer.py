@@ -24,6 +24,8 @@ from needle_controller.steering.simulation import (
     simulate_steering,
     SteeringPlant,
     step_depths,
+    SteppedTipErrors,
+    SteppedTipSensor,
 )
 from needle_dynamics import (
     DEFAULT_NEEDLE,
@@ -87,6 +89,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
     add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
     add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
+    errors = ', '.join(asdict(SteppedTipErrors()))
+    add_constants(parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}')
     parser.add_argument(
         '--step',
         default=STEP_LENGTH,
@@ -134,6 +138,7 @@ class _Task(NamedTuple):
     needle: NeedleParameters
     steering: SteeringParameters
     prior: SteeringPrior
+    errors: SteppedTipErrors
     depths: FloatArray
 
 
@@ -167,6 +172,7 @@ def _task(options: argparse.Namespace) -> _Task:
         target,
         *found.changed(constants(options.set))[:2],
         from_values(SteeringPrior, given),
+        from_values(SteppedTipErrors, constants(options.sensor)),
         step_depths(target[1], options.step),
     )
 
@@ -186,7 +192,7 @@ def sample_needle(
 
 def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print the final tip positions of both needles."""
-    target, needle, steering, prior, depths = _task(options)
+    target, needle, steering, prior, errors, depths = _task(options)
     aim = target[[0, 2]]
     limits = replace(
         SIMULATION_LIMITS,
@@ -203,17 +209,15 @@ def _run(options: argparse.Namespace) -> int:
             write_whole(options.output, png(draw_reach(error.reach, aim)))
         raise
     truth = sample_needle(needle, steering, prior, options.seed)
-    noise = np.random.default_rng([options.seed, 1])
+    noise, losses = (np.random.default_rng([options.seed, stream]) for stream in (1, 3))
     shapes = list[FloatArray]()
-
-    def sensor(tip: FloatArray) -> FloatArray:
-        return np.asarray(tip + prior.noise * noise.standard_normal(2))
 
     def watch(plant: SteeringPlant) -> None:
         shapes.append(_line(plant.needle.shape, truth.frame))
         show(f'step {len(shapes)} of {len(depths) - 1}')
 
     ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
+    sensor = SteppedTipSensor(ours, prior.noise, errors, options.seed, noise, losses)
     with ProgressLine('steering', brief=True) as show:
         done = simulate_steering(law, ours, sensor, watch)
         alone.insert()

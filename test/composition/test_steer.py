@@ -9,7 +9,12 @@ from typing import Any
 
 from matplotlib.image import imread
 from needle_controller import SteeringPrior
-from needle_dynamics import DEFAULT_NEEDLE, NEEDLES
+from needle_controller.steering.simulation import (
+    GroundTruth,
+    SteppedTipErrors,
+    SteppedTipSensor,
+)
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, NEEDLES
 from needle_insertion.cli import main
 from needle_insertion.commands import steer
 import numpy as np
@@ -50,6 +55,49 @@ def test_miss_is_smaller_without_noise(capsys: pytest.CaptureFixture[str]) -> No
     exact = ['--prior', 'path_noise=1e-9', '--prior', 'noise=1e-7']
     found, _ = steered(capsys, *exact)
     assert found['miss [m]'] < 6e-5
+
+
+def test_stepped_sensor_has_errors_in_time_and_space() -> None:
+    """Without errors it reports the tip; losses are None; the field depends on the depth."""
+    needle, steering, _ = find_needle(DEFAULT_NEEDLE)
+    still = np.zeros(2)
+    truth = GroundTruth(
+        needle=needle, steering=steering, tilt=(0.0, 0.0), bevel=still, frame=still, seed=0
+    )
+    plant, tip = truth.plant(np.array([0.0, 0.02])), np.array([1e-3, -2e-3])
+
+    def sensor(noise: float = 0.0, **constants: float) -> SteppedTipSensor:
+        random, losses = np.random.default_rng(1), np.random.default_rng(2)
+        return SteppedTipSensor(plant, noise, SteppedTipErrors(**constants), 3, random, losses)
+
+    np.testing.assert_array_equal(sensor()(tip), tip)
+    white = tip + 1e-4 * np.random.default_rng(1).standard_normal(2)
+    np.testing.assert_array_equal(sensor(1e-4)(tip), white)
+    assert sensor(dropout=1.0)(tip) is None
+    slow = sensor(slow_noise=1e-3, slow_time=10.0, interval=1e-9)
+    first, second = np.array([slow(tip), slow(tip)])
+    # Within 1e-9 s the noise of 1 mm and 10 s changes by 14 nm; ten times that.
+    np.testing.assert_allclose(first, second, rtol=0.0, atol=1.4e-7)
+    assert (first != tip).all()
+    field = sensor(distortion=1e-3, distortion_length=0.01)
+    shallow = field(tip)
+    np.testing.assert_array_equal(field(tip), shallow)
+    plant.insert()
+    assert (np.array(field(tip)) != shallow).all()
+
+
+def test_errors_of_the_sensor_increase_the_miss(capsys: pytest.CaptureFixture[str]) -> None:
+    """A field of 2 mm misleads the law; a sensor without errors is the default."""
+    exact, _ = steered(capsys)
+    same, _ = steered(capsys, '--sensor', 'slow_noise=0', '--sensor', 'interval=3')
+    assert same == exact
+    wrong, _ = steered(capsys, '--sensor', 'distortion=2mm', '--sensor', 'distortion_length=0.1')
+    assert wrong['miss [m]'] > 2.0 * exact['miss [m]']
+    _, said = steered(capsys, '--sensor', 'slow_nose=1mm', status=2)
+    assert 'slow_nose' in said
+    assert 'slow_noise' in said
+    _, said = steered(capsys, '--sensor', 'slow_time=0', status=2)
+    assert 'slow_time must be finite, > 0 s, got 0' in said
 
 
 def test_roll_and_load_limits_take_effect(capsys: pytest.CaptureFixture[str]) -> None:

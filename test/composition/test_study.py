@@ -30,6 +30,7 @@ from needle_ros.errors import JobError
 from needle_ros.process_pool import processes
 from needle_study.distribution import distribution
 from needle_study.engine import chunk, compute, dask, order, Results
+from needle_study.steering import SteeringScenario
 from needle_study.study import DESIGNS, made, Study
 from needle_study.summary import column, probability, quantile, share, worst
 import numpy as np
@@ -94,6 +95,18 @@ def test_samples_are_independent_of_their_batch(law: str, count: int) -> None:
     for number in (0, count // 2, count - 1):
         for name, values in study.rows(number, 1).items():
             assert np.array_equal(values, whole[name][[number]], equal_nan=True)
+
+
+def test_errors_of_the_sensor_are_variables() -> None:
+    """Sizes of zero change no bit, whatever the times and lengths; others change the insertion."""
+    scenario = SteeringScenario({'law': 'springs', 'interval': 2.0})
+    at = {'target_x': 2e-3, 'lost': 0.2}
+    none = {'slow_time': 0.5, 'distortion_length': 0.02}
+    errors = {'slow_noise': 5e-4}, {'dropout_time': 4.0}, {'distortion': 5e-4}
+    rows = [scenario.row({**at, **one}) for one in ({}, none, *errors)]
+    exact, same, *others = scenario.insert(rows, [np.random.default_rng(1) for _ in rows])
+    assert same == exact
+    assert all(one['tip_x'] != exact['tip_x'] for one in others)
 
 
 @pytest.mark.parametrize('radius', [2e-4, 1e-3, 3e-3])

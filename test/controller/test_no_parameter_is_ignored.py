@@ -24,6 +24,7 @@ from needle_controller.commissioning import CommissioningSettings
 from needle_dynamics import NeedleParameters
 from needle_dynamics.compiled.friction import FrictionConstants
 from needle_dynamics.parameters import _FRICTION_FIELDS
+from needle_dynamics.simulated.tip_sensor import TipParameters
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -42,6 +43,7 @@ SETTINGS = (
     PidGains,
     NeedleParameters,
     FrictionConstants,
+    TipParameters,
 )
 
 

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Likelihood of white and slow noise at any sampling times.
+
+The errors of each axis are a bias, a term of the delay, white noise of deviation s, and an
+Ornstein-Uhlenbeck process of deviation :math:`s \sqrt g` and correlation time tau. At any sampling
+times, the inverse covariance matrix Q of this process is tridiagonal [Rue2005]_, so that
+
+.. math:: (I + g Q^{-1})^{-1} = I - g (Q + g I)^{-1}, \qquad
+   \log |I + g Q^{-1}| = \log |Q + g I| - \log |Q|
+
+take a time that is proportional to the number of samples. The likelihood is restricted
+[Patterson1971]_: bias and delay are integrated out. The variance of the white noise has its most
+probable value for each g and tau.
+
+References
+----------
+.. [Rue2005] H. Rue, L. Held, "Gaussian Markov Random Fields", Chapman & Hall, 2005.
+.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
+   sizes are unequal", Biometrika 58(3), 1971, doi:10.1093/biomet/58.3.545.
+
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from math import exp, inf, log, sqrt
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+import numpy as np
+from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.optimize import minimize
+
+#: Grid of the search: variances of slow over white noise, and number of correlation times.
+RATIOS: Final = (1e-4, 1e6)
+_RATIOS: Final = np.geomspace(*RATIOS, 9)
+_TIMES: Final = 9
+
+#: Twice the gain of the log likelihood above which noise is not white. Of 1000 recordings with
+#: white noise, five have a larger gain (chi-squared, two constants).
+_SLOW: Final = 10.6
+
+_STEP: Final = 0.02  # step of the logarithms for a curvature
+
+
+class NoiseFit(NamedTuple):
+    """Noise of k axes, with the constants of the mean: k biases, and the delay if it has one."""
+
+    constants: FloatArray  #: biases [m], and change of the delay [s]
+    covariance: FloatArray  #: of the constants, for known noise
+    log_noise: float  #: logarithm of the deviation of the white noise [m]
+    log_ratio: float  #: logarithm of the variance of slow over white noise; -inf: white
+    log_time: float  #: logarithm of the correlation time [s]
+    deviance: float  #: -2 log restricted likelihood
+    freedom: int  #: values less constants
+    information: float  #: number of independent samples with the same information on the bias
+    #: Covariance of the logarithms of white deviation, ratio and time, (3, 3).
+    spread: FloatArray = np.full((3, 3), np.nan)
+
+
+class NoiseLikelihood:
+    """
+    Likelihood of the errors of a sensor.
+
+    ``errors`` (n, k) [m] are at ``time`` (n,) [s]; ``slopes`` (n, k) are the change of the errors
+    per change of the delay [m/s], or None without a delay.
+    """
+
+    def __init__(self, time: FloatArray, errors: FloatArray, slopes: FloatArray | None) -> None:
+        self._steps, self._axes = np.diff(time), errors.shape[1]
+        ones = np.ones((len(time), 1))
+        parts = [ones, errors] if slopes is None else [ones, errors, slopes]
+        self._columns = np.asfortranarray(np.hstack(parts))
+        self._delayed = slopes is not None
+        step, span = float(np.median(self._steps)), float(time[-1] - time[0])
+        #: Correlation times that differ from white noise and from a drift.
+        self.times = step, span
+
+    def fit(self, log_ratio: float, log_time: float) -> NoiseFit:
+        """Fit bias, delay and white noise for a ratio of variances and a correlation time."""
+        gram, logarithm = self._products(exp(log_ratio), exp(log_time))
+        k = self._axes
+        one, errors = gram[0, 0], gram[1 : k + 1, 1 : k + 1]
+        size = k + self._delayed
+        normal = np.diag(np.full(size, one))
+        right = np.zeros(size)
+        right[:k] = gram[0, 1 : k + 1]
+        if self._delayed:
+            slopes = slice(k + 1, 2 * k + 1)
+            normal[k, :k] = normal[:k, k] = gram[0, slopes]
+            normal[k, k] = np.trace(gram[slopes, slopes])
+            right[k] = np.trace(gram[slopes, 1 : k + 1])
+        inverse = np.linalg.inv(normal)
+        constants = inverse @ right
+        freedom = k * len(self._columns) - size
+        squares = max(float(np.trace(errors) - right @ constants), 1e-300)
+        variance = squares / freedom
+        deviance = freedom * log(variance) + k * logarithm + np.linalg.slogdet(normal)[1]
+        return NoiseFit(
+            constants,
+            variance * inverse,
+            0.5 * log(variance),
+            log_ratio,
+            log_time,
+            float(deviance),
+            freedom,
+            float(one * (1.0 + exp(log_ratio))),
+        )
+
+    def best(self) -> NoiseFit:
+        """Return the most probable noise; white unless slow noise is significant."""
+        white = self.fit(-inf, 0.0)
+        low, high = map(log, self.times)
+        grid = product(np.log(_RATIOS), np.linspace(low, high, _TIMES))
+        start = min((self.fit(*at) for at in grid), key=lambda one: one.deviance)
+        bounds = tuple(map(log, RATIOS)), (low, high)
+        found = minimize(
+            lambda at: self.fit(*at.tolist()).deviance,
+            [start.log_ratio, start.log_time],
+            method='Nelder-Mead',
+            bounds=bounds,
+            options={'xatol': 1e-3, 'fatol': 1e-4},
+        )
+        slow = self.fit(*found.x.tolist())
+        best = white if white.deviance - slow.deviance < _SLOW else slow
+        return best._replace(spread=self._spread(best))
+
+    def _spread(self, at: NoiseFit) -> FloatArray:
+        """Return the covariance of the logarithms of white deviation, ratio and time."""
+        own = np.diag([0.5 / at.freedom, 0.0, 0.0])
+        if at.log_ratio == -inf:
+            return own
+        here = np.array([at.log_ratio, at.log_time])
+        offsets = _STEP * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [-1, -1]])
+        fits = [self.fit(*(here + offset).tolist()) for offset in offsets]
+        d, middle = [one.deviance for one in fits], at.deviance
+        ratio, time = d[0] + d[1] - 2.0 * middle, d[2] + d[3] - 2.0 * middle
+        mixed = 0.5 * (d[4] + d[5] - 2.0 * middle - ratio - time)
+        curvature = np.array([[ratio, mixed], [mixed, time]]) / _STEP**2
+        if np.linalg.eigvalsh(curvature)[0] <= 0.0:
+            return np.full((3, 3), np.inf)
+        spread = 2.0 * np.linalg.inv(curvature)
+        slopes = [fits[0].log_noise - fits[1].log_noise, fits[2].log_noise - fits[3].log_noise]
+        jacobian = np.vstack([np.array(slopes) / (2.0 * _STEP), np.eye(2)])
+        return np.asarray(own + jacobian @ spread @ jacobian.T)
+
+    def _products(self, ratio: float, time: float) -> tuple[FloatArray, float]:
+        """Return the weighted products of all columns, and the logarithm of the determinant."""
+        columns = self._columns
+        if not ratio:
+            return columns.T @ columns, 0.0
+        kept = np.exp(-self._steps / time)
+        lost = -np.expm1(-2.0 * self._steps / time)
+        diagonal = np.ones(len(columns))
+        diagonal[:-1] += kept**2 / lost
+        diagonal[1:] += kept**2 / lost
+        d, e, _ = dpttrf(diagonal + ratio, -kept / lost)
+        solved, _ = dpttrs(d, e, columns)
+        logarithm = float(np.log(d).sum() + np.log(lost).sum())
+        return columns.T @ (columns - ratio * solved), logarithm
+
+
+def log_interval(log_value: float, variance: float) -> tuple[float, float]:
+    """Return the 95 % interval of a positive value from its logarithm."""
+    half = 1.96 * sqrt(variance)
+    return exp(log_value - half), exp(log_value + half)

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read recordings of a tip sensor and true positions, from bags and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_identification.bags.bag import Bag
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.reading import chosen_topic, read_samples, Wanted
+from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
+from needle_identification.recordings.tables import (
+    column_values,
+    guessed,
+    is_table,
+    read_table,
+    sorted_rows,
+    TIME_NAMES,
+)
+from needle_identification.sensor.recording import SensorRecording
+from needle_ros import contract, wire
+from needle_ros.axes import AXES, signed, signed_axis
+from needle_ros.errors import ParameterError
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
+_TRUTH: Final = Wanted('truth_topic', (wire.POINT, wire.POSE, wire.JOINT_STATE), ())
+
+#: Roles of the columns of a table; for a bag, axes or joints by role, without the time.
+SENSOR_ROLES: Final = ('time', 'tip_x', 'tip_y', 'tip_z')
+
+#: Usual column names by role, in lower case without separators.
+_USUAL: Final = {
+    'time': TIME_NAMES,
+    'tip_x': ('tipx', 'x', 'px', 'pointx', 'positionx'),
+    'tip_y': ('tipy', 'y', 'py', 'pointy', 'positiony'),
+    'tip_z': ('tipz', 'z', 'pz', 'pointz', 'positionz'),
+}
+
+_LATEST: Final = 9e9  # largest time whose nanoseconds are 64-bit integers [s]
+_AVERAGED: Final = 1.5  # messages per sample above which samples are means
+
+
+def read_sensor_recording(
+    path: Path | str,
+    truth: Path | str | Sequence[float],
+    *,
+    axes: Sequence[str] = AXES,
+    tip_topic: str | None = None,
+    truth_topic: str | None = None,
+    time: str = 'header',
+    columns: Mapping[str, str] | None = None,
+    truth_columns: Mapping[str, str] | None = None,
+) -> SensorRecording:
+    """
+    Read a recording of a tip sensor, and the true position.
+
+    Parameters
+    ----------
+    path : Path or str
+        A bag, as in `read_friction_recording`, or a table with time and positions.
+    truth : Path or str or sequence of float
+        Constant position x, y, z [m]; or a bag or a table by the same clock, which may be the
+        recording itself.
+    axes : sequence of str
+        Axes to compare, of x, y and z.
+    tip_topic : str, optional
+        Topic of the tip, PointStamped or PoseStamped; default the only topic of these types, or
+        the topic with the last name tip_deflection.
+    truth_topic : str, optional
+        Topic of the true position, likewise, or a JointState with the joints in
+        ``truth_columns``; default the only such topic.
+    time : str
+        Stamps to use, one of `TIMES`.
+    columns, truth_columns : mapping of str to str, optional
+        By role, of `SENSOR_ROLES`: columns of a table, see `tables`; for a bag, the axes x, y or
+        z, or joints, with a prefix ``-`` for the opposite sign.
+
+    Returns
+    -------
+    SensorRecording
+        The recording; its ``losses`` list discarded and corrected data.
+
+    Raises
+    ------
+    RecordingError
+        If a file is not readable, lacks a topic or a column, or the times do not overlap.
+    ParameterError
+        If an axis or the constant position is not valid.
+
+    """
+    axes = tuple(axes)
+    if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
+        raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
+    path, losses = Path(path), list[str]()
+    stamps, tip = _positions(path, _TIP, tip_topic, axes, time, columns or {}, losses)
+    if isinstance(truth, (str, Path)):
+        there = list[str]()
+        true_stamps, true_tip = _positions(
+            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}, there
+        )
+        losses += [f'true position: {loss}' for loss in there]
+        if stamps[-1] < true_stamps[0] or true_stamps[-1] < stamps[0]:
+            spans = (
+                f'from {part[0] / NANOSECONDS:.3f} to {part[-1] / NANOSECONDS:.3f} s'
+                for part in (stamps, true_stamps)
+            )
+            raise RecordingError(
+                f'{path} and the true position in {truth} do not overlap in time; they last '
+                f'{" and ".join(spans)}'
+            )
+    else:
+        if len(truth) != len(AXES) or not np.isfinite(truth).all():
+            raise ParameterError(f'a constant position is x, y, z [m], got {list(truth)}')
+        true_stamps = stamps[:1]
+        true_tip = np.array([[truth[AXES.index(axis)] for axis in axes]], dtype=np.float64)
+    start = stamps[0]
+    return SensorRecording(
+        name=str(path),
+        axes=axes,
+        time=(stamps - start) / NANOSECONDS,
+        tip=tip,
+        true_time=(true_stamps - start) / NANOSECONDS,
+        true_tip=true_tip,
+        losses=tuple(losses),
+    )
+
+
+def _positions(
+    path: Path,
+    wanted: Wanted,
+    topic: str | None,
+    axes: Sequence[str],
+    time: str,
+    columns: Mapping[str, str],
+    losses: list[str],
+) -> tuple[IntArray, FloatArray]:
+    """Return stamps [ns], (n,), and positions on the axes [m], (n, k)."""
+    if not is_table(path):
+        return _of_bag(path, wanted, topic, axes, time, columns, losses)
+    if topic is not None:
+        option = wanted.option.replace('_', '-')
+        raise RecordingError(f'{path} is a table: name columns instead of --{option}')
+    table = read_table(path)
+    specs = {**guessed(table, _USUAL), **columns}
+    roles = [f'tip_{axis}' for axis in axes]
+    if missing := [role for role in ('time', *roles) if role not in specs]:
+        option = '--truth-columns' if wanted is _TRUTH else '--columns'
+        raise RecordingError(
+            f'{path}: no column found for {" and ".join(missing)}, it has '
+            f'{", ".join(table.columns)}: use {option} {missing[0]}=NAME,...'
+        )
+    losses += table.losses
+    if words := ', '.join(
+        f'{role}={specs[role]}' for role in ('time', *roles) if role not in columns
+    ):
+        losses.append(f'columns by their names: {words}')
+    values = {role: column_values(table, role, specs[role], losses) for role in ('time', *roles)}
+    rows = np.column_stack([values[role] for role in roles])
+    start, stamps, found = sorted_rows(path, values['time'], rows, losses)
+    if not abs(start) < _LATEST:
+        raise RecordingError(f'{path}: time starts at {start:.3g} s: is its unit right?')
+    _check_means(losses, int(np.count_nonzero(np.isfinite(rows).all(axis=1))), len(stamps))
+    return round(NANOSECONDS * start) + stamps, found
+
+
+def _of_bag(
+    path: Path,
+    wanted: Wanted,
+    name: str | None,
+    axes: Sequence[str],
+    time: str,
+    columns: Mapping[str, str],
+    losses: list[str],
+) -> tuple[IntArray, FloatArray]:
+    bag = Bag(path)
+    topic = chosen_topic(bag, bag.topics(), wanted, name)
+    words = [columns.get(f'tip_{axis}', axis) for axis in axes]
+    if topic.type_name == wire.JOINT_STATE:
+        parsed = [signed(word) for word in words]
+        source: SignalSource = EachJoint(*(joint for _, joint in parsed))
+    else:
+        parsed = [signed_axis(word, f'tip_{axis}') for axis, word in zip(axes, words, strict=True)]
+        source = source_of(topic.type_name, [axis for _, axis in parsed])
+    gathered, _ = read_samples(bag, {topic: source}, time)
+    samples = gathered[topic].samples(bag)
+    losses += bag.losses
+    _check_means(losses, bag.counts[topic], len(samples.stamps))
+    return samples.stamps, samples.values * [sign for sign, _ in parsed]
+
+
+def _check_means(losses: list[str], count: int, samples: int) -> None:
+    if count > _AVERAGED * samples:
+        losses.append(f'{count} samples averaged to {samples}: noise and rate are of the means')

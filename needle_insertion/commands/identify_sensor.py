@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`needle identify sensor`: noise, bias, delay and losses of a tip sensor."""
+
+from __future__ import annotations
+
+import argparse
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.formatting import between, rounded
+from needle_identification.recordings.tables import column_roles, is_table
+from needle_identification.sensor.estimate import SensorEstimate
+from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
+from needle_identification.sensor.recording import SensorRecording
+from needle_insertion.commands.common import check_file, print_each, print_result
+from needle_insertion.commands.identify_steering import add_time
+from needle_insertion.progress import ProgressLine
+from needle_insertion.report.text import table
+from needle_ros.axes import AXES
+from needle_ros.errors import ParameterError
+from needle_ros.files import write_whole
+from needle_ros.quantities import quantities
+
+
+def add_sensor(what: Any) -> None:
+    """Add the subcommand to the subparsers of ``needle identify``."""
+    parser = what.add_parser(
+        'sensor',
+        help='noise, correlation time, bias, delay, losses and outliers of a tip sensor',
+        description='Compare a recording of the tip sensor with the true position of the tip, '
+        'which is constant or recorded by another sensor.',
+        epilog='example: needle identify sensor held.csv --truth 0mm,52.3mm,0mm '
+        "--columns 'time=t[ms],tip_x=X[mm],tip_y=Y[mm],tip_z=Z[mm]' -o sensor.yaml",
+    )
+    parser.add_argument(
+        'log', type=Path, metavar='LOG', help='bag or table (.csv, .tsv, .mat) of the tip sensor'
+    )
+    parser.add_argument(
+        '--truth',
+        metavar='X,Y,Z|FILE',
+        help='true position: constant, such as 0mm,52.3mm,0mm, or a bag or table by the same '
+        'clock (default: LOG itself, with --truth-topic or --truth-columns)',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        metavar='FILE',
+        help='ROS parameter file with the result, for plant and steering',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    reading = parser.add_argument_group('input')
+    for option, of in (('--columns', 'the sensor'), ('--truth-columns', 'the true position')):
+        reading.add_argument(
+            option,
+            metavar='ROLE=[-]NAME[*FACTOR][UNIT],...',
+            help=f'columns of {of} by role ({", ".join(SENSOR_ROLES)}; default: recognized by '
+            'usual names); for a bag, axes such as tip_x=-z',
+        )
+    for option, of in (('--tip-topic', 'the tip'), ('--truth-topic', 'the true position')):
+        reading.add_argument(
+            option,
+            metavar='TOPIC',
+            help=f'topic of {of}, a PointStamped or PoseStamped (default: the only such topic)',
+        )
+    reading.add_argument(
+        '--axes',
+        default=','.join(AXES),
+        help='axes to compare (default x,y,z)',
+        metavar='AXIS,...',
+    )
+    add_time(reading)
+    parser.set_defaults(identify=_run)
+
+
+def _truth(options: argparse.Namespace) -> Path | list[float]:
+    """Return the constant position or the file of the true position."""
+    if options.truth is None:
+        if options.truth_topic is None and options.truth_columns is None:
+            raise ParameterError(
+                '--truth X,Y,Z or --truth FILE must give the true position, or --truth-topic or '
+                f'--truth-columns its place in {options.log}'
+            )
+        return Path(options.log)
+    if Path(options.truth).exists():
+        return Path(options.truth)
+    try:
+        found = quantities(options.truth, 'm')
+    except ParameterError:
+        found = []
+    if len(found) != len(AXES) or not all(map(isfinite, found)):
+        raise ParameterError(
+            f'--truth must be a file, or three lengths x,y,z such as 0mm,52.3mm,0mm, got '
+            f'{options.truth!r}'
+        )
+    return found
+
+
+def _run(options: argparse.Namespace) -> int:
+    # Large imports, which the other subcommands do not need.
+    from needle_controller.steering.settings import ExecutiveSettings
+    from needle_identification import identify_sensor
+    from needle_identification.result import sensor_yaml
+
+    if options.output is not None:
+        check_file(options.output)
+
+    def roles(text: str | None) -> dict[str, str]:
+        return column_roles(text, SENSOR_ROLES) if text else {}
+
+    with ProgressLine('reading', brief=True):
+        recording = read_sensor_recording(
+            options.log,
+            _truth(options),
+            axes=tuple(axis.strip() for axis in options.axes.split(',')),
+            tip_topic=options.tip_topic,
+            truth_topic=options.truth_topic,
+            time=options.time,
+            columns=roles(options.columns),
+            truth_columns=roles(options.truth_columns),
+        )
+    print_each('warning', recording.losses)
+    with ProgressLine('identification', brief=True):
+        found = identify_sensor(recording)
+    print_each('warning', found.warnings)
+    written = list[Path]()
+    if options.output is not None:
+        # Stamps of headers are the times of the samples: their messages come later.
+        delayed = is_table(options.log) or options.time == 'receive'
+        text = sensor_yaml(found, ExecutiveSettings().measurement_time, delayed=delayed)
+        write_whole(options.output, text.encode())
+        written.append(options.output)
+    document = sensor_document(found, recording)
+    print_result(document, sensor_text(found), written, as_json=options.json)
+    return 0
+
+
+def sensor_text(found: SensorEstimate) -> str:
+    """Return a result as a table for the terminal."""
+    rows = []
+    for one in found.parameters:
+        unit = '' if one.unit == '1' else f' [{one.unit}]'
+        name = f'{one.name.replace("_", " ").capitalize()} {one.symbol}{unit}'
+        low, high = one.interval
+        shown = rounded(one.value, (high - low) / 4.0) if one.determined else 'not determined'
+        rows.append((name, shown, between(one.interval) if one.determined else ''))
+    return (
+        f'{table(rows, ("parameter", "value", "95 % interval"))}\n\n'
+        f'{found.samples} samples at {found.rate:.4g} Hz in {found.duration:.4g} s'
+    )
+
+
+def sensor_document(found: SensorEstimate, recording: SensorRecording) -> dict[str, Any]:
+    """Return a result as a JSON document in SI units."""
+
+    def entry(one: ParameterEstimate) -> dict[str, Any]:
+        if not one.determined:
+            return {'unit': one.unit, 'determined': False}
+        return {
+            'value': one.value,
+            'interval': list(one.interval),
+            'unit': one.unit,
+            'determined': True,
+        }
+
+    return {
+        'parameters': {one.name: entry(one) for one in found.parameters},
+        'axes': list(found.axes),
+        'rate': found.rate,
+        'samples': found.samples,
+        'duration': found.duration,
+        'recording': {'name': recording.name, 'losses': list(recording.losses)},
+        'warnings': list(found.warnings),
+    }
