@@ -12,23 +12,13 @@ measurements. The name of a file is the name of its medium, an underscore, and a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from needle_identification import RecordingError, SteeringRecording
-from needle_identification.recordings.tables import column_values, read_table
-from needle_identification.steering.recording import recorded_insertion
+from needle_identification import read_steering_recording, RecordingError, SteeringRecording
 from needle_ros.errors import ParameterError
 import numpy as np
-
-_COLUMNS: Final = {
-    'depth': '-Base y[mm]',
-    'guide_x': 'Base x[mm]',
-    'guide_z': 'Base z[mm]',
-    'tip_x': 'Tip x[mm]',
-    'tip_z': 'Tip z[mm]',
-}
-_TIMES: Final = ('Base sec', 'Base nanosec')
 
 #: Least number of steps of an insertion.
 _STEPS: Final = 20
@@ -61,26 +51,13 @@ def medium_of(path: Path) -> str:
 
 def read_insertion(path: Path) -> SteeringRecording:
     """Read the steps of an insertion; guide and tip are relative to the first step."""
-    table = read_table(path)
-    missing = {*_TIMES, *(spec.lstrip('-')[:-4] for spec in _COLUMNS.values())} - {*table.columns}
-    if missing:
-        raise RecordingError(f'{path} has no column {", ".join(sorted(missing))}')
-    times = np.column_stack([table.columns[name] for name in _TIMES])
-    new = (times != 0.0).any(axis=1)
-    new[1:] &= (times[1:] != times[:-1]).any(axis=1)
-    losses: list[str] = []
-    values = {
-        role: column_values(table, role, spec, losses)[new] for role, spec in _COLUMNS.items()
-    }
-    if len(values['depth']) <= _STEPS:
-        count = max(0, len(values['depth']) - 1)
+    found = read_steering_recording(path, medium=medium_of(path))
+    if len(found.depth) <= _STEPS:
+        count = len(found.depth) - 1
         raise RecordingError(f'{path} has {count} steps, at least {_STEPS} are needed')
-    for role in ('guide_x', 'guide_z', 'tip_x', 'tip_z'):
-        values[role] = values[role] - values[role][0]
-    found = recorded_insertion(path, medium_of(path), values, losses)
     if not found.known.all():
         raise RecordingError(f'{path}: {"; ".join(found.losses)}')
-    return found
+    return replace(found, guide=found.guide - found.guide[0], tip=found.tip - found.tip[0])
 
 
 def moves(recording: SteeringRecording) -> bool:

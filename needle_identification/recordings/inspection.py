@@ -18,6 +18,7 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
+from needle_identification.steering.columns import steering_columns, STEERING_ROLES
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
 from needle_ros.axes import AXES
@@ -112,7 +113,11 @@ def _table(path: Path) -> Inspection:
     if not {'depth', 'speed'} & set(roles):
         lacking.append('depth or speed')
     command = f'needle identify friction {shlex.quote(str(path))}'
-    if lacking:
+    steered = steering_columns(table)
+    if lacking and {*STEERING_ROLES} - {*steered} <= {'roll'}:
+        words = [f'{role} by name and values: {spec}' for role, spec in steered.items()]
+        command = f'needle identify steering {shlex.quote(str(path))}'
+    elif lacking:
         words.append(f'no column looks like {" or ".join(lacking)}: name them with --columns')
         names = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
         command += f' --columns {shlex.quote(",".join(f"{r}={n}" for r, n in names.items()))}'

@@ -179,7 +179,7 @@ def _plain(name: str) -> str:
     return _WORD.sub('', name.lower())
 
 
-def _unit_of(name: str, role: str) -> str | None:
+def unit_of(name: str, role: str) -> str | None:
     """Return the unit in a name, if valid for the role."""
     match = _BRACKETS.match(name)
     word = match[2].strip() if match else name.rpartition('_')[2]
@@ -203,7 +203,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
             raise RecordingError(f'--columns {role}={spec} is not [-]NAME[*FACTOR][UNIT]')
         name, factor, unit = match.groups()
     name, column = _column(table, role, name)
-    unit = unit or _unit_of(name, role)
+    unit = unit or unit_of(name, role)
     if unit is not None and unit not in UNITS[role]:
         raise RecordingError(
             f'--columns {role}={spec}: the unit must be one of {", ".join(UNITS[role])}, '

@@ -25,12 +25,12 @@ from needle_identification.recordings.reading import (
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import (
     column_values,
-    guessed,
     is_table,
     read_table,
     Table,
 )
 from needle_identification.recordings.timebase import merge
+from needle_identification.steering.columns import new_rows, steering_columns, STEERING_ROLES
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
 from needle_ros.axes import signed, signed_axis
@@ -50,19 +50,6 @@ _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
 _MOVED: Final = 1e-4  # largest change of a constant tilt [rad]
-
-#: Roles of the columns; without a roll column the roll is zero.
-STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
-
-#: Usual column names by role, in lower case without separators.
-_USUAL: Final = {
-    'depth': ('depth', 'insertion', 'insertiondepth', 'tipy', 'robot'),
-    'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
-    'guide_z': ('guidez', 'basez', 'zguide', 'zbase'),
-    'tip_x': ('tipx', 'xtip'),
-    'tip_z': ('tipz', 'ztip'),
-    'roll': ('roll', 'rotation', 'theta'),
-}
 
 _SHIFTED: Final = re.compile(r'^(.*?)\s*@\s*(\d{1,6})$')
 
@@ -148,10 +135,14 @@ def read_steering_recording(
 def read_steering_table(
     path: Path | str, columns: Mapping[str, str], medium: str = ''
 ) -> SteeringRecording:
-    """Read an insertion from a table; roles missing in ``columns`` are found by usual names."""
+    """
+    Read an insertion from a table; roles missing in ``columns`` are found by names and values.
+
+    If no column is given, the rows without a new measurement of the guide are left out.
+    """
     path = Path(path)
     table = read_table(path)
-    specs = {**guessed(table, _USUAL), **columns}
+    specs = {**steering_columns(table), **columns}
     specs = {role: specs[role] for role in STEERING_ROLES if role in specs}
     missing = [role for role in STEERING_ROLES if role not in specs and role != 'roll']
     if missing:
@@ -161,15 +152,20 @@ def read_steering_table(
         )
     losses = list(table.losses)
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
-        losses.append(f'columns by their names: {words}')
+        losses.append(f'columns by their names and values: {words}')
+    new = np.ones(len(next(iter(table.columns.values()))), dtype=np.bool_)
+    if not columns:
+        new, times = new_rows(table, specs)
+        if times:
+            losses.append(f'rows in which {" or ".join(times)} changes: {np.count_nonzero(new)}')
     values = {role: _shifted(table, role, spec, losses) for role, spec in specs.items()}
     moved = np.column_stack([values[role] for role in specs if not role.startswith('tip')])
     usable = np.isfinite(moved).all(axis=1)
     if lost := int(np.count_nonzero(~usable)):
         losses.append(f'{lost} rows with a value that is not a number, left out')
-    if np.count_nonzero(usable) < 2:
+    if np.count_nonzero(usable & new) < 2:
         raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
-    values = {role: column[usable] for role, column in values.items()}
+    values = {role: column[usable & new] for role, column in values.items()}
     return recorded_insertion(path, medium, values, losses)
 
 

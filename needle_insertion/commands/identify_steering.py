@@ -16,8 +16,9 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
+from needle_identification.steering.columns import STEERING_ROLES
 from needle_identification.steering.estimate import HeldOut, SteeringEstimate
-from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
+from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
 from needle_insertion.commands.common import check_file, print_each, print_result, with_unit

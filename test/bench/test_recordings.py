@@ -128,8 +128,8 @@ def test_number_and_media_are_selected(tmp_path: Path) -> None:
 
 def test_table_without_a_column_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'gel_00.csv'
-    path.write_text('Tip x,Tip z,Base x,Base y,Base z\n1,2,3,4,5\n', encoding='utf-8')
-    with pytest.raises(RecordingError, match='Base nanosec, Base sec'):
+    path.write_text('Tip x,Base x,Base y,Base z\n1,3,4,5\n', encoding='utf-8')
+    with pytest.raises(RecordingError, match='no column found for tip_z'):
         read_insertion(path)
 
 

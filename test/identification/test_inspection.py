@@ -142,6 +142,15 @@ def test_table_columns_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[
     capsys.readouterr()
 
 
+def test_a_table_of_a_steered_insertion_is_recognized(tmp_path: Path) -> None:
+    path = tmp_path / 'gel 1.csv'
+    rows = '\n'.join(f'{1 + k},{-5 * k},{2 + k},{0.1 * k},{-5 * k},{0.2 * k}' for k in range(9))
+    path.write_text(f'Base x,Base y,Base z,Tip x,Tip y,Tip z\n{rows}\n', encoding='utf-8')
+    found = inspect_recording(path)
+    assert shlex.split(found.command) == ['needle', 'identify', 'steering', str(path)]
+    assert 'depth by name and values: -Base y[mm]' in found.words
+
+
 def test_a_missing_recording_gives_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RecordingError, match='does not exist'):
         inspect_recording('nowhere')

@@ -24,7 +24,7 @@ from needle_identification import (
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
 from needle_identification.result import steering_yaml
-from needle_identification.steering.reading import STEERING_ROLES
+from needle_identification.steering.columns import STEERING_ROLES
 from needle_identification.steering.recording import credible, readings
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
@@ -324,6 +324,35 @@ def test_rows_of_zeros_before_the_guide_moves_are_left_out(tmp_path: Path) -> No
     # A guide that starts at zero.
     path.write_text(path.read_text().replace('25,-22', '1,0').replace('26,-22', '2,0'))
     assert len(read_steering_recording(path).depth) == 5
+
+
+def test_a_foreign_table_is_read_without_options(tmp_path: Path) -> None:
+    """Millimeters without a unit, inverted depth, held columns with own times, zeros first."""
+    rng = np.random.default_rng(3)
+    depth = 5e-3 * np.arange(1.0, 21.0)
+    guide, tip = 1e-3 * rng.normal(size=(2, 20, 2)) + 0.02
+    plain = tmp_path / 'plain.csv'
+    rows = np.column_stack([depth, guide, tip])
+    np.savetxt(plain, rows, delimiter=',', header='depth,guide_x,guide_z,tip_x,tip_z', comments='')
+    # Each step is logged when it ends; until the next one the tip is logged in motion.
+    held = np.repeat(np.column_stack([1e3 * guide[:, 0], -1e3 * depth, 1e3 * guide[:, 1]]), 4, 0)
+    seen = 1e3 * np.repeat(tip, 4, 0)
+    seen[np.arange(80) % 4 > 0] += rng.normal(size=(60, 2))
+    steps = np.repeat(np.arange(20), 4)
+    times = np.column_stack([1_665_773_010 + steps, 1_000 + steps])
+    along = -1e3 * np.repeat(depth, 4) - 0.4
+    lines = np.column_stack([held, times, seen[:, 0], along, seen[:, 1]])
+    lines = np.vstack([np.zeros((7, 8)), lines])
+    lines[:7, 5:] = 1e3 * tip[0, 0]
+    foreign = tmp_path / 'foreign.csv'
+    names = 'Base x,Base y,Base z,Base sec,Base nanosec,Tip x,Tip y,Tip z'
+    np.savetxt(foreign, lines, delimiter=',', header=names, comments='', fmt='%.10g')
+    expected, found = read_steering_recording(plain), read_steering_recording(foreign)
+    for name in ('depth', 'guide', 'tip'):
+        # Ten digits in the file, of up to 100 mm.
+        assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-10)
+    assert 'rows in which Base sec or Base nanosec changes: 20' in found.losses
+    assert any('depth=-Base y[mm], guide_x=Base x[mm]' in words for words in found.losses)
 
 
 def test_columns_may_be_delayed_by_rows(tmp_path: Path) -> None:
