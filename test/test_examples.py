@@ -74,7 +74,6 @@ def test_notebook_runs(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The notebook runs in its folder, draws, and prints the expected results."""
-    # Restores the folder that a notebook changes.
     monkeypatch.chdir(NOTEBOOKS)
     runpy.run_path(str(NOTEBOOKS / f'{name}.py'), run_name='__main__')
     assert plt.get_fignums()

@@ -10,12 +10,11 @@ the needle, with a confidence interval.
 # %%
 # A recording as your rig may write it
 # ------------------------------------
-# This cell writes a table from a recording of the clone into an empty folder: time in ms, position
-# of a stage in mm that increases *out of* the tissue, force in N. Replace it by your own file.
+# This cell writes a table from a recording of the clone: time in ms, position of a stage in mm that
+# increases *out of* the tissue, force in N. Replace it by your own file.
 
-from os import chdir
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import gettempdir
 
 from needle_identification import (
     FrictionSettings,
@@ -26,11 +25,10 @@ from needle_identification import (
 )
 import numpy as np
 
-BAGS = Path('../../bags').resolve()
-chdir(mkdtemp())
+BAGS = Path('../../bags')
 
 bag = read_friction_recording(BAGS / 'friction_01')
-table = Path('stage.csv')
+table = Path(gettempdir(), 'stage.csv')
 np.savetxt(
     table,
     np.column_stack([1e3 * bag.time, -1e3 * bag.depth, bag.force]),

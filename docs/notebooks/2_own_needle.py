@@ -11,14 +11,12 @@ Describe your needle in a YAML file, insert it, and measure how its tip responds
 # --------------
 # Only constants that differ from a needle of the package are needed, in SI units or with a unit.
 
-from os import chdir
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import gettempdir
 
 from needle_dynamics import bending_length, find_needle, ParameterError, SteeredNeedle
 
-chdir(mkdtemp())
-file = Path('mine.yaml')
+file = Path(gettempdir(), 'mine.yaml')
 file.write_text(
     """\
 needle: bending_35mm
@@ -36,7 +34,7 @@ print(f'bending length: {1e3 * length:.1f} mm')
 # %%
 # A wrong name or value is reported with the valid ones.
 
-wrong = Path('wrong.yaml')
+wrong = file.with_name('wrong.yaml')
 wrong.write_text('lenght: 150mm\n', encoding='utf-8')
 try:
     find_needle(str(wrong))
