@@ -10,8 +10,8 @@ the needle, with a confidence interval.
 # %%
 # A recording as your rig may write it
 # ------------------------------------
-# This cell writes a table from a recording of the clone: time in ms, position of a stage in mm that
-# increases *out of* the tissue, force in N. Replace it by your own file.
+# This cell writes a table from a recording of the clone: time in ms, position of a stage in mm
+# that increases *out of* the tissue, force in N. Replace it by your own file.
 
 from pathlib import Path
 from tempfile import gettempdir
