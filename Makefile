@@ -22,7 +22,7 @@ check: $(VENV)/.dev
 	$(BIN)/python -m tools.license
 
 # Documentation site, without network access; Sphinx warnings are errors.
-docs: $(VENV)/.docs
+docs: $(VENV)/.docs compiled
 	$(BIN)/python -m sphinx -q -W -E --keep-going -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
 
@@ -95,4 +95,4 @@ $(VENV)/.bench: setup.py $(VENV)/.complete
 	touch $@
 
 clean:
-	rm -rf $(VENV) build install log demo_output docs/_build docs/api docs/repository
+	rm -rf $(VENV) build install log demo_output docs/_build docs/api docs/gallery docs/repository

@@ -129,7 +129,13 @@ setup(
             'ruff>=0.9',
         ],
         # `make docs`; locked separately in requirements-docs.lock.
-        'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
+        'docs': [
+            'furo>=2024.8',
+            'myst-parser>=4.0',
+            'numpydoc>=1.8',
+            'sphinx>=8.1,<9',
+            'sphinx-gallery>=0.18',
+        ],
         'study': STUDY,
         'dask': DASK,
         'gym': GYM,

@@ -20,7 +20,7 @@ from benchmarks.page import Answer, PageSection, Tick
 from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
 from needle_study.engine import chunk, order, TABLE
-from needle_study.study import made
+from needle_study.study import build_study
 import numpy as np
 import yaml
 
@@ -92,7 +92,7 @@ def _start() -> float:
     """Return the time from the start of a worker to its first result [s]."""
     begin = time.monotonic()
     with processes(1) as pool:
-        pool.submit(chunk, order(made({**_STUDY, 'samples': 1})), 0, 1).result()
+        pool.submit(chunk, order(build_study({**_STUDY, 'samples': 1})), 0, 1).result()
     return time.monotonic() - begin
 
 

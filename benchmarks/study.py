@@ -31,7 +31,7 @@ from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
 from needle_ros.process_pool import processes
 from needle_study import engine
-from needle_study.study import made, read_study, Study
+from needle_study.study import build_study, read_study, Study
 import numpy as np
 import psutil
 import yaml
@@ -155,7 +155,7 @@ def _compare(folder: Path, plan: StudyPlan, tick: Tick) -> Answer:
 def _study(samples: int, settings: dict[str, Any] | None = None) -> Study:
     """Return the study with different numbers."""
     document = read_study(STUDY).document
-    return made(
+    return build_study(
         {**document, 'samples': samples, 'settings': {**document['settings'], **(settings or {})}}
     )
 

@@ -22,9 +22,10 @@ extensions = [
     'repository_pages',
     'safety_file',
     'mathml',
+    'sphinx_gallery.gen_gallery',
 ]
-# The README is included in the home page.
-exclude_patterns = ['_build', 'repository/readme.md']
+# The README is included in the home page; the pages of the notebooks are in gallery/.
+exclude_patterns = ['_build', 'notebooks', 'repository/readme.md']
 html_math_renderer = 'mathml'
 html_theme = 'furo'
 html_title = f'{project} {release}'
@@ -51,3 +52,19 @@ numpydoc_show_class_members = False
 
 myst_enable_extensions = ['dollarmath']
 myst_heading_anchors = 3
+
+# The notebooks: scripts with cells, executed here. Pages depend on sources only, not on the clock.
+sphinx_gallery_conf = {
+    'examples_dirs': 'notebooks',
+    'gallery_dirs': 'gallery',
+    'backreferences_dir': 'gallery/names',
+    'filename_pattern': r'\.py$',
+    'within_subsection_order': 'FileNameSortKey',
+    'abort_on_example_error': True,
+    'run_stale_examples': True,
+    'capture_repr': ('_repr_html_',),
+    'min_reported_time': float('inf'),
+    'write_computation_times': False,
+    'download_all_examples': False,
+    'show_signature': False,
+}

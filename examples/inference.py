@@ -21,7 +21,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray, insert_batch, NEEDLES
 from needle_dynamics.steering.parameters import with_lengths
-from needle_study.study import made
+from needle_study.study import build_study
 import numpy as np
 
 #: Variables of the population. Bending length and path noise are inferred; the others are nuisance
@@ -52,7 +52,7 @@ DRAWN, TRIALS, DRAWS = 20_000, 1000, 1000
 def population(count: int, seed: int) -> dict[str, FloatArray]:
     """Draw needles as `needle study` does."""
     study = {'scenario': 'steering', 'samples': count, 'seed': seed, 'population': POPULATION}
-    return made(study).draw(range(count))
+    return build_study(study).draw(range(count))
 
 
 def guides() -> FloatArray:

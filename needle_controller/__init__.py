@@ -77,5 +77,6 @@ if TYPE_CHECKING:
     from needle_controller.steering.responses import SteeringModel as SteeringModel
     from needle_controller.steering.settings import ExecutiveSettings as ExecutiveSettings
     from needle_controller.uncertainty import Uncertainty as Uncertainty
+    from needle_ros.wire import Reading as Reading
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

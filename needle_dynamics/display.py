@@ -114,9 +114,9 @@ class Displayed:
         panels = {k: one for k, one in panels.items() if any(v.any() for _, v in one)} or panels
         figure = figure or new_figure(1.0 + 1.6 * len(panels))
         found = list(figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0])
-        label, factor = _shown(name)
+        label, factor = shown(name)
         for axes, (panel, lines) in zip(found, panels.items(), strict=True):
-            text, scale = _shown(panel)
+            text, scale = shown(panel)
             for word, values in lines:
                 axes.plot(factor * abscissa, scale * values, label=word)
             axes.set_ylabel(text)
@@ -134,7 +134,7 @@ def new_figure(height: float) -> Figure:
     return plt.figure(figsize=(9.0, height), layout='constrained')
 
 
-def _shown(name: str) -> tuple[str, float]:
+def shown(name: str) -> tuple[str, float]:
     """Return the label of a column in the unit of figures, and the factor of its values."""
     word, _, unit = name.removesuffix(']').partition(' [')
     unit, factor = _SHOWN.get(unit, (unit, 1.0))

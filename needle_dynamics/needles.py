@@ -166,7 +166,8 @@ def find_needle(name: str) -> NeedlePreset:
     try:
         document = read_document(Path(name).expanduser().read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
-        raise ParameterError(f'needle {name} cannot be read: {error}') from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ParameterError(f'needle {name} cannot be read: {reason}') from error
     return _based(name, document)
 
 

@@ -155,19 +155,25 @@ class _Parser(argparse.ArgumentParser):
         # Imported here: the help does not need it.
         from difflib import get_close_matches
 
+        message = re.sub(r"invalid int value: ('.*')$", r'must be a whole number, got \1', message)
         if wrong := re.search(r"invalid choice: '([^']*)'", message):
             known = [str(choice) for action in self._actions for choice in action.choices or ()]
             near = get_close_matches(wrong[1], known, 1)
         else:
             _, _, words = message.partition('unrecognized arguments: ')
-            options = list(self._options())
+            # Without the dashes, which all options have in common.
+            options = {name.lstrip('-'): name for name in self._options()}
             near = [
-                name
+                options[name]
                 for word in words.split()
                 if word.startswith('-')
-                for name in get_close_matches(word.partition('=')[0], options, 1)
+                for name in get_close_matches(word.partition('=')[0].lstrip('-'), options, 1)
             ]
-        super().error(f'{message}; did you mean {", ".join(near)}?' if near else message)
+        if near:
+            message += f'; did you mean {", ".join(near)}?'
+        elif 'invalid' not in message:
+            message += '; --help lists all arguments'
+        self.exit(2, f'{self.prog}: error: {message}\n')
 
     def _options(self) -> Iterator[str]:
         yield from self._option_string_actions

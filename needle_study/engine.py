@@ -27,7 +27,7 @@ from zlib import crc32
 from needle_dynamics import FloatArray
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.files import write_whole
-from needle_study.study import made, Study
+from needle_study.study import build_study, Study
 import pyarrow as pa
 from pyarrow import parquet
 
@@ -77,7 +77,7 @@ def _check_versions(wanted: Mapping[str, str], what: str) -> None:
 def _study(text: str) -> Study:
     given = json.loads(text)
     _check_versions(given['versions'], 'a worker')
-    return made(given['study'])
+    return build_study(given['study'])
 
 
 def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:

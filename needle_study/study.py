@@ -9,18 +9,24 @@ from functools import lru_cache
 from math import isfinite
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Final
+from typing import Any, Final, TYPE_CHECKING
 
 from needle_dynamics import FloatArray
+from needle_dynamics.display import Displayed, new_figure, shown
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_study.distribution import Distribution, distribution
 from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import Scenario, SCENARIOS
+from needle_study.scenario import Metric, Scenario, SCENARIOS, Variable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
+
+if TYPE_CHECKING:
+    # Take half a second to import.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
@@ -94,6 +100,20 @@ class Study:
         """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
 
+    def simulate(self) -> StudyTable:
+        """
+        Simulate all samples in this process.
+
+        `needle study` computes large studies on all cores, and writes them to files.
+
+        Returns
+        -------
+        StudyTable
+            Variables and metrics of each sample.
+
+        """
+        return StudyTable(self, self.rows(0, self.samples))
+
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
         """Compute `count` samples from number `first` on: number, sampled values and metrics."""
         numbers = range(first, first + count)
@@ -106,6 +126,48 @@ class Study:
         }
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class StudyTable(Displayed):
+    """Samples of a study: number, variables of the population and metrics."""
+
+    study: Study
+    values: Mapping[str, FloatArray]  #: by name, each of shape (n,); 1 for yes, NaN if missing
+
+    def columns(self) -> dict[str, FloatArray]:
+        scenario = self.study.scenario
+        known: dict[str, Metric | Variable] = {**scenario.variables, **scenario.metrics}
+        units = {name: one.unit for name, one in known.items()}
+        return {f'{name} [{units.get(name) or 1}]': one for name, one in self.values.items()}
+
+    def plot(self, figure: Figure | None = None) -> list[Axes]:
+        """
+        Draw the distribution of the primary metric, and the metric over each variable.
+
+        Parameters
+        ----------
+        figure : matplotlib.figure.Figure, optional
+            Figure to draw in; by default a new one of ``matplotlib.pyplot``.
+
+        Returns
+        -------
+        list of matplotlib.axes.Axes
+            The histogram, and a panel for each variable of the population.
+
+        """
+        scenario, (name, *_) = self.study.scenario, self.study.scenario.metrics
+        label, factor = shown(f'{name} [{scenario.metrics[name].unit}]')
+        values = factor * self.values[name]
+        figure = figure or new_figure(3.0)
+        found = list(figure.subplots(1, 1 + len(self.study.population), squeeze=False).flat)
+        found[0].hist(values[np.isfinite(values)], bins='auto')
+        found[0].set(xlabel=label, ylabel='samples')
+        for axes, variable in zip(found[1:], self.study.population, strict=True):
+            text, scale = shown(f'{variable} [{scenario.variables[variable].unit}]')
+            axes.plot(scale * self.values[variable], values, '.')
+            axes.set(xlabel=text, ylabel=label)
+        return found
+
+
 @lru_cache(maxsize=64)
 def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
     """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
@@ -114,10 +176,29 @@ def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
     return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))
 
 
-def read_study(path: Path) -> Study:
-    """Read a YAML study file; raise `ParameterError` with its name if it is not valid."""
+def read_study(path: Path | str) -> Study:
+    """
+    Read a study file.
+
+    Parameters
+    ----------
+    path : Path or str
+        File (.yaml).
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ParameterError
+        If the file is not a valid study; the message has its name.
+
+    """
+    path = Path(path)
     try:
-        return made(read_document(path.read_text(encoding='utf-8')))
+        return build_study(read_document(path.read_text(encoding='utf-8')))
     except (DocumentError, ParameterError) as error:
         raise ParameterError(f'{path}: {error}') from error
     except (OSError, UnicodeDecodeError) as error:
@@ -125,8 +206,26 @@ def read_study(path: Path) -> Study:
         raise ParameterError(f'{path}: {reason}') from error
 
 
-def made(document: Any) -> Study:
-    """Build a study from the content of a file; raise `ParameterError` if it is not valid."""
+def build_study(document: Any) -> Study:
+    """
+    Build a study from the content of a study file.
+
+    Parameters
+    ----------
+    document : mapping
+        Keys and values as in a study file, in SI units.
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown or a value is not valid.
+
+    """
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)

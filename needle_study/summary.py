@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 from needle_dynamics import FloatArray
 import numpy as np
-from pyarrow import parquet
 from scipy.stats import binom
 
 _NORMAL: Final = 1.96  #: half-width of a 95 % interval over the standard deviation
@@ -31,6 +30,9 @@ class Estimate(NamedTuple):
 
 def batches(table: Path, name: str) -> Iterator[FloatArray]:
     """Yield the values of one column of a table by sample number, in batches of shape (k,)."""
+    # Takes long to import, and a table in memory does not need it.
+    from pyarrow import parquet
+
     with parquet.ParquetFile(table) as file:
         for batch in file.iter_batches(columns=[name], use_threads=False):
             yield batch.column(0).to_numpy(zero_copy_only=False)
@@ -58,7 +60,20 @@ def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
 
 
 def probability(parts: Iterable[FloatArray]) -> Estimate:
-    """Estimate a probability from values 1 and 0, with the interval of Wilson; NaN is ignored."""
+    """
+    Estimate a probability, with the interval of Wilson.
+
+    Parameters
+    ----------
+    parts : iterable of ndarray
+        Values 1 and 0, in any number of arrays; NaN is ignored.
+
+    Returns
+    -------
+    Estimate
+        Fraction of ones, with its 95 % interval.
+
+    """
     n, yes = 0, 0.0
     for values in parts:
         finite = values[np.isfinite(values)]
@@ -72,7 +87,22 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
 
 
 def quantile(values: FloatArray, part: float) -> Estimate:
-    """Estimate a quantile with its distribution-free interval; NaN is ignored."""
+    """
+    Estimate a quantile with its distribution-free interval.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Values; NaN is ignored.
+    part : float
+        Fraction of the values below the quantile.
+
+    Returns
+    -------
+    Estimate
+        The quantile, with its 95 % interval.
+
+    """
     finite = np.sort(values[np.isfinite(values)])
     n = len(finite)
     if n == 0:

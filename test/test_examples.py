@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scripts of examples/ run and print the expected results."""
+"""The scripts of examples/ and docs/notebooks run and print the expected results."""
 
 from __future__ import annotations
 
+import ast
+from importlib import import_module
 from pathlib import Path
 import re
 import runpy
 
+from matplotlib import pyplot as plt
 import pytest
 
-EXAMPLES = Path(__file__).parents[1] / 'examples'
+ROOT = Path(__file__).parents[1]
+EXAMPLES, NOTEBOOKS = ROOT / 'examples', ROOT / 'docs/notebooks'
 
 #: Required output of each script, as a pattern.
 PRINTED = {
@@ -24,6 +28,16 @@ PRINTED = {
     'simulate': r'depth at the end: 28\.1\d mm',
 }
 
+
+#: Required output of each notebook, as a pattern; its tolerance is that of the shown digits.
+CELLS = {
+    '1_own_recordings': r'warnings: none\ncoulomb_friction: 0\.55\d+ N, 95 % interval 0\.5',
+    '2_own_needle': r"unknown parameter 'lenght'; did you mean 'length'\?",
+    '3_aiming': r'estimated bending length: 11\d % of the nominal value',
+    '4_own_law': r'own law: \+0\.280 mm from the target',
+    '5_studies': r'steered: hit 8\d % \(7\d to 9\d\), median miss 0\.2\d mm',
+    '6_own_robot': r'slide from 160\.00 mm to 120\.\d\d mm\n.*\n.*no position of the joint',
+}
 
 #: Optional dependency of a script, which is skipped without it.
 NEEDS = {'inference': 'sbi'}
@@ -53,3 +67,29 @@ def test_readme_lists_every_example() -> None:
     assert set(re.findall(r'\]\((\w+)\.py\)', page)) == {
         path.stem for path in EXAMPLES.glob('*.py')
     }
+
+
+@pytest.mark.parametrize('name', CELLS)
+def test_notebook_runs(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The notebook runs in its folder, draws, and prints the expected results."""
+    monkeypatch.chdir(NOTEBOOKS)
+    runpy.run_path(str(NOTEBOOKS / f'{name}.py'), run_name='__main__')
+    assert plt.get_fignums()
+    plt.close('all')
+    assert re.search(CELLS[name], capsys.readouterr().out)
+
+
+def test_notebooks_import_public_names() -> None:
+    """Every name of our packages is in the `__all__` of its root."""
+    assert {path.stem for path in NOTEBOOKS.glob('*.py')} == set(CELLS)
+    found = {
+        (node.module, alias.name)
+        for path in NOTEBOOKS.glob('*.py')
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('needle_')
+        for alias in node.names
+    }
+    assert len(found) > 20
+    assert [one for one in found if one[1] not in import_module(one[0]).__all__] == []

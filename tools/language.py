@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 import re
 import sys
@@ -87,7 +88,8 @@ def texts_of_code(path: str, source: str) -> Iterator[Text]:
 
 def texts(root: Path) -> Iterator[Text]:
     """Yield all text of a checkout that is written by hand."""
-    for path in sorted([*root.glob('needle_*/**/*.py'), *root.glob('reproduction/**/*.py')]):
+    patterns = ('needle_*/**/*.py', 'reproduction/**/*.py', 'docs/notebooks/*.py')
+    for path in sorted(chain.from_iterable(map(root.glob, patterns))):
         yield from texts_of_code(str(path.relative_to(root)), path.read_text('utf-8'))
     for path in sorted(root.glob('test/**/*.py')):
         for k, line in enumerate(path.read_text('utf-8').splitlines(), 1):

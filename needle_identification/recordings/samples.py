@@ -279,8 +279,8 @@ class Gathering:
         raise RecordingError('; '.join([what, *bag.losses]))
 
 
-def are_gaps(steps: NDArray[np.int64]) -> BoolArray:
-    """Return which steps between samples [ns], (n,), are gaps, without interpolation."""
+def are_gaps(steps: NDArray[np.int64] | NDArray[np.float64]) -> BoolArray:
+    """Return which steps between samples, (n,), are gaps, without interpolation."""
     return np.asarray(steps > _GAP * np.median(steps))
 
 

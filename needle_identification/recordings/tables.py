@@ -306,6 +306,8 @@ def sorted_rows(
 def _text(path: Path) -> Table:
     head = [line.rstrip('\r\n') for line in islice(_lines(path), _HEAD)]
     first = next((k for k, line in enumerate(head) if _numbers(line)), None)
+    if not head:
+        raise RecordingError(f'{path} is empty; valid: a table with named columns')
     if first is None:
         raise RecordingError(f'{path} has no line of numbers among its first {len(head)}')
     separator = _separator(head[first])

@@ -104,6 +104,11 @@ def run_steering(name: str, options: argparse.Namespace) -> int:
         raise ParameterError(f'--speed must be positive and finite, got {speed!r} m/s')
     interval = WAY / speed if options.interval is None else options.interval
     start = 0.0 if options.depth is None else options.depth
+    if start > needle.length:
+        raise ParameterError(
+            f'--depth must be <= length = {needle.length:g} m, got {start:g} m: lengths without a '
+            'unit are in m, such as 0.05 or 50mm'
+        )
     if not 0.0 < interval < inf or not start < to < inf or (to - start) / speed > _MOST * interval:
         raise ParameterError(
             f'--to must be beyond --depth, {start:g} m, with at most {_MOST} samples of '

@@ -157,7 +157,7 @@ def _task(options: argparse.Namespace) -> _Task:
     if not 0.0 < target[1] <= reach:
         raise ParameterError(
             f'--target: the depth must be in (0, {1e3 * reach:g}] mm with the needle '
-            f'{options.needle}, got {1e3 * target[1]:g} mm'
+            f'{options.needle}, got {1e3 * target[1]:g} mm; lengths without a unit are in m'
         )
     if not 0.0 < options.step <= target[1]:
         raise ParameterError(

@@ -60,6 +60,11 @@ def _run(options: argparse.Namespace) -> int:
     workers = options.workers if options.workers is not None else os.cpu_count() or 1
     if workers < 1:
         raise ParameterError(f'--workers must be >= 1, got {workers}')
+    if options.replay is not None and not 0 <= options.replay < study.samples:
+        raise ParameterError(
+            f'--replay must be from 0 to {study.samples - 1}, the samples of the study, got '
+            f'{options.replay}'
+        )
     results = engine.Results(folder, study)
     if options.replay is not None:
         bag = folder / f'sample_{options.replay}'

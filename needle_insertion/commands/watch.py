@@ -10,6 +10,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import print_each, Subcommand
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
@@ -29,6 +30,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         'bag', type=Path, nargs='?', metavar='BAG', help='recording to show (default: live)'
+    )
+    parser.add_argument(
+        '--time',
+        choices=TIMES,
+        default=TIMES[0],
+        help='stamps of a recording: header of each message, or receive time (default header)',
     )
     parser.add_argument(
         '--control',
@@ -62,7 +69,7 @@ async def _recorded(options: argparse.Namespace) -> None:
     from needle_insertion.watch.recorded import ShownRecording
     from needle_insertion.watch.server import Server
 
-    recording = ShownRecording(options.bag)
+    recording = ShownRecording(options.bag, options.time)
     print_each('warning', recording.losses)
     await _serve(Server(lambda: RecordedReader(recording), options.host, options.port))
 

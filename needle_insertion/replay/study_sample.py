@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from needle_identification import BagWriter
-from needle_ros.errors import JobError, ParameterError
+from needle_ros.errors import JobError
 from needle_ros.wire import Template
 from needle_study.engine import Results
 from needle_study.summary import picked
@@ -16,11 +16,6 @@ import numpy as np
 def replay_sample(results: Results, number: int, bag: Path) -> bool:
     """Record a sample to a bag; return whether it was compared with a table of the study."""
     study = results.study
-    if not 0 <= number < study.samples:
-        raise ParameterError(
-            f'--replay must be from 0 to {study.samples - 1}, the samples of the study, got '
-            f'{number}'
-        )
     row = study.rows(number, 1)
     if compared := results.table.exists():
         for name, values in row.items():

@@ -39,7 +39,8 @@ class Live:
             now = monotonic()
             self._poll(now)
             frame = self._view.frame(now)
-            self.history.append(row(frame))
+            frame['row'] = row(frame)
+            self.history.append(frame['row'])
             self.scene = self._view.scene
             self.number, self.frame = self.number + 1, _json(frame)
             async with self._changed:
@@ -99,13 +100,12 @@ class RecordedReader:
             },
         }
         self._scene: dict[str, Any] | None = None
-        self._jumped = True
         self._due = monotonic()
         self._asked = asyncio.Event()
         self._asked.set()
 
     async def next(self) -> str:
-        """Wait for the next frame; return it, with the history after a jump, as JSON."""
+        """Wait for the next frame; return it, at first with all signals, as JSON."""
         playback = self._playback
         if playback.playing:
             await asyncio.sleep(self._due - monotonic())
@@ -124,13 +124,10 @@ class RecordedReader:
             content['scene'], first = view.scene, self._scene is None
             self._scene = view.scene
             if first:
-                content['setting'] = self._setting
-        if self._jumped:
-            self._jumped = False
-            content['history'] = self._recording.history(at)
+                content |= {'setting': self._setting, 'signals': self._recording.signals()}
         return _json(content)
 
     def take(self, message: dict[str, Any]) -> None:
         """Process a playback message; see `PagePlayback.take`."""
-        self._jumped |= self._playback.take(message)
+        self._playback.take(message)
         self._asked.set()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -14,13 +14,16 @@ from needle_identification import Bag, RecordingError
 from needle_identification.bags.bag import Recorded
 from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
+from needle_identification.recordings import TIMES
+from needle_identification.recordings.samples import are_gaps
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
-from needle_insertion.watch.view import RATE, row, SPAN, View
+from needle_insertion.watch.view import RATE, row, SIGNALS, topic_of, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import node_of
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader, read_line, read_string, Reading
+import numpy as np
 
 #: Topics shown on the page; each also in a namespace.
 STREAMS: Final = (
@@ -32,7 +35,8 @@ _OTHERS: Final = (contract.NEEDLE_SHAPE, contract.TIP_EXPECTED, contract.DIAGNOS
 #: Largest number of stored messages per topic; longer recordings are decimated by two.
 _MOST: Final = 8192
 
-_HISTORY_RATE: Final = 10.0  #: rows of the history per second [Hz]
+#: Difference of the durations by stamps and by arrival that is reported [s].
+_SLACK: Final = 10.0
 
 #: Range of the playback speed, relative to real time.
 SLOWEST, FASTEST = 0.02, 50.0
@@ -59,6 +63,11 @@ class _Kept(Generic[_Item]):
             self.interval = max(2.0 * self.interval, 2.0 * span / _MOST)
             del self._times[1::2], self._items[1::2]
 
+    def items(self) -> Iterator[tuple[float, _Item, bool]]:
+        """Yield time and content of each message, and whether a gap precedes it."""
+        steps = np.diff(np.array(self._times), prepend=self._times[:1])
+        return zip(self._times, self._items, are_gaps(steps).tolist(), strict=True)
+
     def at(self, time: float) -> tuple[float, _Item] | None:
         """Return time and content of the newest message at a time."""
         k = bisect_right(self._times, time) - 1
@@ -66,11 +75,17 @@ class _Kept(Generic[_Item]):
 
 
 class ShownRecording:
-    """Content of a bag for the page by time [s]; `RecordingError` if it has nothing to show."""
+    """
+    Content of a bag for the page by time [s]; `RecordingError` if it has nothing to show.
 
-    def __init__(self, path: Path) -> None:
+    ``time`` selects the stamps, one of `TIMES`. A message without a stamp has the time of the
+    newest message before it.
+    """
+
+    def __init__(self, path: Path, time: str = TIMES[0]) -> None:
         self.name = path.name or str(path)
         period = 0.75 / RATE
+        self._header = time == TIMES[0]
         self._readings: dict[str, _Kept[Reading]] = {}
         self._lines = {name: _Kept[FloatArray](period) for name in ('needle', 'path')}
         self._expected = _Kept[Any]()
@@ -89,19 +104,26 @@ class ShownRecording:
                 f'{path} has nothing to show: none of {known}; it has '
                 f'{", ".join(topic.name for topic in topics)}'
             )
-        first: int | None = None
-        last = 0
+        self._first: int | None = None
+        self._newest = 0.0
+        begin = end = 0
         for message in bag.messages(chosen.__contains__):
-            first = message.received if first is None else first
-            last = max(last, message.received)
+            begin, end = begin or message.received, message.received
             try:
-                self._take(chosen[message.topic], message, first)
+                self._take(chosen[message.topic], message)
             except (MessageError, RecordingError):
                 self._invalid += 1
-        self.duration = (last - (first or 0)) / NANOSECONDS
+        self.duration = self._newest
         self.losses = tuple(bag.losses)
         if self._invalid:
             self.losses += (f'{self._invalid} messages do not match the type of their topic',)
+        elapsed = (end - begin) / NANOSECONDS
+        if self._header and self.duration > 2.0 * elapsed + _SLACK:
+            contradiction = (
+                f'the stamps of {path.name} span {self.duration:.4g} s, and its messages arrived '
+                f'within {elapsed:.4g} s: use --time receive if clocks differed'
+            )
+            self.losses += (contradiction,)
         shown: list[_Kept[Any]] = [*self._readings.values(), *self._lines.values()]
         if not any(kept.at(self.duration) for kept in shown):
             reasons = '; '.join((f'{path} has no readings to show', *self.losses))
@@ -109,12 +131,23 @@ class ShownRecording:
         longest = max(kept.interval for kept in shown)
         self._silent = max(1.0, 3.0 * longest)
 
-    def _take(self, name: str, message: Recorded, first: int) -> None:
+    def _time(self, stamp: int) -> float:
+        """Return the time of a stamp [ns] from the start [s], and store it if it is the newest."""
+        if self._first is None:
+            self._first = stamp
+        time = (stamp - self._first) / NANOSECONDS
+        self._newest = max(self._newest, time)
+        return time
+
+    def _take(self, name: str, message: Recorded) -> None:
         """Store the content of a message."""
-        time, data = (message.received - first) / NANOSECONDS, message.data
+        data = message.data
+        time = self._newest if self._header else self._time(message.received)
         if name in self._readers:
-            read = self._readers[name].read
-            self._readings.setdefault(name, _Kept(self._period)).add(time, lambda: read(data))
+            reading = self._readers[name].read(data)
+            if self._header and reading.stamp:
+                time = self._time(reading.stamp)
+            self._readings.setdefault(name, _Kept()).add(time, lambda: reading)
         elif name == contract.NEEDLE_SHAPE.name:
             which, points = read_line(data)
             if which in self._lines:
@@ -149,18 +182,23 @@ class ShownRecording:
                 view.status(state[1], state[0])
         return view
 
-    def history(self, time: float) -> list[list[float | None]]:
-        """Return the history before a time [s]: rows of `view.row` at 10 Hz."""
-        count = int(min(SPAN, time) * _HISTORY_RATE)
-        rows = []
-        for k in range(count, 0, -1):
-            at = time - k / _HISTORY_RATE
-            view = View()
-            for topic, readings in self._readings.items():
-                if found := readings.at(at):
-                    view.reading(topic, found[1], found[0])
-            rows.append(row(view.frame(at)))
-        return rows
+    def signals(self) -> dict[str, list[list[float | None]]]:
+        """Return times [s] and values of each recorded signal; None between them is a gap."""
+        found: dict[str, list[list[float | None]]] = {}
+        for topic, readings in self._readings.items():
+            of = [name for name in SIGNALS if topic_of(name, self._readings) == topic]
+            rows = list[list[float | None]]()
+            for time, reading, after_gap in readings.items():
+                if after_gap:
+                    rows.append([round(time, 6), *[None] * len(SIGNALS)])
+                view = View()
+                view.reading(topic, reading, time)
+                rows.append([round(time, 6), *row(view.frame(time))[1:]])
+            times, *columns = map(list, zip(*rows, strict=True))
+            for name, values in zip(SIGNALS, columns, strict=True):
+                if name in of and any(value is not None for value in values):
+                    found[name] = [times, values]
+        return {name: found[name] for name in SIGNALS if name in found}
 
 
 class PagePlayback:
@@ -184,8 +222,8 @@ class PagePlayback:
                 self._at, self.playing = self._duration, False
         return self._at
 
-    def take(self, message: dict[str, Any]) -> bool:
-        """Process a message ``at`` (a time [s]), ``play`` or ``speed``; return if time jumped."""
+    def take(self, message: dict[str, Any]) -> None:
+        """Process a message ``at`` (a time [s]), ``play`` or ``speed``."""
         now = self.at
         match message:
             case {'at': int() | float() as at, **rest} if not rest and at is not True:
@@ -204,7 +242,6 @@ class PagePlayback:
                     f'{SLOWEST:g} to {FASTEST:g}}}'
                 )
         self._since = self._steady()
-        return self._at != now
 
 
 def _chosen(topics: tuple[BagTopic, ...]) -> dict[BagTopic, str]:

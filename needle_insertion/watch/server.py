@@ -49,6 +49,7 @@ _PAGE: Final = Path(__file__).with_name('page')
 _FILES: Final = {
     '/': (_PAGE / 'watch.html', 'text/html'),
     '/watch.css': (_PAGE / 'watch.css', 'text/css'),
+    '/charts.js': (_PAGE / 'charts.js', 'text/javascript'),
     '/watch.js': (_PAGE / 'watch.js', 'text/javascript'),
     '/needle.js': (TEMPLATE_FOLDER / 'needle.js', 'text/javascript'),
 }

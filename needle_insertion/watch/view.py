@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from math import isfinite, sqrt
 from typing import Any, Final
 
@@ -19,6 +19,19 @@ RATE: Final = 30.0  #: frames per second
 SPAN: Final = 20.0  #: duration of the history [s]
 _SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
 _NOTHING: Final = (None, None, None)  #: position, velocity and effort of a missing joint
+
+#: Signals of the charts, each with its topic and SI unit.
+SIGNALS: Final = {
+    'depth': (contract.JOINT_STATES.name, 'm'),
+    'reference': (contract.REFERENCE.name, 'm'),
+    'velocity': (contract.JOINT_STATES.name, 'm/s'),
+    'error': (contract.TRACKING_ERROR.name, 'm'),
+    'force': (contract.BASE_WRENCH.name, 'N'),
+    'tip_x': (contract.TIP_DEFLECTION.name, 'm'),
+    'tip_z': (contract.TIP_DEFLECTION.name, 'm'),
+    'guide_x': (contract.JOINT_STATES.name, 'm'),
+    'guide_z': (contract.JOINT_STATES.name, 'm'),
+}
 
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
@@ -223,8 +236,22 @@ def _progress(status: NodeStatus | None) -> dict[str, int]:
     return {'step': status.step, 'steps': status.steps}
 
 
+def topic_of(signal: str, topics: Container[str]) -> str:
+    """Return the topic of a signal of `SIGNALS`; without a force sensor, efforts are the force."""
+    topic, _ = SIGNALS[signal]
+    sensed = signal != 'force' or topic in topics
+    return topic if sensed else contract.JOINT_STATES.name
+
+
 def row(frame: Mapping[str, Any]) -> list[float | None]:
-    """Return time, depth, reference, force, tip x and z of a frame for the strip charts."""
-    tip = frame['tip'] or [None] * 3
-    charted = [frame['time'], frame['depth'], frame['reference'], frame['force']]
-    return [*charted, tip[0], tip[2]]
+    """Return the time of a frame and its values of `SIGNALS`; None while a topic is silent."""
+    tip, guide = frame['tip'] or [None] * 3, frame['guide']
+    values = {**frame, 'tip_x': tip[0], 'tip_z': tip[2], 'guide_x': guide[0], 'guide_z': guide[1]}
+    topics = {contract.BASE_WRENCH.name} if frame['sensed'] else ()
+    return [
+        frame['time'],
+        *(
+            None if topic_of(signal, topics) in frame['silent'] else values[signal]
+            for signal in SIGNALS
+        ),
+    ]

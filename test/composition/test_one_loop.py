@@ -14,7 +14,7 @@ from needle_dynamics import FloatArray
 from needle_insertion.cli import main
 from needle_insertion.commands.steer import sample_needle
 from needle_study.gym.steering import SteeringEnv
-from needle_study.study import made
+from needle_study.study import build_study
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -39,7 +39,7 @@ def by_study(truth: GroundTruth, seed: int) -> FloatArray:
     for name in ('tilt', 'bevel', 'frame'):
         values |= {f'{name}_{axis}': getattr(truth, name)[k] for k, axis in enumerate('xz')}
     values |= {'target_x': TARGET[0], 'target_z': TARGET[2]}
-    study = made({
+    study = build_study({
         'scenario': 'steering', 'samples': 1, 'seed': seed,
         'settings': {'depth': TARGET[1], 'prior': asdict(PRIOR)},
         'population': {name: float(value) for name, value in values.items()},

@@ -10,7 +10,7 @@ from typing import Any
 from needle_controller import build_law, GuideSetpoint, SteeringLimits, SteeringModel
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError
-from needle_study.study import made
+from needle_study.study import build_study
 import numpy as np
 import pytest
 from support.steered_robot import CONTINUOUS, NEEDLE, Robot, SETTINGS, STEERING
@@ -72,7 +72,7 @@ def test_own_law_steers_in_the_command(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_own_law_steers_in_a_study() -> None:
     """Bit-identical to the same needles inserted alone."""
-    study = made({
+    study = build_study({
         'scenario': 'steering', 'samples': 8, 'seed': 3, 'settings': {'law': OWN},
         'population': {'target_x': {'uniform': [-0.002, 0.002]}, 'tilt_z': {'normal': [0, 0.01]}},
     })  # fmt: skip

@@ -31,7 +31,7 @@ from needle_ros.process_pool import processes
 from needle_study.distribution import distribution
 from needle_study.engine import chunk, compute, dask, order, Results
 from needle_study.steering import SteeringScenario
-from needle_study.study import DESIGNS, made, Study
+from needle_study.study import build_study, DESIGNS, Study
 from needle_study.summary import column, probability, quantile, share, worst
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def checksum(path: Path) -> str:
 @pytest.mark.parametrize('design', DESIGNS)
 def test_samples_are_independent_of_chunks(design: str) -> None:
     """Bit-identical, also with correlations."""
-    study = made({**SMALL, 'design': design})
+    study = build_study({**SMALL, 'design': design})
     whole = study.rows(0, 13)
     for first, count in ((0, 1), (1, 5), (6, 7)):
         part = study.rows(first, count)
@@ -89,7 +89,7 @@ def test_samples_are_independent_of_chunks(design: str) -> None:
 @pytest.mark.parametrize(('law', 'count'), [('multi_hypothesis', 5), ('open_loop', 300)])
 def test_samples_are_independent_of_their_batch(law: str, count: int) -> None:
     """Bit-identical; open-loop samples are computed in batches of some hundreds."""
-    study = made({**SMALL, 'settings': {**SMALL['settings'], 'law': law}})
+    study = build_study({**SMALL, 'settings': {**SMALL['settings'], 'law': law}})
     whole = study.rows(0, count)
     assert np.isfinite(whole['miss']).all()
     for number in (0, count // 2, count - 1):
@@ -112,14 +112,14 @@ def test_errors_of_the_sensor_are_variables() -> None:
 @pytest.mark.parametrize('radius', [2e-4, 1e-3, 3e-3])
 def test_hits_are_misses_up_to_the_hit_radius(radius: float) -> None:
     settings = {**SMALL['settings'], 'law': 'open_loop', 'hit_radius': radius}
-    rows = made({**SMALL, 'settings': settings}).rows(0, 40)
+    rows = build_study({**SMALL, 'settings': settings}).rows(0, 40)
     assert np.array_equal(rows['hit'], rows['miss'] <= radius)
     assert rows['hit'].any() or radius < 1e-3
 
 
 @pytest.mark.parametrize('design', DESIGNS)
 def test_samples_follow_distributions_and_correlations(design: str) -> None:
-    study = made({**SMALL, 'design': design, 'samples': 4096, 'population': {
+    study = build_study({**SMALL, 'design': design, 'samples': 4096, 'population': {
         'tilt_x': {'normal': [0.01, 0.002], 'within': [-0.1, 0.1]},
         'tilt_z': {'uniform': [-0.02, 0.04]},
         'skin': {'gamma': [2.0, 0.5], 'within': [0.0, 10.0]},
@@ -152,10 +152,10 @@ def test_samples_are_independent_of_the_order_of_variables(design: str) -> None:
     for names in (list(given), list(turned)):
         assert names != sorted(names)
     one, other = (
-        made({**SMALL, 'design': design, 'population': each}) for each in (given, turned)
+        build_study({**SMALL, 'design': design, 'population': each}) for each in (given, turned)
     )
     whole = one.draw(range(20))
-    for study in (other, made(json.loads(order(one))['study'])):
+    for study in (other, build_study(json.loads(order(one))['study'])):
         drawn = study.draw(range(20))
         for name, values in whole.items():
             assert np.array_equal(drawn[name], values)
@@ -166,7 +166,7 @@ def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
     """In every dimension, and the strata of the dimensions are uncorrelated."""
     names = ('target_x', 'target_z', 'tilt_x')
     population = {name: {'uniform': [0.0, 0.5]} for name in names}
-    drawn = made(
+    drawn = build_study(
         {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
          'population': population}
     ).draw(range(samples))  # fmt: skip
@@ -207,7 +207,7 @@ def test_quantiles_are_monotone_and_within_the_range(
 
 def test_table_is_independent_of_workers_and_chunks(tmp_path: Path) -> None:
     """The bytes are equal in one process and with one or two workers."""
-    study = made(SMALL)
+    study = build_study(SMALL)
     sums = set()
     for name, executor, workers in (
         ('here', here, 1), ('two', lambda: processes(2), 2), ('one', lambda: processes(1), 1),
@@ -227,7 +227,7 @@ def test_killed_workers_do_not_change_the_table(tmp_path: Path) -> None:
     document = {**SMALL, 'samples': 600}
     file, folder = tmp_path / 'study.yaml', tmp_path / 'killed'
     file.write_text(yaml.safe_dump(document))
-    whole = Results(tmp_path / 'whole', made(document))
+    whole = Results(tmp_path / 'whole', build_study(document))
     compute(whole, here, 1, lambda _: None)
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '2']
     # Up to 2 s between kills, about the time until a worker starts its first chunk.
@@ -244,7 +244,7 @@ def test_killed_studies_are_resumed(tmp_path: Path) -> None:
     file.write_text(yaml.safe_dump(document))
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '1']
     folder, rng = tmp_path / 'killed', np.random.default_rng(1)
-    whole = Results(tmp_path / 'whole', made(document))
+    whole = Results(tmp_path / 'whole', build_study(document))
     compute(whole, here, 1, lambda _: None)
     kills = kill_again_and_again([*words, '-o', str(folder)], folder, 10, rng)
     assert kills.killed >= 2
@@ -291,7 +291,7 @@ def test_pages_limit_the_number_of_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Quantiles and pictures use the first samples, probabilities and worst samples use all."""
-    results = Results(tmp_path / 'results', made(SMALL))
+    results = Results(tmp_path / 'results', build_study(SMALL))
     compute(results, here, 1, lambda _: None)
     asked: set[int | None] = set()
 
@@ -313,9 +313,9 @@ def test_pages_limit_the_number_of_samples(
 def test_open_loop_equals_a_guide_at_rest(tmp_path: Path) -> None:
     """The batch gives the same tips as single insertions."""
     free = {**SMALL, 'settings': {**SMALL['settings'], 'law': 'open_loop'}}
-    rows = made(free).rows(0, 20)
+    rows = build_study(free).rows(0, 20)
     still = {**SMALL, 'settings': {**SMALL['settings'], 'guide_limit': 0.0}}
-    same = made(still).rows(0, 20)
+    same = build_study(still).rows(0, 20)
     # A guide at position 0 and a missing guide differ by rounding.
     np.testing.assert_allclose(rows['tip_x'], same['tip_x'], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(rows['tip_z'], same['tip_z'], rtol=0.0, atol=1e-9)
@@ -359,7 +359,7 @@ def test_variance_fractions_of_a_sum_are_exact() -> None:
 
 def test_maps_include_samples_at_their_edges() -> None:
     """Two variables with two values each have all samples at an edge."""
-    study, rng = made(SMALL), np.random.default_rng(3)
+    study, rng = build_study(SMALL), np.random.default_rng(3)
     over = {name: rng.integers(0, 2, 4000).astype(float) for name in ('tilt_z', 'skin')}
     values = over['tilt_z'] + 2.0 * over['skin']
     [picture] = page._map('miss', study.scenario.metrics['miss'], values, over, study)
@@ -370,7 +370,7 @@ def test_maps_include_samples_at_their_edges() -> None:
 
 def test_quantiles_at_zero_and_one_are_finite(monkeypatch: pytest.MonkeyPatch) -> None:
     """A scrambled Sobol sequence may contain an exact 0, whose normal score is infinite."""
-    study = made(SMALL)
+    study = build_study(SMALL)
     for part in (0.0, 1.0):
         monkeypatch.setattr(Study, '_parts', lambda *_, at=part: np.full((3, 5), at))
         for name, values in study.draw(range(3)).items():
@@ -383,7 +383,7 @@ def test_a_study_is_locked_by_one_process(
 ) -> None:
     file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
     file.write_text(yaml.safe_dump(SMALL))
-    results = Results(folder, made(SMALL))
+    results = Results(folder, build_study(SMALL))
     words = ['study', str(file), '-o', str(folder), '--workers', '1']
     with results.alone():
         assert main(words) == 1
@@ -415,7 +415,7 @@ def test_damaged_parts_are_computed_again(
     tmp_path: Path, damage: Callable[[Path], object]
 ) -> None:
     """Also a part with other samples than in its name, and overlapping parts."""
-    study = made(SMALL)
+    study = build_study(SMALL)
     whole, broken = Results(tmp_path / 'whole', study), Results(tmp_path / 'broken', study)
     compute(whole, here, 1, lambda _: None)
     for first in (0, 16):
@@ -428,7 +428,7 @@ def test_damaged_parts_are_computed_again(
 
 def test_flipped_bits_of_a_table_are_detected(tmp_path: Path) -> None:
     """At any place of the file."""
-    study = made(SMALL)
+    study = build_study(SMALL)
     results = Results(tmp_path / 'whole', study)
     compute(results, here, 1, lambda _: None)
     whole = results.table.read_bytes()
@@ -542,7 +542,7 @@ def test_unusable_files_and_folders_are_rejected(
     (tmp_path / 'other' / 'results').mkdir(parents=True)
     assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
     assert 'exists and is not a study; name another folder' in capsys.readouterr().err
-    Results(tmp_path / 'third', made({**SMALL, 'seed': 4}))
+    Results(tmp_path / 'third', build_study({**SMALL, 'seed': 4}))
     assert main(['study', str(file), '-o', str(tmp_path / 'third')]) == 2
     assert 'belongs to another study; name another folder' in capsys.readouterr().err
     assert main(['study', str(file), '-o', str(tmp_path / 'x'), '--workers', '0']) == 2
@@ -551,7 +551,7 @@ def test_unusable_files_and_folders_are_rejected(
 
 def test_a_full_disk_is_a_one_line_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Completed parts remain, and the study is resumed when there is space."""
-    study = made(SMALL)
+    study = build_study(SMALL)
     results = Results(tmp_path / 'results', study)
     room = resource_limit(2000)
     with room, pytest.raises(JobError, match=r'cannot be written: .*File too large'):
@@ -580,7 +580,7 @@ def test_a_killed_scheduler_is_a_one_line_error(tmp_path: Path) -> None:
     """Completed parts remain."""
     from distributed import Client
 
-    study, file = made({**SMALL, 'samples': 400}), tmp_path / 'scheduler.json'
+    study, file = build_study({**SMALL, 'samples': 400}), tmp_path / 'scheduler.json'
     whole, results = Results(tmp_path / 'whole', study), Results(tmp_path / 'dask', study)
     compute(whole, here, 1, lambda _: None)
     words = ['--host', '127.0.0.1', '--no-dashboard', '--scheduler-file', str(file)]
@@ -615,7 +615,7 @@ def test_a_dask_cluster_survives_a_killed_worker(
     """The table is the same with two worker processes; a missing scheduler is reported."""
     from distributed import Client, LocalCluster
 
-    study = made({**SMALL, 'samples': 200})
+    study = build_study({**SMALL, 'samples': 200})
     whole = Results(tmp_path / 'whole', study)
     compute(whole, here, 1, lambda _: None)
     with (

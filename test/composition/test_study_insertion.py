@@ -24,7 +24,7 @@ from needle_insertion.cli import main
 from needle_ros.process_pool import processes
 from needle_study.engine import compute, Results
 from needle_study.insertion import CONTROLLERS, METRICS
-from needle_study.study import made
+from needle_study.study import build_study
 from needle_study.summary import column
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ SMALL: dict[str, Any] = {
 
 def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, float]:
     """Return the metrics of one sample with given values."""
-    scenario = made({**SMALL, 'settings': settings or {}, 'population': {}}).scenario
+    scenario = build_study({**SMALL, 'settings': settings or {}, 'population': {}}).scenario
     rows = {name: np.array([value]) for name, value in drawn.items()}
     found = scenario.run(rows, [np.random.default_rng(1)])
     assert list(found) == list(METRICS)
@@ -71,7 +71,7 @@ def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, flo
 def test_samples_are_independent_of_chunks(controller: str, design: str) -> None:
     """Bit-identical for all variables."""
     settings = {'wait': 0.2, 'controller': controller}
-    study = made({**SMALL, 'settings': settings, 'design': design})
+    study = build_study({**SMALL, 'settings': settings, 'design': design})
     whole = study.rows(0, 20)
     assert not np.isnan(whole['error']).any()
     for first, count in ((0, 1), (1, 2), (3, 17)):
@@ -82,7 +82,7 @@ def test_samples_are_independent_of_chunks(controller: str, design: str) -> None
 
 
 def test_table_is_independent_of_the_workers(tmp_path: Path) -> None:
-    study, tables = made({**SMALL, 'settings': {'wait': 0.2}}), []
+    study, tables = build_study({**SMALL, 'settings': {'wait': 0.2}}), []
     for workers in (1, 2):
         results = Results(tmp_path / str(workers), study)
         compute(results, partial(processes, workers), workers, lambda _: None)
@@ -203,7 +203,7 @@ def test_needles_outside_their_range_are_reported() -> None:
 )
 def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, Any]) -> None:
     """The guard of the node finds a violation at the last replayed sample, and not before."""
-    study = made({**SMALL, 'settings': settings, 'population': {}})
+    study = build_study({**SMALL, 'settings': settings, 'population': {}})
     drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
     rows = {name: np.array([value]) for name, value in drawn.items()}
     found = study.scenario.run(rows, [study.rng(0, 1)])

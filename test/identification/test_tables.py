@@ -165,7 +165,7 @@ def test_probable_millimeters_without_unit_are_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('text', 'columns', 'said'),
     [
-        ('', {}, 'no line of numbers'),
+        ('', {}, 'is empty; valid: a table'),
         ('hello\nworld\n', {}, 'no line of numbers'),
         (
             'a,b\n1,2\n2,3\n',

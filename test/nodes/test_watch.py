@@ -293,6 +293,54 @@ def test_browser_shows_live_data(ros_graph: RosGraph, tmp_path: Path, width: int
         asyncio.run(look(url))
 
 
+async def examine(tab: Tab) -> None:
+    """Use zoom, cursor, choice of signals, exports, lateral scale and link of a recording."""
+    assert await tab.run('charts.range()') == [0.0, 4.0]
+    # A link to a moment and a range.
+    await tab.run("location.hash = '#at=2.5&from=2&to=3'")
+    clock = "document.getElementById('clock').textContent"
+    await tab.wait(f"{clock}.startsWith('2.5 of')", 'the time of the link')
+    assert await tab.run('charts.range()') == [2.0, 3.0]
+    # Keys: a cursor one percent of the range later, in all charts, with values at this time.
+    strips = "document.getElementById('strips')"
+    key = strips + ".dispatchEvent(new KeyboardEvent('keydown', {{key: '{}'}}))"
+    await tab.run(key.format('ArrowRight'))
+    await tab.wait("document.getElementById('span').textContent.includes('2.510 s')", 'a cursor')
+    texts = "[...document.querySelectorAll('figcaption span')].map((one) => one.textContent)"
+    # The newest sample is of 2.50 s.
+    assert 'measured 50.00' in await tab.run(texts)
+    assert 'along 4.50' in await tab.run(texts)
+    # The link follows a zoom about the cursor.
+    await tab.run(key.format('+'))
+    low, high = await tab.run('charts.range()')
+    assert high - low == pytest.approx(1.0 / 1.5)
+    await tab.wait('location.hash.includes(`from=${charts.range()[0].toFixed(3)}`)', 'the link')
+    # Signals: a chart without signals is hidden.
+    visible = "[...document.querySelectorAll('figure')].filter((one) => !one.hidden).length"
+    assert await tab.run(visible) == 3
+    for name in ('force', 'guide_x'):
+        await tab.run(f"document.querySelector('[name={name}]').click()")
+    await tab.wait(f"{visible} === 3 && charts.csv().includes('guide_x')", 'the chosen signals')
+    # Exports: the rows of the shown range, and a picture.
+    lines = (await tab.run('charts.csv()')).splitlines()
+    assert lines[0] == 'time [s],depth [m],reference [m],tip_x [m],tip_z [m],guide_x [m]'
+    times = [float(line.partition(',')[0]) for line in lines[1:]]
+    assert times == sorted(times)
+    assert low <= times[0] < times[-1] <= high
+    await tab.run('URL.createObjectURL = (content) => { window.saved = content; return "#"; }')
+    await tab.run("document.getElementById('save-picture').click()")
+    assert await tab.wait('window.saved && saved.type', 'the picture') == 'image/png'
+    # Magnified lateral scale: the needle takes more of the page.
+    tall = "document.getElementById('needle').clientHeight"
+    before = await tab.run(tall)
+    lateral = "document.getElementById('lateral')"
+    await tab.run(f"{lateral}.value = '5', {lateral}.dispatchEvent(new Event('change'))")
+    await tab.wait(f'{tall} > {before}', 'the magnified needle')
+    await tab.run("document.getElementById('whole').click()")
+    assert await tab.run('charts.range()') == [0.0, 4.0]
+    assert tab.faults == []
+
+
 @needs_browser
 @pytest.mark.parametrize('width', [1400, 400])
 def test_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
@@ -313,6 +361,7 @@ def test_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
             await tab.picture(tmp_path / 'middle.png')
             assert 'silent' in (await tab.run(LOOK))['text']
             assert tab.faults == []
+            await examine(tab)
             calm = {'name': 'prefers-reduced-motion', 'value': 'reduce'}
             await tab.call('Emulation.setEmulatedMedia', features=[calm])
             count = await tab.run('needleWatch.drawn')

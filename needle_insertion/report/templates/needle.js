@@ -81,19 +81,20 @@ const needleDrawing = (() => {
     constructor(canvas) {
       this.canvas = canvas;
       /* Limits only grow, so that the picture does not jump. */
-      this.end = 60;
-      this.side = LEAST;
+      this.lateral = 1;  /* lateral scale over the scale of the depth */
+      this.reset();
     }
 
     /* Reset the limits for another recording or time. */
     reset() {
       this.end = 60;
-      this.side = LEAST;
+      /* Magnified, the needle needs no margin for a later motion. */
+      this.side = this.lateral > 1 ? 2 : LEAST;
     }
 
     /* Extend the limits for later drawings. */
     room(frame, scene) {
-      const depths = [0], sides = [LEAST - 3];
+      const depths = [0], sides = [0];
       const line = (points) => {
         if (!points || !points.length) return;
         points[1].forEach((y) => depths.push(mm(y)));
@@ -112,28 +113,29 @@ const needleDrawing = (() => {
       const layers = scene.tissue ? scene.tissue.layers : [];
       const last = layers.length > 1 ? mm(layers[layers.length - 1][0]) + 15 : 0;
       this.end = Math.max(this.end, 10 * Math.ceil(Math.max(deepest, last) / 10));
-      this.side = Math.max(this.side, Math.ceil(Math.max(...sides) + 3));
+      this.side = Math.max(this.side, Math.ceil(Math.max(...sides) + (this.lateral > 1 ? 1 : 3)));
     }
 
     draw(scene, frame) {
       this.room(frame, scene);
       const width = this.canvas.clientWidth || 600;
       const scale = (width - MARGIN.left - MARGIN.right) / (this.end + OUTSIDE);
-      const half = Math.max(this.side * scale, 30);
+      const aside = scale * this.lateral;
+      const half = Math.max(this.side * aside, 30);
       const height = MARGIN.top + 4 * half + MARGIN.between + MARGIN.bottom;
       const pen = prepared(this.canvas, width, Math.round(height));
       const across = (y) => MARGIN.left + (mm(y) + OUTSIDE) * scale;
       [[0, 'x'], [2, 'z']].forEach(([axis, name], k) => {
         const middle = MARGIN.top + half + k * (2 * half + MARGIN.between);
-        const plane = {axis, name, middle, half, scale, width, across,
-          up: (value) => middle - mm(value) * scale};
+        const plane = {axis, name, middle, half, scale, aside, width, across,
+          up: (value) => middle - mm(value) * aside};
         this.plane(pen, plane, scene, frame, k === 1);
       });
       return {width, height, scale};
     }
 
     plane(pen, plane, scene, frame, last) {
-      const {axis, name, middle, half, scale, width, across, up} = plane;
+      const {axis, name, middle, half, scale, aside, width, across} = plane;
       const left = MARGIN.left, right = width - MARGIN.right;
       const top = middle - half, bottom = middle + half;
       pen.save();
@@ -142,7 +144,7 @@ const needleDrawing = (() => {
       pen.clip();
       this.tissue(pen, plane, scene, right);
       /* A grid with steps wide enough for the labels. */
-      const step = scale * 5 > 14 ? 5 : 10;
+      const step = [1, 2, 5].find((one) => aside * one > 14) || 10;
       pen.strokeStyle = COLORS.grid;
       pen.lineWidth = 1;
       stroke(pen, COLORS.grid, 1, [], [[left, middle], [right, middle]]);
@@ -160,17 +162,17 @@ const needleDrawing = (() => {
       pen.strokeRect(left, top, right - left, 2 * half);
       pen.fillStyle = COLORS.ink;
       pen.textAlign = 'right';
-      const most = step * Math.floor((half / scale - 1) / step);
+      const most = step * Math.floor((half / aside - 0.5) / step);
       for (let value = -most; value <= most; value += step) {
-        pen.fillText(String(value), left - 6, middle - value * scale + 4);
-        stroke(pen, COLORS.faint, 1, [], [[left - 3, middle - value * scale],
-          [left, middle - value * scale]]);
+        pen.fillText(String(value), left - 6, middle - value * aside + 4);
+        stroke(pen, COLORS.faint, 1, [], [[left - 3, middle - value * aside],
+          [left, middle - value * aside]]);
       }
       pen.save();
       pen.translate(11, middle);
       pen.rotate(-Math.PI / 2);
       pen.textAlign = 'center';
-      pen.fillText(`${name} [mm]`, 0, 0);
+      pen.fillText(`${name} [mm]${this.lateral > 1 ? ` × ${this.lateral}` : ''}`, 0, 0);
       pen.restore();
       if (!last) return;
       pen.textAlign = 'center';

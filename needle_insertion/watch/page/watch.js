@@ -5,13 +5,13 @@
 const find = (id) => document.getElementById(id);
 const mm = (value) => (value === null ? null : 1e3 * value);
 
-/* Duration of the strip charts [s]; period of text and numbers [ms]. */
-const SPAN = 20, WORDS = 120;
+/* Period of text and numbers [ms]. */
+const WORDS = 120;
 const LEVELS = ['fine', 'warning', 'error', 'silent'];
 const SIGNS = {fine: '●', warning: '▲', error: '■', silent: '○', none: '○'};
-const COLUMNS = {time: 0, depth: 1, reference: 2, force: 3, x: 4, z: 5};
 
-const token = new URLSearchParams(location.hash.slice(1)).get('token') || '';
+const link = new URLSearchParams(location.hash.slice(1));
+const token = link.get('token') || '';
 const calm = matchMedia('(prefers-reduced-motion: reduce)');
 const drawing = new needleDrawing.Drawing(find('needle'));
 
@@ -20,13 +20,12 @@ const seen = {frames: 0, drawn: 0, connected: false};
 window.needleWatch = seen;
 
 let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
-let frame = null, playback = null, history = [], waiting = false, worded = 0, drawnAt = 0;
+let frame = null, playback = null, waiting = false, worded = 0, drawnAt = 0;
 let dragging = false, unseen = 0, saying = 0;
 
 /* Text. */
 
-const fixed = (value, digits) =>
-  (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
+const {fixed} = needleCharts;
 
 function put(node, text) {
   if (node.textContent !== text) node.textContent = text;
@@ -119,76 +118,44 @@ function show(one) {
   level(one.box, state);
 }
 
-/* Strip charts. */
+/* Charts. */
 
-const {prepared, stroke, label, COLORS} = needleDrawing;
+const charts = new needleCharts.Charts(find('strips'), find('signals'), () => frame && later(), seek);
 
-const CHARTS = [
-  {canvas: find('chart-depth'), factor: 1e3, least: 2, lines: [['depth', COLORS.needle, []], ['reference', COLORS.target, [6, 4]]]},
-  {canvas: find('chart-force'), factor: 1, least: 1, lines: [['force', COLORS.needle, []]],
-    limit: () => scene.limits.load},
-  {canvas: find('chart-tip'), factor: 1e3, least: 1, lines: [['x', COLORS.needle, []], ['z', COLORS.target, [6, 4]]]},
-];
-
-function steps(low, high) {
-  const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
-  const values = [];
-  for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
-  return {values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9))};
+/* The address of the page is a link to the moment and the range that it shows. */
+function remember() {
+  const [from, to] = charts.range().map((time) => fixed(time, 3));
+  link.set('at', fixed(frame.time, 3));
+  link.set('from', from);
+  link.set('to', to);
+  if (location.hash !== `#${link}`) window.history.replaceState(null, '', `#${link}`);
 }
 
-function chart({canvas, factor, least, lines, limit}) {
-  const width = canvas.clientWidth || 300, height = 200;
-  const pen = prepared(canvas, width, height);
-  const left = 40, right = width - 6, top = 6, bottom = height - 20;
-  let low = Infinity, high = -Infinity;
-  for (const row of history) {
-    for (const [name] of lines) {
-      const value = row[COLUMNS[name]];
-      if (value === null) continue;
-      low = Math.min(low, value * factor);
-      high = Math.max(high, value * factor);
-    }
-  }
-  if (low > high) [low, high] = [-least, least];
-  const pad = Math.max(0.08 * (high - low), (least - (high - low)) / 2);
-  [low, high] = [low - pad, high + pad];
-  const x = (time) => right + (time - frame.time) * (right - left) / SPAN;
-  const y = (value) => bottom - (value - low) * (bottom - top) / (high - low);
-  pen.fillStyle = COLORS.ink;
-  const {values, digits} = steps(low, high);
-  for (const value of values) {
-    stroke(pen, COLORS.grid, 1, [], [[left, y(value)], [right, y(value)]]);
-    pen.textAlign = 'right';
-    pen.fillText(fixed(value, digits), left - 5, y(value) + 4);
-  }
-  pen.textAlign = 'center';
-  for (let back = 0; back <= SPAN; back += 5) {
-    pen.textAlign = back === 0 ? 'right' : 'center';
-    pen.fillText(back ? `−${back}` : 'now', x(frame.time - back), bottom + 15);
-  }
-  const most = limit && limit();
-  for (const value of most ? [-most, most] : []) {
-    if (value > low && value < high) {
-      stroke(pen, COLORS.target, 1.5, [2, 4], [[left, y(value)], [right, y(value)]]);
-      label(pen, 'limit', left + 4, y(value) - 4, COLORS.target);
-    }
-  }
-  for (const [name, color, dash] of lines) {
-    let points = [];
-    for (const row of history) {
-      const value = row[COLUMNS[name]], at = x(row[0]);
-      if (value !== null && at >= left) {
-        points.push([at, y(value * factor)]);
-      } else {
-        stroke(pen, color, 1.8, dash, points);
-        points = [];
-      }
-    }
-    stroke(pen, color, 1.8, dash, points);
-  }
+/* Show the moment and the range of the address. */
+function follow() {
+  const [at, from, to] = ['at', 'from', 'to'].map((name) => parseFloat(link.get(name)));
+  if (to > from) charts.show(from, to);
+  if (at >= 0) seek(at);
 }
+
+function seek(time) {
+  send({play: false});
+  send({at: time});
+}
+
+/* Name of exported files: recording and time. */
+const named = () => `${setting.recording ? setting.recording.name : 'live'}_${fixed(frame.time, 2)}s`;
+
+find('zoom-in').addEventListener('click', () => charts.zoom(needleCharts.ZOOM, frame.time));
+find('zoom-out').addEventListener('click', () => charts.zoom(1 / needleCharts.ZOOM, frame.time));
+find('whole').addEventListener('click', () => { charts.whole(); later(); });
+find('save-picture').addEventListener('click', () => charts.savePicture(find('needle'), named()));
+find('save-table').addEventListener('click', () => charts.saveTable(named()));
+find('lateral').addEventListener('change', (event) => {
+  drawing.lateral = Number(event.target.value);
+  drawing.reset();
+  later();
+});
 
 /* Status of the nodes. */
 
@@ -252,6 +219,12 @@ function tellShape() {
   put(find('shape'), words);
 }
 
+function tellCursor() {
+  const of = setting.recording ? 'The recording' : 'The last 20 s';
+  const time = charts.cursor === null ? null : charts.cursor - (setting.recording ? 0 : frame.time);
+  put(find('span'), time === null ? of : `${of}: values at ${fixed(time, 3)} s`);
+}
+
 /* Text and numbers, at a readable rate. */
 function say() {
   clearTimeout(saying);
@@ -261,6 +234,7 @@ function say() {
   tellNodes();
   tellAim();
   tellShape();
+  tellCursor();
   if (playback) tellPlayback();
 }
 
@@ -271,7 +245,7 @@ function draw(now) {
   if (!frame) return;
   drawnAt = now;
   drawing.draw(scene, frame);
-  CHARTS.forEach(chart);
+  charts.draw(frame.time, scene.limits);
   if (now - worded > WORDS) say();
   /* Text of the last frame, too. */
   else if (!saying) saying = setTimeout(say, WORDS);
@@ -289,23 +263,21 @@ function later() {
   else requestAnimationFrame(draw);
 }
 
-const rowOf = (f) => [f.time, f.depth, f.reference, f.force, f.tip ? f.tip[0] : null, f.tip ? f.tip[2] : null];
-
 function take(message) {
   if (message.answer) return answered(message.answer);
   if (message.setting) settle(message.setting);
   if (message.scene) scene = message.scene;
   if (message.playback) playback = message.playback;
-  if (message.history) {
-    history = message.history;
-    worded = 0;
+  if (message.history) charts.live(message.history);
+  if (message.signals) {
+    charts.record(message.signals, setting.recording.duration);
+    follow();
   }
   if (!message.frame) return undefined;
   frame = message.frame;
   seen.frames += 1;
   unseen += 1;
-  if (!history.length || frame.time > history[history.length - 1][0]) history.push(rowOf(frame));
-  while (history.length && history[0][0] < frame.time - SPAN - 1) history.shift();
+  if (frame.row) charts.push(frame.row);
   later();
   return undefined;
 }
@@ -319,7 +291,7 @@ function settle(given) {
   put(find('source'), setting.recording ? `recording ${setting.recording.name}` : 'live');
   if (!setting.recording) return;
   find('at').max = setting.recording.duration;
-  find('at').step = setting.recording.duration / 500;
+  find('at').step = 'any';
   find('losses').hidden = !setting.recording.losses.length;
   put(find('losses'), setting.recording.losses.join('; '));
 }
@@ -330,6 +302,7 @@ function tellPlayback() {
   put(find('play'), playback.playing ? 'Pause' : 'Play');
   put(find('clock'), `${fixed(frame.time, 1)} of ${fixed(setting.recording.duration, 1)} s`);
   if (!dragging) find('at').value = frame.time;
+  if (!playback.playing) remember();
 }
 
 find('play').addEventListener('click', () => playback && send({play: !playback.playing}));
@@ -360,6 +333,14 @@ find('target').addEventListener('submit', (event) => {
   event.preventDefault();
   const {x, y, z} = event.target.elements;
   send({ask: 'target', at: [x, y, z].map((input) => Number(input.value) / 1e3), token});
+});
+
+window.addEventListener('hashchange', () => {
+  const given = new URLSearchParams(location.hash.slice(1));
+  for (const name of ['at', 'from', 'to']) {
+    if (given.has(name)) link.set(name, given.get(name));
+  }
+  if (playback) follow();
 });
 
 /* Connection. */

@@ -1,0 +1,380 @@
+'use strict';
+
+/*
+ * Charts of `needle watch`: signals over time with one cursor, zoom, and export of picture and
+ * table. Times are in s, values in SI units. A value of null, or a pause, is a gap.
+ */
+const needleCharts = (() => {
+  const {prepared, stroke, label, COLORS} = needleDrawing;
+  const SOLID = [COLORS.needle, []], DASHED = [COLORS.target, [6, 4]];
+  const HEIGHT = 150, LEFT = 44, RIGHT = 8, TOP = 6, BOTTOM = 20;
+  /* Duration of a live chart, and shortest duration [s]; zoom factor; a drag [pixels]. */
+  const SPAN = 20, SHORTEST = 0.02, ZOOM = 1.5, DRAG = 4;
+
+  /* Charts: name, unit, factor from SI, smallest range, and signals with words and line. */
+  const CHARTS = [
+    {name: 'Depth', unit: 'mm', si: 'm', factor: 1e3, least: 2, digits: 2,
+      signals: {depth: ['measured', ...SOLID], reference: ['reference', ...DASHED]}},
+    {name: 'Force', unit: 'N', si: 'N', factor: 1, least: 1, digits: 2, limit: 'load', signals: {force: ['along', ...SOLID]}},
+    {name: 'Tip', unit: 'mm', si: 'm', factor: 1e3, least: 1, digits: 2,
+      signals: {tip_x: ['x', ...SOLID], tip_z: ['z', ...DASHED]}},
+    {name: 'Guide', unit: 'mm', si: 'm', factor: 1e3, least: 1, digits: 2, off: true,
+      signals: {guide_x: ['x', ...SOLID], guide_z: ['z', ...DASHED]}},
+    {name: 'Velocity', unit: 'mm/s', si: 'm/s', factor: 1e3, least: 1, digits: 1, off: true, signals: {velocity: ['measured', ...SOLID]}},
+    {name: 'Tracking error', unit: 'mm', si: 'm', factor: 1e3, least: 0.1, digits: 3, off: true, signals: {error: ['along', ...SOLID]}},
+  ];
+  /* Columns of a row of a live frame, after the time. */
+  const ROW = ['depth', 'reference', 'velocity', 'error', 'force', 'tip_x', 'tip_z', 'guide_x', 'guide_z'];
+
+  const fixed = (value, digits) =>
+    (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
+
+  /* Number of times up to a time, in ascending times. */
+  function upTo(times, time) {
+    let low = 0, high = times.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (times[middle] <= time) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+
+  function steps(low, high, number) {
+    const rough = (high - low) / number, power = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
+    const values = [];
+    for (let k = Math.ceil(low / step - 1e-9); k * step <= high; k += 1) values.push(k * step);
+    return {values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9))};
+  }
+
+  function save(content, name) {
+    const link = document.createElement('a');
+    link.href = URL.createObjectURL(content);
+    link.download = name;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  }
+
+  class Charts {
+    /* `changed` is called to draw again, `seek` with a time of a recording. */
+    constructor(box, choices, changed, seek) {
+      this.box = box;
+      this.changed = changed;
+      this.seek = seek;
+      this.data = {};
+      this.now = 0;
+      this.duration = null;
+      this.span = SPAN;
+      this.from = 0;
+      this.cursor = null;
+      for (const chart of CHARTS) this.add(chart, choices);
+      box.addEventListener('keydown', (event) => this.key(event));
+    }
+
+    add(chart, choices) {
+      const figure = document.createElement('figure'), caption = document.createElement('figcaption');
+      chart.canvas = document.createElement('canvas');
+      chart.canvas.setAttribute('role', 'img');
+      chart.canvas.setAttribute('aria-label', `${chart.name} over time`);
+      caption.append(`${chart.name} [${chart.unit}]`);
+      chart.figure = figure;
+      chart.values = {};
+      chart.chosen = {};
+      for (const [name, [words, , dash]] of Object.entries(chart.signals)) {
+        const value = document.createElement('span');
+        value.className = dash.length ? 'dashed' : 'solid';
+        caption.append(value);
+        chart.values[name] = value;
+        const choice = document.createElement('label'), tick = document.createElement('input');
+        tick.type = 'checkbox';
+        tick.name = name;
+        tick.checked = !chart.off;
+        tick.addEventListener('change', () => this.changed());
+        choice.append(tick, ` ${chart.name.toLowerCase()} ${words}`);
+        choices.append(choice);
+        chart.chosen[name] = tick;
+      }
+      figure.append(caption, chart.canvas);
+      this.box.append(figure);
+      this.listen(chart.canvas);
+    }
+
+    /* Data. */
+
+    /* Show a recording of a duration with all its signals, {name: [times, values]}. */
+    record(signals, duration) {
+      this.data = signals;
+      this.duration = duration;
+      this.whole();
+    }
+
+    /* Show live rows, which replace all earlier ones. */
+    live(rows) {
+      this.data = Object.fromEntries(ROW.map((name) => [name, [[], []]]));
+      this.duration = null;
+      rows.forEach((row) => this.push(row));
+    }
+
+    push([time, ...values]) {
+      ROW.forEach((name, k) => {
+        const [times, column] = this.data[name];
+        if (times.length && time <= times[times.length - 1]) return;
+        times.push(time);
+        column.push(values[k]);
+        const old = upTo(times, time - SPAN - 1);
+        times.splice(0, old);
+        column.splice(0, old);
+      });
+    }
+
+    /* Value of a signal at a time: its newest one, null in a gap. */
+    at(name, time) {
+      const [times, values] = this.data[name] || [[], []];
+      const k = upTo(times, time) - 1;
+      return k < 0 ? null : values[k];
+    }
+
+    /* Time range. */
+
+    range() {
+      return this.duration === null ? [this.now - this.span, this.now] : [this.from, this.from + this.span];
+    }
+
+    whole() {
+      this.from = 0;
+      this.span = this.duration === null ? SPAN : Math.max(this.duration, SHORTEST);
+    }
+
+    /* Show a range of a recording [s]. */
+    show(from, to) {
+      const all = Math.max(this.duration, SHORTEST);
+      this.span = Math.min(all, Math.max(SHORTEST, to - from));
+      this.from = Math.min(Math.max(0, from), all - this.span);
+    }
+
+    /* Change the duration by a factor, about a time. */
+    zoom(factor, about) {
+      if (this.duration === null) {
+        this.span = Math.min(SPAN, Math.max(1, this.span / factor));
+      } else {
+        const [from, to] = this.range();
+        const time = about === null || about < from || about > to ? (from + to) / 2 : about;
+        this.show(time - (time - from) / factor, time + (to - time) / factor);
+      }
+      this.changed();
+    }
+
+    /* Pointer and keys. */
+
+    time(canvas, event) {
+      const box = canvas.getBoundingClientRect(), [from, to] = this.range();
+      const share = (event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT);
+      return from + Math.min(1, Math.max(0, share)) * (to - from);
+    }
+
+    listen(canvas) {
+      let held = null;
+      canvas.addEventListener('pointerdown', (event) => {
+        held = {x: event.clientX, from: this.from, moved: false};
+        canvas.setPointerCapture(event.pointerId);
+      });
+      canvas.addEventListener('pointermove', (event) => {
+        if (held && this.duration !== null) {
+          held.moved = held.moved || Math.abs(event.clientX - held.x) > DRAG;
+          const pixel = this.span / (canvas.clientWidth - LEFT - RIGHT);
+          const from = held.from - (event.clientX - held.x) * pixel;
+          if (held.moved) this.show(from, from + this.span);
+        }
+        this.cursor = this.time(canvas, event);
+        this.changed();
+      });
+      canvas.addEventListener('pointerup', (event) => {
+        if (held && !held.moved && this.duration !== null) this.seek(this.time(canvas, event));
+        held = null;
+      });
+      canvas.addEventListener('pointerleave', () => {
+        this.cursor = null;
+        this.changed();
+      });
+      canvas.addEventListener('wheel', (event) => {
+        event.preventDefault();
+        this.zoom(event.deltaY < 0 ? ZOOM : 1 / ZOOM, this.time(canvas, event));
+      }, {passive: false});
+    }
+
+    key(event) {
+      const [from, to] = this.range(), step = {ArrowLeft: -0.01, ArrowRight: 0.01}[event.key];
+      if (step) {
+        const start = this.cursor === null ? this.now : this.cursor;
+        this.cursor = Math.min(to, Math.max(from, start + step * (to - from)));
+        this.changed();
+      } else if (event.key === 'Enter' && this.cursor !== null && this.duration !== null) {
+        this.seek(this.cursor);
+      } else if (event.key === '+' || event.key === '-') {
+        this.zoom(event.key === '+' ? ZOOM : 1 / ZOOM, this.cursor);
+      } else {
+        return;
+      }
+      event.preventDefault();
+    }
+
+    /* Drawing. */
+
+    draw(now, limits) {
+      this.now = now;
+      for (const chart of CHARTS) {
+        const names = this.chosen(chart);
+        chart.figure.hidden = !names.length;
+        for (const [name, box] of Object.entries(chart.values)) {
+          box.hidden = !names.includes(name);
+          const value = this.at(name, this.cursor === null ? now : this.cursor);
+          const text = `${chart.signals[name][0]} ${fixed(value === null ? null : value * chart.factor, chart.digits)}`;
+          if (box.textContent !== text) box.textContent = text;
+        }
+        if (names.length) this.one(chart, names, limits);
+      }
+    }
+
+    chosen(chart) {
+      return Object.keys(chart.signals).filter((name) => chart.chosen[name].checked && this.data[name]);
+    }
+
+    /* Points of a signal in a time range, without those of the same pixel between extremes. */
+    lines(name, from, to, x, y) {
+      const [times, values] = this.data[name], found = [];
+      let points = [], column = NaN, low = null, high = null;
+      const end = () => {
+        if (low !== null) points.push(...(low[0] <= high[0] ? [low, high] : [high, low]));
+        low = high = null;
+      };
+      const last = Math.min(times.length, upTo(times, to) + 1);
+      for (let k = Math.max(0, upTo(times, from) - 1); k < last; k += 1) {
+        const value = values[k];
+        if (value === null) {
+          end();
+          found.push(points);
+          [points, column] = [[], NaN];
+          continue;
+        }
+        const at = [x(times[k]), y(value)], pixel = Math.floor(at[0]);
+        if (pixel !== column) end();
+        column = pixel;
+        if (low === null || at[1] < low[1]) low = at;
+        if (high === null || at[1] > high[1]) high = at;
+      }
+      end();
+      return [...found, points].filter((one) => one.length);
+    }
+
+    extent(names, from, to) {
+      let low = Infinity, high = -Infinity;
+      for (const name of names) {
+        const [times, values] = this.data[name];
+        for (let k = Math.max(0, upTo(times, from) - 1), last = upTo(times, to); k < last; k += 1) {
+          if (values[k] === null) continue;
+          low = Math.min(low, values[k]);
+          high = Math.max(high, values[k]);
+        }
+      }
+      return low > high ? null : [low, high];
+    }
+
+    one({canvas, factor, least, limit, signals}, names, limits) {
+      const width = canvas.clientWidth || 300, pen = prepared(canvas, width, HEIGHT);
+      const right = width - RIGHT, bottom = HEIGHT - BOTTOM, [from, to] = this.range();
+      let [low, high] = (this.extent(names, from, to) || [-least / factor, least / factor]).map((one) => one * factor);
+      const pad = Math.max(0.08 * (high - low), (least - (high - low)) / 2);
+      [low, high] = [low - pad, high + pad];
+      const x = (time) => LEFT + (time - from) * (right - LEFT) / (to - from);
+      const y = (value) => bottom - (value - low) * (bottom - TOP) / (high - low);
+      pen.fillStyle = COLORS.ink;
+      const across = steps(low, high, 4);
+      pen.textAlign = 'right';
+      for (const value of across.values) {
+        stroke(pen, COLORS.grid, 1, [], [[LEFT, y(value)], [right, y(value)]]);
+        pen.fillText(fixed(value, across.digits), LEFT - 5, y(value) + 4);
+      }
+      /* Live times are relative to the present time. */
+      const zero = this.duration === null ? to : 0;
+      const along = steps(from - zero, to - zero, Math.max(2, Math.min(10, width / 90)));
+      for (const value of along.values) {
+        const at = x(zero + value);
+        stroke(pen, COLORS.grid, 1, [], [[at, TOP], [at, bottom]]);
+        pen.textAlign = at > right - 20 ? 'right' : 'center';
+        pen.fillText(zero && value === 0 ? 'now' : `${fixed(value, along.digits)} s`, at, bottom + 15);
+      }
+      const most = limit && limits[limit];
+      for (const value of most ? [-most, most] : []) {
+        if (value > low && value < high) {
+          stroke(pen, COLORS.target, 1.5, [2, 4], [[LEFT, y(value)], [right, y(value)]]);
+          label(pen, 'limit', LEFT + 4, y(value) - 4, COLORS.target);
+        }
+      }
+      pen.save();
+      pen.beginPath();
+      pen.rect(LEFT, 0, right - LEFT, HEIGHT);
+      pen.clip();
+      for (const name of names) {
+        const [, color, dash] = signals[name];
+        for (const points of this.lines(name, from, to, x, (value) => y(value * factor))) {
+          /* A sample between two gaps is a point. */
+          if (points.length === 1) points.push([points[0][0] + 1, points[0][1]]);
+          stroke(pen, color, 1.8, dash, points);
+        }
+      }
+      if (this.duration !== null) stroke(pen, COLORS.ink, 1.5, [], [[x(this.now), TOP], [x(this.now), bottom]]);
+      if (this.cursor !== null) {
+        stroke(pen, COLORS.tip, 1.5, [3, 3], [[x(this.cursor), TOP], [x(this.cursor), bottom]]);
+      }
+      pen.restore();
+    }
+
+    /* Export. */
+
+    /* Table of the shown signals in the shown range; an empty cell has no sample at its time. */
+    csv() {
+      const [from, to] = this.range(), rows = new Map(), heads = ['time [s]'];
+      const shown = CHARTS.flatMap((chart) => this.chosen(chart).map((name) => [name, chart.si]));
+      shown.forEach(([name, unit], k) => {
+        heads.push(`${name} [${unit}]`);
+        const [times, values] = this.data[name];
+        times.forEach((time, i) => {
+          if (values[i] === null || time < from || time > to) return;
+          if (!rows.has(time)) rows.set(time, Array(shown.length).fill(''));
+          rows.get(time)[k] = values[i];
+        });
+      });
+      const lines = [...rows].sort((one, other) => one[0] - other[0]).map(([time, row]) => [time, ...row].join(','));
+      return `${[heads.join(','), ...lines].join('\n')}\n`;
+    }
+
+    saveTable(name) {
+      save(new Blob([this.csv()], {type: 'text/csv'}), `${name}.csv`);
+    }
+
+    /* Picture of a canvas and of all shown charts. */
+    savePicture(first, name) {
+      const shown = CHARTS.filter((chart) => !chart.figure.hidden), LINE = 22;
+      const fine = window.devicePixelRatio || 1, sheet = document.createElement('canvas');
+      const tall = (one) => one.height / fine;
+      const height = tall(first) + shown.reduce((sum, {canvas}) => sum + LINE + tall(canvas), 0);
+      sheet.width = Math.max(first.width, ...shown.map(({canvas}) => canvas.width));
+      const pen = prepared(sheet, sheet.width / fine, height);
+      pen.fillStyle = COLORS.paper;
+      pen.fillRect(0, 0, sheet.width, height);
+      const put = (canvas, y) => pen.drawImage(canvas, 0, y, canvas.width / fine, tall(canvas));
+      put(first, 0);
+      let y = tall(first);
+      for (const {canvas, figure} of shown) {
+        const words = [...figure.querySelector('figcaption').childNodes].filter((node) => !node.hidden);
+        label(pen, words.map((node) => node.textContent).join('   '), 8, y + 15, COLORS.ink);
+        put(canvas, y + LINE);
+        y += LINE + tall(canvas);
+      }
+      sheet.toBlob((content) => save(content, `${name}.png`));
+    }
+  }
+
+  return {Charts, fixed, ZOOM};
+})();
