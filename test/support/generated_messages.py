@@ -197,6 +197,9 @@ def importable(package: str, folder: Path) -> Iterator[str]:
     sys.path.insert(0, str(folder))
     yield str(folder)
     sys.path.remove(str(folder))
+    # Nodes of other tests must not find it.
+    for name in [name for name in sys.modules if name.partition('.')[0] == package]:
+        del sys.modules[name]
 
 
 if __name__ == '__main__':
