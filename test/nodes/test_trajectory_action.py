@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
+from itertools import pairwise
 import os
 import signal
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ from typing import Any
 from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND
 from needle_ros.contract import REQUEST_AGE
 from needle_ros.requests import Verdict
@@ -176,13 +178,19 @@ def test_goal_succeeds_within_tolerance(ros_graph: RosGraph, actions: str, mode:
         assert error == pytest.approx(desired - actual, abs=1e-15)
         if stamp in by_stamp:
             assert actual == pytest.approx(by_stamp[stamp].position[0], abs=1e-12)
-        # The reference that is followed: of the controller, or linear from the start.
+        # The reference that the controller follows.
         if stamp in aims:
             assert desired == aims[stamp].position[0]
-        elif mode == 'robot':
-            since = (stamp - (stamps[-1] - SECOND)) / SECOND
-            # The last feedback is after the end.
-            assert desired <= DEPTH + 3e-3 * max(0.0, since) + 1e-3
+    if mode == 'robot':
+        # The reference of the base is linear in time.
+        passed = [
+            (stamp / SECOND, one.desired.positions[0])
+            for stamp, one in zip(stamps, sent.feedback, strict=True)
+            if one.desired.positions[0] < end
+        ]
+        slopes = [(b - a) / (t - s) for (s, a), (t, b) in pairwise(passed)]
+        # Rounding of a stamp as a float: 1e-7 s of 50 ms.
+        assert slopes == pytest.approx([3e-3] * len(slopes), rel=1e-4)
     assert by_stamp.keys() & {*stamps}
 
 
@@ -473,8 +481,6 @@ def test_late_goal_joins_at_its_points_ahead(ros_graph: RosGraph, actions: str, 
 @pytest.mark.requirement('S-242')
 def test_indenter_takes_goals_of_efforts(ros_graph: RosGraph, actions: str) -> None:
     user = ros_graph.node('user')
-    from needle_dynamics.plant_node import PlantNode
-
     ros_graph.add(PlantNode, parameters={'mode': 'indenter', 'rate': 200.0})
     client = Client(ros_graph, user, 'plant')
     sent = client.send(trajectory(0, [(0.5, [1.0, 0.5])], ('x', 'z'), 'effort'))
