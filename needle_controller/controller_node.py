@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
+from math import nan
 import sys
 from time import sleep
 from typing import Any
@@ -40,7 +41,8 @@ from needle_ros.status import ControllerStatus, Diagnosis
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import nanoseconds
-from needle_ros.trajectories import JointPath
+from needle_ros.trajectories import FollowedJoint, JointPath, JointReference
+from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.publisher import Publisher
@@ -151,6 +153,7 @@ class ControllerNode(ModelNode):
         #: Adapter of a robot with its own topics.
         self._driver: Driver | None = None
         self._command: Publisher | None = None
+        self._action: TrajectoryAction | None = None
         self._checks, self._missing = 0, ''
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._write_aim = contract.REFERENCE.template().serialize
@@ -196,6 +199,14 @@ class ControllerNode(ModelNode):
         self._tracking_error = self.publisher(contract.TRACKING_ERROR)
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
+        self._action = TrajectoryAction(
+            self,
+            self._supervisor.requests,
+            (contract.INSERTION,),
+            self._follow,
+            lambda _joints, reason: self._supervisor.hold(reason),
+            self.now,
+        )
 
     # Transitions.
 
@@ -264,6 +275,9 @@ class ControllerNode(ModelNode):
 
     def cleanup(self) -> None:
         """Discard the controller, its robot, and the load estimate."""
+        if self._action is not None:
+            self._action.destroy()
+        self._action = None
         self._supervisor.cleanup()
         self._driver = self._command = None
 
@@ -271,7 +285,9 @@ class ControllerNode(ModelNode):
         """Start to answer measurements and to check for missing inputs."""
         self._supervisor.activate(self.now(), self._who_publishes())
         self._checks, self._missing = 0, ''
-        self._watchdog = steady_timer(self, self._supervisor.watch_period, self._check_inputs)
+        self._watchdog = steady_timer(
+            self, self._supervisor.safety.watch_period, self._check_inputs
+        )
 
     def about(self) -> str:
         """Name law, constants, rate and topics."""
@@ -328,11 +344,10 @@ class ControllerNode(ModelNode):
             # The plant moves the guide of a steered needle.
             return
         header, path = message.header, JointPath.from_message(message)
-        self._act(
-            self._supervisor.trajectory(
-                nanoseconds(header.stamp), header.frame_id, path, self.now()
-            )
-        )
+        self._follow(nanoseconds(header.stamp), header.frame_id, path)
+
+    def _follow(self, stamp: int, frame: str, path: JointPath) -> None:
+        self._act(self._supervisor.trajectory(stamp, frame, path, self.now()))
 
     def _who_publishes(self) -> dict[str, int]:
         """Count the publishers of commands and measurements; active or not."""
@@ -371,10 +386,21 @@ class ControllerNode(ModelNode):
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
+                self._update_goals(answer)
         self._system.publish()
         self.publish_events(self._supervisor.events)
         if self._supervisor.requests.due():
             self.publish_diagnostics()
+
+    def _update_goals(self, answer: ForceCommand) -> None:
+        """Check the goals at a measurement, against the reference that its command follows."""
+        controller = self._supervisor.controller
+        if controller is None or self._action is None or not self._action.moves:
+            return
+        (position, velocity), (position_error, velocity_error) = answer.reference, answer.error
+        reference = JointReference(position, velocity, nan, controller.guide.arrived)
+        actual = position - position_error, velocity - velocity_error, answer.force
+        self._action.update(answer.stamp, {contract.INSERTION: FollowedJoint(reference, actual)})
 
     def diagnose(self) -> Diagnosis[ControllerStatus]:
         """Report target, state, faults and answers to requests."""

@@ -109,12 +109,6 @@ class Supervisor(StateMachine[ForceCommand]):
             self._following.change(parameters)
 
     @property
-    def watch_period(self) -> float:
-        """Longest time between two calls of `watch` [s]."""
-        timeout = self.safety.streams['joint_states'].timeout / NANOSECONDS
-        return min(0.1, 0.5 * timeout)
-
-    @property
     def waits(self) -> bool:
         """Whether no measurement was received yet."""
         return self.fault == _WAITING
@@ -137,7 +131,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if self.controller is not None:
             self.controller.forget()
         self._active = None
-        self._waiting.discard('the controller is not active')
+        self._waiting.end('the controller is not active')
         return self._command(ForceCommand(now))
 
     def _begin(self, now: int) -> None:
@@ -186,7 +180,18 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
         """Take a path, which starts at its stamp."""
-        return self._request(JOINT_TRAJECTORY, stamp, frame, now, partial(follow_path, path))
+        act = partial(follow_path, path)
+        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, act)
+        if path.stops and stamp <= now:
+            # A stop waits for no sample.
+            self._execute_request(stamp + 1)
+        return answer
+
+    def hold(self, reason: str) -> None:
+        """Brake and hold, for a reason."""
+        self._waiting.discard(reason, (INSERTION,))
+        if self.controller is not None:
+            self.controller.stop_motion()
 
     def _request(
         self, topic: Topic, stamp: int, frame: str, now: int, act: RequestAction
@@ -250,6 +255,7 @@ class Supervisor(StateMachine[ForceCommand]):
     def _stop(self, reason: str, now: int) -> ForceCommand:
         """Latch a stop: zero force, and no motion until the next request."""
         self.safety.latch(reason)
+        self._waiting.end(f'stopped: {reason}')
         self.requests.supersede(now)
         self.bending.forget()
         self.fault = reason
@@ -273,7 +279,7 @@ class Supervisor(StateMachine[ForceCommand]):
     def _retract(self, controller: Controller, depth: float | None, now: int) -> None:
         """Withdraw a needle at a depth [m]; one that is less deep rests."""
         self.requests.supersede(now)
-        self._waiting.discard('the needle is retracted', Verdict.SUPERSEDED)
+        self._waiting.end('the needle is retracted', Verdict.SUPERSEDED)
         if depth is not None:
             low, high = controller.settings.depths(controller.parameters)
             controller.set_target(min(max(min(self.retract_depth, depth), low), high))
@@ -362,9 +368,8 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
-        last = self._last
-        if last.stamp == stamp:
-            return ForceCommand(stamp, last.force, last.torque)
+        if self._last.stamp == stamp:
+            return ForceCommand(stamp, self._last.force, self._last.torque)
         return self._command(ForceCommand(stamp))
 
     def _answer(
@@ -385,6 +390,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if command.notice is not None:
             self.events.last_rejection = command.notice
             self.events.add(Severity.ERROR, command.notice)
+            if controller.target is None:
+                self.requests.end(command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         force, depth = self._last.force, measured.depth
@@ -427,8 +434,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self._warn(line.partition(' ')[0], f'{line}; the observer continues without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
-        rate = self._timing.compare_rate(joints)
-        self._warn('pace', rate)
+        self._warn('pace', self._timing.compare_rate(joints))
         return answer
 
     def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
@@ -452,11 +458,11 @@ class Supervisor(StateMachine[ForceCommand]):
         self.fault = fault
 
     def _release(self, stamp: int) -> ForceCommand:
-        self._waiting.discard(self.fault or 'no force is commanded')
         if self.controller is not None:
             self._following.forget()
             self.controller.guide.waits = False
             self.controller.release()
+        self._waiting.end(self.fault or 'no force is commanded')
         return self._command(ForceCommand(stamp))
 
     def _command(self, answer: ForceCommand) -> ForceCommand:
@@ -469,32 +475,26 @@ class Supervisor(StateMachine[ForceCommand]):
             return ControllerPhase.STOPPED
         if self._active is None:
             return ControllerPhase.INACTIVE
-        if self.fault is None:
-            return ControllerPhase.ACTIVE
-        return ControllerPhase.WAITING if self.waits else ControllerPhase.FAULT
+        faulty = ControllerPhase.WAITING if self.waits else ControllerPhase.FAULT
+        return ControllerPhase.ACTIVE if self.fault is None else faulty
 
-    def _status(self, now: int) -> ControllerStatus:
+    def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:
+        """Return severity, fault if there is any, and status."""
         safety, control, active = self.safety, self.controller, self._active
-        warning = None
-        if active is not None:
-            warning = safety.warning(now) or self.bending.warning or self._timing.warning(now)
-        return replace(
+        warning = safety.warning(now) or self.bending.warning or self._timing.warning(now)
+        status = replace(
             safety.status(ControllerStatus() if control is None else control.status(), now),
             phase=self._phase,
             system=self.authority.mode,
             fault=self.fault or '',
-            warning=warning or '',
+            warning=(warning or '') if active is not None else '',
             observer=self.bending.status(),
             latency=self._timing.status(),
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,
             requests=self.requests.status(),
         )
-
-    def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:
-        """Return severity, fault if there is any, and status."""
-        status = self._status(now)
-        if self.safety.stop is not None:
-            return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', status
-        held = (self.fault or status.warning) if self._active is not None else ''
+        if safety.stop is not None:
+            return Severity.ERROR, f'{safety.stop}; ~/clear_stop releases', status
+        held = (self.fault or status.warning) if active is not None else ''
         return Severity.WARNING if held else Severity.INFO, held or None, status

@@ -203,6 +203,7 @@ class PlantNode(ModelNode):
         """Discard the plant."""
         if self._run is not None:
             self._number = self._run.number
+            self._trajectories.destroy()
         self._run = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
@@ -231,6 +232,7 @@ class PlantNode(ModelNode):
         self._late = 0
         self._samples.begin()
         self._run.begin()
+        self._trajectories.begin()
         self._check_commanders()
         own = self._run.constants.own
         self._display.begin(own.rate * max(1.0, own.real_time_factor))
@@ -257,7 +259,7 @@ class PlantNode(ModelNode):
 
     def deactivate(self) -> None:
         """Stop sampling."""
-        self._trajectories.discard('the plant is not active')
+        self._trajectories.end('the plant is not active')
         for timer in self._active_timers:
             self.destroy_timer(timer)
 
@@ -272,6 +274,8 @@ class PlantNode(ModelNode):
 
     def _on_joint_commands(self, reading: Reading) -> None:
         self._take_command(lambda plant_run, now: plant_run.command_joints(reading, now))
+        if self._run is not None and self._run.commanded:
+            self._trajectories.displace('joint_commands are followed', self._run.commanded)
 
     def _take_command(self, offer: Callable[[PlantRun, int], tuple[bool, str]]) -> None:
         """Handle a command from either topic."""
@@ -303,10 +307,10 @@ class PlantNode(ModelNode):
         self._trajectories.stopped = f'stopped: {reason}' if reason else ''
         if mode is Mode.STOPPED:
             self.get_logger().error(f'stopped: {reason}; no force or motion until ~/clear_stop')
-            self._trajectories.discard(self._trajectories.stopped)
+            self._trajectories.end(self._trajectories.stopped)
             self._run.halt()
         elif mode is Mode.RETRACTING:
-            self._trajectories.discard('the needle is retracted')
+            self._trajectories.end('the needle is retracted')
             self._run.withdraw()
         self._run.commands.stopped = mode is Mode.STOPPED
         self.publish_diagnostics()
@@ -344,7 +348,7 @@ class PlantNode(ModelNode):
 
     def _reset(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
         plant_run.perform(Event(RESET))
-        self._trajectories.discard('the plant was reset')
+        self._trajectories.end('the plant was reset')
         self._trajectories.requests.supersede(self._time.simulated(self.now()))
         self._halted = None
         self._set_fault({})
@@ -405,6 +409,7 @@ class PlantNode(ModelNode):
         except NeedleError as error:
             self._halted = str(error)
             self.get_logger().error(f'{error}; the plant has stopped')
+            self._trajectories.halt(f'{error}; the plant has stopped')
             self.report_change()
             return
         if plant_run.commands.exhausted and not was_exhausted:

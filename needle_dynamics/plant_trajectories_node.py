@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
@@ -15,13 +15,14 @@ from needle_ros.errors import ParameterError, printable
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
+from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.waiting_requests import WaitingRequests
 from trajectory_msgs.msg import JointTrajectory
 
 
 class PlantTrajectories:
     """
-    Receive `joint_trajectory`, execute each request once, and acknowledge it.
+    Receive trajectories as messages and goals, execute each once, and acknowledge it.
 
     A trajectory starts at the sample nearest before its stamp: it waits for this sample, or joins
     if it arrives later. Without a stamp, or in a plant that is not active, it starts on arrival.
@@ -39,25 +40,54 @@ class PlantTrajectories:
         self.received = bool(self._moved)
         self.requests = RequestLog({topic: self._moved} if self.received else {})
         self._waiting = WaitingRequests(self.requests)
-        #: Stamp of the newest sample, and period of the samples [ns].
+        #: Stamp of the newest sample, 0 before the first, and period of the samples [ns].
         self._sampled, self._period = 0, round(NANOSECONDS / constants.own.rate)
         self.rejected = 0
         self.stopped = ''
+        self._action: TrajectoryAction | None = None
         if self.received:
             node.subscribe(topic, self._on_trajectory)
+            self._action = TrajectoryAction(
+                node, self.requests, self._moved, self._follow, self._hold, simulated
+            )
 
-    def discard(self, reason: str) -> None:
-        """Discard the trajectories that wait."""
-        self._waiting.discard(reason, Verdict.SUPERSEDED)
+    def begin(self) -> None:
+        """Await the first sample of an active plant."""
+        self._sampled = 0
+
+    def destroy(self) -> None:
+        """End all goals, and destroy the action."""
+        if self._action is not None:
+            self._action.destroy()
+
+    def end(self, reason: str) -> None:
+        """Discard the trajectories that wait, and end the goals, whose joints hold."""
+        self._waiting.end(reason, Verdict.SUPERSEDED)
+
+    def halt(self, reason: str) -> None:
+        """Discard all trajectories of a plant that cannot move, nor hold."""
+        self.requests.end(reason, self._moved)
+        self.end(reason)
+
+    def displace(self, reason: str, joints: Collection[str]) -> None:
+        """End the goals of joints that something else moves."""
+        self.requests.end(reason, joints)
+
+    def _hold(self, joints: Collection[str], reason: str) -> None:
+        """Hold joints now, also while no sample is taken."""
+        self._waiting.discard(reason, joints)
+        self._run.hold([name for name in self._moved if name in joints])
 
     def sample(self, stamp: int) -> None:
         """Begin the trajectories that start before the next sample; ``stamp`` [ns] is the last."""
+        if self._action is not None and self._action.moves:
+            self._action.update(stamp, self._run.followed())
         self._sampled = stamp
-        self._begin(0.0)
+        self._begin(stamp + self._period, 0.0)
 
-    def _begin(self, elapsed: float) -> None:
-        """Execute the requests that are due, at a time after their start [s]."""
-        while (request := self._waiting.take(self._sampled + self._period)) is not None:
+    def _begin(self, until: int, elapsed: float) -> None:
+        """Execute the requests that start before a time [ns], at a time after their start [s]."""
+        while (request := self._waiting.take(until)) is not None:
             topic, stamp, moved, act = request
             try:
                 act(self._run, elapsed)
@@ -69,12 +99,14 @@ class PlantTrajectories:
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         """Execute a trajectory if it is new and valid, or let it wait, and acknowledge it."""
-        topic, stamp = contract.JOINT_TRAJECTORY, nanoseconds(message.header.stamp)
-        path = JointPath.from_message(message)
+        self._follow(nanoseconds(message.header.stamp), '', JointPath.from_message(message))
+
+    def _follow(self, stamp: int, frame: str, path: JointPath) -> None:
+        topic = contract.JOINT_TRAJECTORY
         # In mode `simulation`, `insertion` is addressed to the controller.
         moved = tuple(name for name in path.joints or self._moved if name in self._moved)
         now = self._simulated() if self._node.is_active else stamp
-        known = self.requests.check(topic, stamp, now, '', moved)
+        known = self.requests.check(topic, stamp, now, frame, moved)
         if known is not None:
             if known.verdict in (Verdict.REJECTED, Verdict.LATE):
                 self._reject(known.reason)
@@ -82,10 +114,13 @@ class PlantTrajectories:
             # A stop of the node `steering` is not an error of its sender.
             self.requests.answer(topic, stamp, Verdict.SUPERSEDED, self.stopped)
         else:
-            if not self._node.is_active:
-                self._sampled = stamp
+            # Not active, or before the first sample.
+            self._sampled = self._sampled if self._node.is_active and self._sampled else now
             request = self._waiting.add(topic, stamp, moved, partial(_follow, path, moved))
-            self._begin(request.elapsed(self._sampled))
+            # A stop waits for no sample.
+            until = now + 1 if path.stops else 0
+            due = max(self._sampled + self._period, until)
+            self._begin(due, request.elapsed(self._sampled))
         self.publish_answers()
 
     def _reject(self, reason: str) -> None:

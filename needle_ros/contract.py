@@ -469,5 +469,19 @@ DIAGNOSTICS: Final = Topic(
     qos=COMMAND._replace(depth=10),
 )
 
+
+class Action(NamedTuple):
+    """An action of the contract."""
+
+    #: Name, relative to the node.
+    name: str
+    type_name: str
+
+
+#: Offered by the nodes that receive `joint_trajectory`, if its package is installed.
+FOLLOW_JOINT_TRAJECTORY: Final = Action(
+    '~/follow_joint_trajectory', 'control_msgs/action/FollowJointTrajectory'
+)
+
 #: All topics, in the order above.
 TOPICS: Final = tuple(value for value in [*globals().values()] if isinstance(value, Topic))

@@ -9,11 +9,11 @@ second, so that a lost message is replaced. The sender repeats the request until
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from time import monotonic
-from typing import Final
+from typing import Final, NamedTuple, TypeAlias
 
 from needle_ros.contract import REQUEST_AGE, Stamp, Topic
 from needle_ros.errors import NeedleError, printable
@@ -119,6 +119,22 @@ class RequestStatus:
 _VERDICTS: Final = {one.value for one in Verdict}
 
 
+#: Takes an answer to a request, and the joints that something else moves from then on.
+Listener: TypeAlias = Callable[[Acknowledgement, Collection[str]], None]
+
+
+class _Watched(NamedTuple):
+    """A request whose end is reported."""
+
+    joints: frozenset[str]
+    tell: Listener
+
+
+def is_stale(stamp: int, now: int) -> bool:
+    """Return whether a stamp [ns] is too far from the present time [ns]; 0 never is."""
+    return stamp != 0 and not -_MOST_AGE <= now - stamp <= _MOST_AGE
+
+
 class RequestLog:
     """
     Log of received requests: accept each once, in the order of the stamps, and record answers.
@@ -141,11 +157,14 @@ class RequestLog:
         self._answers: dict[tuple[str, int], Acknowledgement] = {}
         #: Stamp of the newest request that was accepted, by joint [ns].
         self._newest: dict[str, int] = {}
+        #: Requests whose end is reported, by topic and stamp.
+        self._watched: dict[tuple[str, int], _Watched] = {}
         self._changed = False
         self._published = -_PAUSE
 
     def forget(self) -> None:
         """Delete all requests, after a start or after the clock was set back."""
+        self.end('the clock was set back')
         self._answers.clear()
         self._newest.clear()
 
@@ -165,7 +184,7 @@ class RequestLog:
             self._changed = True
             return known
         verdict, reason = Verdict.REJECTED, ''
-        if stamp and not -_MOST_AGE <= now - stamp <= _MOST_AGE:
+        if is_stale(stamp, now):
             reason = f'{topic.name} is stale: its stamp is {apart(now - stamp)}'
         elif frame not in self._frames:
             valid = ' or '.join(map(repr, self._frames))
@@ -198,7 +217,44 @@ class RequestLog:
         while len(self._answers) > _KEPT:
             del self._answers[next(iter(self._answers))]
         self._changed = True
+        watched = self._watched.get((topic.name, stamp))
+        if watched is not None:
+            if made.refused:
+                del self._watched[topic.name, stamp]
+            watched.tell(made, ())
+        if verdict is Verdict.ACCEPTED:
+            self.end(f'a newer {topic.name} is followed', {*joints}, besides=stamp)
         return made
+
+    def watch(self, topic: Topic, stamp: int, joints: Iterable[str], tell: Listener) -> int:
+        """
+        Report the answers to a request of some joints, and the end of its execution.
+
+        Returns the stamp [ns] of the request, made unique.
+        """
+        while (topic.name, stamp) in self._answers:
+            stamp += 1
+        self._watched[topic.name, stamp] = _Watched(frozenset(joints), tell)
+        return stamp
+
+    def unwatch(self, topic: Topic, stamp: int) -> None:
+        """Report nothing more of a request."""
+        self._watched.pop((topic.name, stamp), None)
+
+    def end(
+        self, reason: str, moved: Collection[str] | None = None, *, besides: int | None = None
+    ) -> None:
+        """
+        Report the end of the watched requests, except for one stamp [ns].
+
+        ``moved`` are the joints that something else moves from now on: only requests of one of
+        them end. Without it all requests end.
+        """
+        for key, watched in [*self._watched.items()]:
+            if key[1] != besides and (moved is None or watched.joints & {*moved}):
+                del self._watched[key]
+                ended = Acknowledgement(*key, Verdict.SUPERSEDED, printable(reason))
+                watched.tell(ended, moved or ())
 
     def reject(self, topic: Topic, stamp: int, why: str | NeedleError) -> None:
         """Answer that a request is rejected, for a reason or an error."""

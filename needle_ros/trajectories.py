@@ -17,6 +17,22 @@ MOST_POINTS: Final = 10_000
 Points: TypeAlias = Sequence[Sequence[float]]
 
 
+class JointReference(NamedTuple):
+    """Reference of a joint that follows trajectories; NaN for values that are not controlled."""
+
+    position: float  #: position [m or rad]
+    velocity: float  #: velocity [m/s or rad/s]
+    effort: float  #: force [N] or torque [N m]
+    arrived: bool  #: whether it is at the end of its motion
+
+
+class FollowedJoint(NamedTuple):
+    """Reference of a joint, and its measured position, velocity and effort, in equal units."""
+
+    reference: JointReference
+    actual: tuple[float, float, float]
+
+
 class LateTrajectoryError(ParameterError):
     """All points of a trajectory are in the past."""
 

@@ -43,9 +43,7 @@ class WaitingRequests:
     ) -> WaitingRequest:
         """Add a request; it replaces those of the same joints."""
         request = WaitingRequest(topic, stamp, tuple(joints), act)
-        replaced = [one for one in self._waiting if {*one.joints} & {*request.joints}]
-        for one in replaced:
-            self._drop(one, f'a newer {topic.name} is followed', Verdict.SUPERSEDED)
+        self.discard(f'a newer {topic.name} is followed', request.joints)
         self._waiting.append(request)
         self._requests.answer(topic, stamp, Verdict.RECEIVED)
         return request
@@ -62,10 +60,17 @@ class WaitingRequests:
                 return one
         return None
 
-    def discard(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
-        """Discard all requests, and answer them."""
+    def discard(self, reason: str, joints: Iterable[str]) -> None:
+        """Discard the requests of some joints, superseded for a reason."""
+        for one in [*self._waiting]:
+            if {*joints} & {*one.joints}:
+                self._drop(one, reason, Verdict.SUPERSEDED)
+
+    def end(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
+        """Discard and answer all requests, and report the end of all in execution."""
         for one in [*self._waiting]:
             self._drop(one, reason, verdict)
+        self._requests.end(reason)
 
     def _drop(self, one: WaitingRequest, reason: str, verdict: Verdict) -> None:
         self._waiting.remove(one)

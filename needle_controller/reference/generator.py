@@ -64,6 +64,12 @@ class ReferenceGenerator:
     def moves(self) -> bool:
         return self._motion is not None
 
+    @property
+    def arrived(self) -> bool:
+        """Whether the motion to the target or along the path has ended."""
+        motion = None if self.paused or self._change is not None else self._motion
+        return motion is not None and self.now - self._start >= motion.duration
+
     def aim(self, depth: float) -> None:
         """Move to an insertion depth [m]; `ParameterError` if not finite or out of range."""
         low, high = self._depths

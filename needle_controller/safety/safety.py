@@ -89,6 +89,11 @@ class Safety:
             self.guard.forget(stream.name)
         self.guard.forget('reference')
 
+    @property
+    def watch_period(self) -> float:
+        """Longest time between two checks for missing inputs [s]."""
+        return min(0.1, 0.5 * self.streams['joint_states'].timeout / NANOSECONDS)
+
     def latch(self, reason: str | None) -> bool:
         """Latch a stop for a reason, if not None; return whether the stop begins now."""
         if reason is None or self.stop is not None:

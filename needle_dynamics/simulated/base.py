@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from math import copysign, inf, sqrt
+from math import copysign, inf, nan, sqrt
 from typing import Final
 
 from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant
-from needle_ros.trajectories import check_times
+from needle_ros.trajectories import check_times, JointReference
 import numpy as np
 
 #: Parts of a sample interval with constant push force: with friction the velocity follows the
@@ -19,6 +19,7 @@ import numpy as np
 PUSHES: Final = 4
 
 _SETTLED: Final = 1e-8  #: position error below which the base rests at the end of a trajectory [m]
+_ROUNDING: Final = 1e-9  #: tolerance of times due to rounding [s]
 _LATE: Final = 1e-4  #: position error above which the base is late [m]
 
 
@@ -121,6 +122,26 @@ class BaseMotion:
     def end(self) -> float:
         """Time of the last point [s], on the clock of `velocity`."""
         return float(self._times[-1])
+
+    def reference(self, time: float) -> JointReference:
+        """
+        Return the reference at a time [s], on the clock of `velocity`.
+
+        A push has no position and velocity, a motion no effort.
+        """
+        times, last = self._times, len(self._times) - 1
+        # Clock rounding must not delay the end.
+        arrived = time >= self.end - _ROUNDING
+        k = min(int(np.searchsorted(times, time, side='right')), last)
+        if self._pushes[k]:
+            force = float(np.interp(time, times, self._forces))
+            return JointReference(nan, nan, force, arrived)
+        velocity = 0.0
+        if k > 0 and not arrived:
+            step = self._depths[k] - self._depths[k - 1]
+            velocity = float(step / (times[k] - times[k - 1]))
+        position = float(np.interp(time, times, self._depths))
+        return JointReference(position, velocity, nan, arrived)
 
     def push(self, time: float, depth: float, interval: float) -> float | None:
         """Return the mean push force over an interval [N] at a depth [m]; None in a motion."""

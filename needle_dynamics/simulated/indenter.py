@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from math import hypot
+from math import hypot, nan
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
@@ -17,7 +17,7 @@ from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import check_times, joint_values, Points
+from needle_ros.trajectories import check_times, joint_values, JointReference, Points
 import numpy as np
 
 JOINTS = ('x', 'z')  #: joints of the indenter trajectories: the axes of the plane
@@ -168,6 +168,15 @@ class Indenter(SimulatedPlant):
                 )
         self._times = self.time + np.append(0.0, times)
         self._forces = np.vstack([self._force, np.array(forces, dtype=np.float64).T])
+
+    def references(self) -> dict[str, JointReference]:
+        # Clock rounding must not delay the end.
+        arrived = bool(self.time >= self._times[-1] - 1e-6 * self.interval)
+        efforts = [float(np.interp(self.time, self._times, f)) for f in self._forces.T]
+        return {
+            joint: JointReference(nan, nan, effort, arrived)
+            for joint, effort in zip(JOINTS, efforts, strict=True)
+        }
 
     def _motion(self) -> str:
         return 'the end-effector moves' if self._moving else ''

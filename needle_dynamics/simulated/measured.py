@@ -14,7 +14,7 @@ from needle_dynamics.simulated.tip_sensor import TipReading
 from needle_ros.contract import BASE_WRENCH, GROUND_TRUTH, JOINT_STATES, TIP_DEFLECTION, Topic
 from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import Points
+from needle_ros.trajectories import JointReference, Points
 import numpy as np
 
 AT_REST: Final = 1e-6  #: velocity below which taring is permitted [m/s]
@@ -94,6 +94,18 @@ class SimulatedPlant(ABC):
         ------
         ParameterError
             If the plant has no such joint, or a joint cannot follow; then no joint moves.
+
+        """
+
+    @abstractmethod
+    def references(self) -> dict[str, JointReference]:
+        """
+        Return the reference of the joints at the newest sample.
+
+        Returns
+        -------
+        dict of str to JointReference
+            Reference by joint; empty if no joint follows trajectories.
 
         """
 

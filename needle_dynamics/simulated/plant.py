@@ -26,7 +26,7 @@ from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipS
 from needle_ros.contract import BASE_WRENCH, ground_truth, INSERTION, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import ParameterError
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import joint_values, Points
+from needle_ros.trajectories import joint_values, JointReference, Points
 import numpy as np
 
 _POINTS: Final = 21  #: number of points of an outline
@@ -113,6 +113,9 @@ class Plant(SimulatedPlant):
             raise ParameterError('is followed in the modes robot and indenter only')
         columns = (joint_values(INSERTION, joints, values) for values in (positions, efforts))
         self.base.follow(self.time, self.depth, times, *columns)
+
+    def references(self) -> dict[str, JointReference]:
+        return {} if self.base is None else {INSERTION: self.base.reference(self.time)}
 
     def _motion(self) -> str:
         return velocity_text(self.integrator.velocity)

@@ -9,6 +9,7 @@ performs it again.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import nan
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
@@ -20,6 +21,7 @@ from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.timing import NANOSECONDS
+from needle_ros.trajectories import FollowedJoint
 from needle_ros.wire import Reading
 
 #: Event kinds.
@@ -73,6 +75,8 @@ class PlantRun:
         self._events = [Event(CONFIGURED, self._values)]
         #: Latest measurements.
         self._measured: list[Measurement] = []
+        #: Joints that the latest `joint_commands` have moved.
+        self.commanded: set[str] = set()
 
     # Commands.
 
@@ -84,6 +88,7 @@ class PlantRun:
     def command_joints(self, reading: Reading, now: int) -> tuple[bool, str]:
         """Process a `joint_commands` message at a time [ns]; return as `Commands.offer`."""
         commands = self.commands
+        self.commanded = set()
         try:
             asked = self._joint_commands.read(reading, self._positions(), now)
             counts, complaint = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
@@ -96,20 +101,40 @@ class PlantRun:
                         'efforts': [[]],
                     }
                     self.perform(Event(MOTION, content))
+                    self.commanded |= {*goals}
                 self._joint_commands.accept(asked)
         except ParameterError as error:
             commands.refuse()
             return True, f'{JOINT_COMMANDS.name}: {error}; no force is applied'
         return counts, complaint
 
+    def followed(self) -> dict[str, FollowedJoint]:
+        """Return reference and measurement of each joint that follows trajectories."""
+        at = self._measured_joints()
+        return {
+            name: FollowedJoint(reference, at[name])
+            for name, reference in self.plant.references().items()
+        }
+
+    def _measured_joints(self) -> dict[str, tuple[float, float, float]]:
+        """Return the last measured position, velocity and effort of each joint."""
+        if JOINT_STATES.name in self.topics:
+            joints = self.topics[JOINT_STATES.name].joints
+            *_, (_, _, values) = self._measured
+            count = len(joints)
+            return {
+                joint.name: (values[k], values[k + count], values[k + 2 * count])
+                for k, joint in enumerate(joints)
+            }
+        (_, _, wrench), (_, _, pose) = self._measured
+        x, z = PRESS_JOINTS
+        return {x: (pose[0], nan, wrench[0]), z: (pose[2], nan, wrench[2])}
+
     def _positions(self) -> dict[str, float]:
         """Return the joint positions measured by the encoders [m or rad]."""
         if not self._measured or JOINT_STATES.name not in self.topics:
             return {INSERTION: self.plant.depth}
-        joints = self.topics[JOINT_STATES.name].joints
-        # The last measurement, with the positions first.
-        values = self._measured[-1][2]
-        return {joint.name: value for joint, value in zip(joints, values, strict=False)}
+        return {name: position for name, (position, _, _) in self._measured_joints().items()}
 
     def halt(self) -> None:
         """End every force and motion, of the needle and of all joints that move by themselves."""

@@ -34,7 +34,7 @@ from needle_ros.contract import (
 from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant
 from needle_ros.status import PlantStatus
-from needle_ros.trajectories import check_times, joint_values, Points
+from needle_ros.trajectories import check_times, joint_values, JointReference, Points
 import numpy as np
 
 
@@ -132,6 +132,10 @@ class SteeredPlant(SimulatedPlant):
             self.base.follow(self.time, self.depth, times, *columns)
         self._motions |= followed
         self._moving |= {*followed}
+
+    def references(self) -> dict[str, JointReference]:
+        motions = self._motions if self.base is None else {INSERTION: self.base, **self._motions}
+        return {name: motion.reference(self.time) for name, motion in motions.items()}
 
     def _motion(self) -> str:
         joints = ', '.join(sorted(self._moving))

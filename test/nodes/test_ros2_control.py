@@ -17,7 +17,6 @@ from math import nan
 import os
 from pathlib import Path
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from needle_ros.status import node_of, PlantStatus
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from support.generated_messages import importable
 from support.installed import ROOT
 from support.ros_graph import RosGraph
 import yaml
@@ -468,17 +468,8 @@ def test_publish_tf_is_rejected_without_a_needle(ros_graph: RosGraph) -> None:
 @pytest.fixture(scope='module')
 def transforms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Return the folder of tf2_msgs, built from its definition if not installed."""
-    if find_spec('tf2_msgs'):
-        yield ''
-        return
-    if not (shutil.which('gcc') and shutil.which('g++')):
-        pytest.skip('neither tf2_msgs nor a compiler to make it')
-    folder = tmp_path_factory.mktemp('tf2')
-    words = [sys.executable, '-m', 'support.tf2_messages', str(folder)]
-    subprocess.run(words, cwd=Path(__file__).parents[1], check=True, stdout=subprocess.DEVNULL)
-    sys.path.insert(0, str(folder))
-    yield str(folder)
-    sys.path.remove(str(folder))
+    with importable('tf2_msgs', tmp_path_factory.mktemp('tf2')) as entry:
+        yield entry
 
 
 @pytest.mark.parametrize(('steered', 'prefix'), [(False, ''), (True, 'left/')])

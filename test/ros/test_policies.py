@@ -8,7 +8,7 @@ import shutil
 
 from lxml import etree
 from needle_insertion.nodes import NODES
-from needle_ros.contract import EVERY_NODE, TF, TOPICS, USER
+from needle_ros.contract import EVERY_NODE, FOLLOW_JOINT_TRAJECTORY, TF, TOPICS, USER
 import pytest
 from support.installed import ROOT
 from support.policies import load, NOT_RECORDED, POLICIES, POLICY, REPORTS
@@ -90,6 +90,19 @@ def test_permissions_to_publish_agree_with_the_contract() -> None:
                 assert not allowed
             elif own:
                 assert allowed == own | played, name
+
+
+@pytest.mark.requirement('S-249')
+def test_goals_are_accepted_from_the_operator_only() -> None:
+    """Each action that may be called is executed by a node that receives trajectories."""
+    offered = {node: profile.execute for node, profile in POLICY.items() if profile.execute}
+    name = FOLLOW_JOINT_TRAJECTORY.name
+    assert offered == {n: {name.replace('~', f'/{n}')} for n in ('plant', 'controller')}
+    assert {*offered} == {n for n in NODES if '/joint_trajectory' in POLICY[n].subscribe} - {
+        'recorder'
+    }
+    called = {node: profile.call for node, profile in POLICY.items() if profile.call}
+    assert called == {OPERATOR: frozenset().union(*offered.values())}
 
 
 @pytest.mark.requirement('S-241')

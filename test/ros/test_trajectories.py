@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from needle_ros.contract import JOINT_TRAJECTORY, REQUEST_AGE
 from needle_ros.errors import ParameterError
-from needle_ros.requests import RequestLog, Verdict
+from needle_ros.requests import Acknowledgement, RequestLog, Verdict
 from needle_ros.trajectories import JointPath, LateTrajectoryError, MOST_POINTS
 from needle_ros.waiting_requests import WaitingRequests
 import pytest
@@ -74,7 +76,7 @@ def test_requests_wait_for_their_stamp_and_replace_the_same_joints() -> None:
     assert waiting.take(20) is None
     assert waiting.take(21).stamp == 20
     assert waiting.take(21) is None
-    waiting.discard('stopped')
+    waiting.end('stopped')
     assert verdict(30) is Verdict.REJECTED
     # The clock was set back below the valid age of a request.
     far = round((REQUEST_AGE + 2.0) * SECOND)
@@ -93,3 +95,36 @@ def test_late_request_may_be_sent_again() -> None:
     late, other = (status.answer_to('joint_trajectory', stamp) for stamp in (5, 6))
     assert (late.verdict, late.refused) == (Verdict.LATE, True)
     assert other.verdict is Verdict.REJECTED
+
+
+def test_watched_requests_report_each_end_once() -> None:
+    """With the joints that something else moves; other requests continue."""
+    log, topic = RequestLog({JOINT_TRAJECTORY: ('insertion', 'guide_x', 'roll')}), JOINT_TRAJECTORY
+    told: list[tuple[int, Verdict, set[str]]] = []
+
+    def tell(one: Acknowledgement, moved: Collection[str]) -> None:
+        told.append((one.stamp, one.verdict, {*moved}))
+
+    def watch(stamp: int, *joints: str) -> int:
+        return log.watch(topic, stamp, joints, tell)
+
+    first = watch(10, 'insertion', 'guide_x')
+    log.answer(topic, first, Verdict.ACCEPTED, joints=('insertion', 'guide_x'))
+    # The stamp identifies a request: the next is 1 ns later.
+    second = watch(10, 'roll')
+    assert (first, second) == (10, 11)
+    log.answer(topic, second, Verdict.ACCEPTED, joints=('roll',))
+    assert told == [(10, Verdict.ACCEPTED, set()), (11, Verdict.ACCEPTED, set())]
+    told.clear()
+    log.answer(topic, 20, Verdict.ACCEPTED, joints=('guide_x',))
+    assert told == [(10, Verdict.SUPERSEDED, {'guide_x'})]
+    log.end('stopped')
+    assert told[1:] == [(11, Verdict.SUPERSEDED, set())]
+    rejected = watch(30, 'roll')
+    log.reject(topic, rejected, LateTrajectoryError('past'))
+    log.end('stopped')
+    assert told[2:] == [(30, Verdict.LATE, set())]
+    silent = watch(40, 'roll')
+    log.unwatch(topic, silent)
+    log.answer(topic, silent, Verdict.REJECTED)
+    assert len(told) == 3

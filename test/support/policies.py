@@ -18,6 +18,10 @@ NOT_RECORDED: Final = {'/rosout', '/parameter_events'}
 REPORTS: Final = {'/joint_states/_processed', '/joint_states/_recorded'}
 
 
+#: Part of the names of the topics and services of an action.
+ACTION: Final = '/_action/'
+
+
 class Profile(NamedTuple):
     """Permitted or used names of a node."""
 
@@ -25,6 +29,9 @@ class Profile(NamedTuple):
     subscribe: frozenset[str]
     reply: frozenset[str]
     request: frozenset[str]
+    #: Actions that are offered and used, with their topics and services.
+    execute: frozenset[str] = frozenset()
+    call: frozenset[str] = frozenset()
 
 
 def load(path: Path = POLICIES) -> etree._ElementTree:
@@ -41,7 +48,7 @@ def parsed(tree: etree._ElementTree) -> dict[str, Profile]:
         (profile,) = enclave.iterfind('profiles/profile')
         node, namespace = profile.get('node'), profile.get('ns')
         allowed: dict[str, set[str]] = {rule: set() for rule in Profile._fields}
-        for block in profile.iterchildren('topics', 'services'):
+        for block in profile.iterchildren('topics', 'services', 'actions'):
             for rule in allowed.keys() & block.attrib.keys():
                 assert block.get(rule) == 'ALLOW'
                 for name in (item.text.replace('~', f'{namespace}{node}') for item in block):

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Action server ``follow_joint_trajectory`` of a node that receives `joint_trajectory`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Final
+
+from needle_ros.base_node import BaseNode
+from needle_ros.contract import FOLLOW_JOINT_TRAJECTORY, JOINT_TRAJECTORY
+from needle_ros.errors import ParameterError, printable
+from needle_ros.requests import Acknowledgement, RequestLog, Verdict
+from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.trajectories import FollowedJoint, JointPath
+from needle_ros.trajectory_goals import (
+    ErrorCode,
+    Outcome,
+    outcome_of,
+    TrajectoryGoal,
+    UnknownJointError,
+)
+from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+from trajectory_msgs.msg import JointTrajectoryPoint
+
+#: Period of the feedback [ns], as for joint_trajectory_controller.
+_PERIOD: Final = NANOSECONDS // 20
+
+_INACTIVE: Final = 'the node is not active'
+
+
+class _GoalServer(ActionServer):
+    """Action server of goals that the node executes, without a callback for each."""
+
+    def notify_execute(self, _goal: ServerGoalHandle, _execute: object) -> None:
+        """Do nothing: the node executes the goal with its samples."""
+
+    def send_result(self, handle: ServerGoalHandle, result: Any) -> None:
+        """Send a result now: the executor would send it after the node is cleaned up."""
+        response = self.action_type.Impl.GetResultService.Response()
+        response.status, response.result = handle.status, result
+        future = self._result_futures[bytes(handle.goal_id.uuid)]
+        # Without an executor the future calls back at once.
+        future._set_executor(None)
+        future.set_result(response)
+
+
+@dataclass(slots=True, eq=False)
+class _Execution:
+    """A goal, its handle, and the time of its next feedback [ns]."""
+
+    handle: ServerGoalHandle
+    goal: TrajectoryGoal
+    due: int = 0
+
+
+class TrajectoryAction:
+    """
+    Offer ``~/follow_joint_trajectory`` of control_msgs, if this package is installed.
+
+    A goal becomes the same request as a message on `joint_trajectory`. Every goal is accepted, and
+    an invalid one aborted with code and reason, for which a rejection has no field. A goal that is
+    canceled or violates a tolerance holds its joints.
+
+    Parameters
+    ----------
+    node : BaseNode
+        The receiver.
+    requests : RequestLog
+        Log of its requests, in which `joint_trajectory` is answered.
+    joints : collection of str
+        Joints that it moves.
+    request : callable
+        Takes a trajectory with stamp [ns] and frame, as if it arrived on the topic.
+    hold : callable
+        Holds joints at once, for a reason.
+    now : callable
+        Returns the time of the stamps [ns].
+
+    """
+
+    def __init__(
+        self,
+        node: BaseNode,
+        requests: RequestLog,
+        joints: Collection[str],
+        request: Callable[[int, str, JointPath], None],
+        hold: Callable[[Collection[str], str], None],
+        now: Callable[[], int],
+    ) -> None:
+        self._node, self._requests, self._joints = node, requests, joints
+        self._request, self._hold, self._now = request, hold, now
+        self._server: _GoalServer | None = None
+        #: Goals in execution, by their stamps [ns].
+        self._running: dict[int, _Execution] = {}
+        self._canceled: list[ServerGoalHandle] = []
+        package, _, kind = FOLLOW_JOINT_TRAJECTORY.type_name.partition('/action/')
+        try:
+            self._action = getattr(import_module(f'{package}.action'), kind)
+        except ImportError:
+            # Not among the wheels of ROS 2.
+            return
+        self._server = _GoalServer(
+            node,
+            self._action,
+            FOLLOW_JOINT_TRAJECTORY.name,
+            # Goals are executed by `update`.
+            lambda _handle: self._action.Result(),
+            handle_accepted_callback=self._on_goal,
+            cancel_callback=self._on_cancel,
+        )
+
+    @property
+    def moves(self) -> bool:
+        """Whether there are goals in execution."""
+        return bool(self._running)
+
+    def destroy(self) -> None:
+        """End all goals, and destroy the server."""
+        self._requests.end('the node is cleaned up', self._joints)
+        self._finish_canceled()
+        if self._server is not None:
+            self._server.destroy()
+
+    # Goals.
+
+    def _on_goal(self, handle: ServerGoalHandle) -> None:
+        """Turn a goal into a request."""
+        handle.execute()
+        header = handle.request.trajectory.header
+        try:
+            if not self._node.is_active:
+                raise ParameterError(_INACTIVE)
+            goal = TrajectoryGoal.from_message(handle.request, self._joints)
+        except UnknownJointError as error:
+            self._finish(handle, Outcome(ErrorCode.INVALID_JOINTS, str(error)))
+            return
+        except ParameterError as error:
+            self._finish(handle, Outcome(ErrorCode.INVALID_GOAL, str(error)))
+            return
+        execution = _Execution(handle, goal)
+
+        def tell(answer: Acknowledgement, moved: Collection[str]) -> None:
+            self._on_answer(execution, answer, moved)
+
+        stamp = nanoseconds(header.stamp) or self._now()
+        goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, tell)
+        self._running[goal.stamp] = execution
+        self._request(goal.stamp, header.frame_id, goal.trajectory)
+
+    def _on_answer(
+        self, execution: _Execution, answer: Acknowledgement, moved: Collection[str]
+    ) -> None:
+        """Process an answer to the request of a goal; `moved` are joints not to hold."""
+        goal = execution.goal
+        goal.moves |= answer.verdict is Verdict.ACCEPTED
+        if not answer.refused:
+            return
+        del self._running[goal.stamp]
+        if goal.moves:
+            self._hold(goal.joints - {*moved}, answer.reason)
+        self._finish(execution.handle, outcome_of(answer, self._now()))
+
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        """Hold the joints of a goal; its result follows when rclpy has changed its state."""
+        for execution in [*self._running.values()]:
+            if execution.handle == handle:
+                self._end(execution, 'the goal was canceled')
+                self._canceled.append(handle)
+                executor: Any = self._node.executor
+                executor.create_task(self._finish_canceled)
+        return CancelResponse.ACCEPT
+
+    def _finish_canceled(self) -> None:
+        handles, self._canceled = self._canceled, []
+        for handle in handles:
+            self._finish(handle, Outcome(ErrorCode.SUCCESSFUL, 'the goal was canceled'))
+
+    def _end(self, execution: _Execution, reason: str) -> None:
+        """End the execution of a goal, and hold its joints if there is a reason."""
+        goal = execution.goal
+        self._requests.unwatch(JOINT_TRAJECTORY, goal.stamp)
+        del self._running[goal.stamp]
+        if reason:
+            self._hold(goal.joints, reason)
+
+    def update(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> None:
+        """Check the goals in execution at a sample with a stamp [ns], and publish feedback."""
+        for execution in [*self._running.values()]:
+            goal = execution.goal
+            if not goal.moves:
+                continue
+            outcome = goal.check(stamp, followed)
+            if outcome is not None or stamp >= execution.due:
+                execution.due = stamp + _PERIOD
+                execution.handle.publish_feedback(self._feedback(goal, stamp, followed))
+            if outcome is not None:
+                self._end(execution, outcome.reason)
+                self._finish(execution.handle, outcome)
+
+    # Messages.
+
+    def _feedback(
+        self, goal: TrajectoryGoal, stamp: int, followed: Mapping[str, FollowedJoint]
+    ) -> Any:
+        joints = [followed[name] for name in goal.trajectory.joints]
+        feedback = self._action.Feedback(joint_names=[*goal.trajectory.joints])
+        time = feedback.header.stamp
+        time.sec, time.nanosec = divmod(stamp, NANOSECONDS)
+        desired = [joint.reference[:3] for joint in joints]
+        actual = [joint.actual for joint in joints]
+        error = [
+            (p - at, v - speed, force - load)
+            for (p, v, force), (at, speed, load) in zip(desired, actual, strict=True)
+        ]
+        for point, rows in (
+            (feedback.desired, desired),
+            (feedback.actual, actual),
+            (feedback.error, error),
+        ):
+            _fill(point, rows, max(0, stamp - goal.stamp))
+        return feedback
+
+    def _finish(self, handle: ServerGoalHandle, outcome: Outcome) -> None:
+        """Set the final state of a goal, and send its result."""
+        if handle.is_cancel_requested:
+            handle.canceled()
+        elif outcome.code is ErrorCode.SUCCESSFUL:
+            handle.succeed()
+        else:
+            handle.abort()
+            self._node.get_logger().warning(
+                printable(
+                    f'follow_joint_trajectory aborted, {outcome.code.name}: {outcome.reason}'
+                ),
+                throttle_duration_sec=1.0,
+            )
+        reason = printable(outcome.reason)
+        result = self._action.Result(error_code=int(outcome.code), error_string=reason)
+        if self._server is not None:
+            self._server.send_result(handle, result)
+
+
+def _fill(
+    point: JointTrajectoryPoint, rows: list[tuple[float, float, float]], elapsed: int
+) -> None:
+    """Write position, velocity and effort of each joint, at a time after the start [ns]."""
+    columns = (list(column) for column in zip(*rows, strict=True))
+    point.positions, point.velocities, point.effort = columns
+    time = point.time_from_start
+    time.sec, time.nanosec = divmod(elapsed, NANOSECONDS)

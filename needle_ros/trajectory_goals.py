@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Goals of the action ``follow_joint_trajectory``: validation, tolerances and result."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from math import isfinite
+from typing import Any, Final, NamedTuple
+
+from needle_ros.errors import ParameterError
+from needle_ros.requests import Acknowledgement, is_stale, Verdict
+from needle_ros.timing import nanoseconds
+from needle_ros.trajectories import FollowedJoint, JointPath
+
+#: Value of a tolerance that disables its check, as 0 does.
+_ERASED: Final = -1.0
+
+
+class ErrorCode(IntEnum):
+    """Error codes of control_msgs/action/FollowJointTrajectory."""
+
+    SUCCESSFUL = 0
+    INVALID_GOAL = -1
+    INVALID_JOINTS = -2
+    OLD_HEADER_TIMESTAMP = -3
+    PATH_TOLERANCE_VIOLATED = -4
+    GOAL_TOLERANCE_VIOLATED = -5
+
+
+class Outcome(NamedTuple):
+    """Result of a goal: error code, and its reason for users."""
+
+    code: ErrorCode
+    reason: str
+
+
+class UnknownJointError(ParameterError):
+    """A goal names a joint that is not moved, none, or one twice."""
+
+
+class Tolerance(NamedTuple):
+    """Largest errors of a joint: position [m or rad] and velocity; 0 or less without a limit."""
+
+    position: float
+    velocity: float
+
+    def excess(self, name: str, joint: FollowedJoint) -> str:
+        """Describe an error of a joint beyond the tolerance, '' without one."""
+        reference = joint.reference
+        for what, limit, desired, actual in zip(
+            self._fields, self, reference[:2], joint.actual[:2], strict=True
+        ):
+            # A push has no position: NaN is not beyond a limit.
+            if limit > 0.0 and abs(desired - actual) > limit:
+                error = desired - actual
+                return f'{what} error of {name} is {error:.6g}, beyond its tolerance {limit:.6g}'
+        return ''
+
+
+@dataclass(slots=True)
+class TrajectoryGoal:
+    """
+    A goal with its tolerances by joint, for the joints of a receiver.
+
+    It succeeds when the references of all joints have arrived and the joints are within
+    ``goal``. From the arrival on, this may take ``timeout`` [ns], or any time if it is 0.
+    Until then the joints must be within ``path`` of their references.
+    """
+
+    trajectory: JointPath
+    path: Mapping[str, Tolerance]
+    goal: Mapping[str, Tolerance]
+    timeout: int
+    #: Stamp of its request [ns].
+    stamp: int = 0
+    #: Whether its motion has begun.
+    moves: bool = False
+    #: Time at which all references had arrived [ns].
+    arrived: int | None = None
+
+    @classmethod
+    def from_message(cls, message: Any, joints: Collection[str]) -> TrajectoryGoal:
+        """
+        Convert a goal of the action, for the joints of a receiver.
+
+        Raises `UnknownJointError` for other joints, and `ParameterError` for a goal without
+        points, with a multi-DOF joint, or with an invalid tolerance.
+        """
+        trajectory = JointPath.from_message(message.trajectory)
+        _check_joints('joint_names', trajectory.joints, joints)
+        if trajectory.stops:
+            raise ParameterError('trajectory has no points; cancel a goal to stop its joints')
+        if message.multi_dof_trajectory.joint_names or message.multi_dof_trajectory.points:
+            raise ParameterError('multi_dof_trajectory must be empty')
+        return cls(
+            trajectory,
+            _tolerances('path_tolerance', message.path_tolerance, trajectory.joints),
+            _tolerances('goal_tolerance', message.goal_tolerance, trajectory.joints),
+            nanoseconds(message.goal_time_tolerance),
+        )
+
+    @property
+    def joints(self) -> frozenset[str]:
+        """Names of the moved joints."""
+        return frozenset(self.trajectory.joints)
+
+    def check(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> Outcome | None:
+        """Return the outcome at a sample with a stamp [ns], None while the goal is executed."""
+        joints = {name: followed[name] for name in self.trajectory.joints}
+        if not all(joint.reference.arrived for joint in joints.values()):
+            self.arrived = None
+            excess = _first_excess(self.path, joints)
+            return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess) if excess else None
+        if self.arrived is None:
+            self.arrived = stamp
+        excess = _first_excess(self.goal, joints)
+        if not excess:
+            return Outcome(ErrorCode.SUCCESSFUL, '')
+        if 0 < self.timeout < stamp - self.arrived:
+            return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, excess)
+        return None
+
+
+def outcome_of(answer: Acknowledgement, now: int) -> Outcome:
+    """Return the outcome of a goal whose request is refused at a time [ns]."""
+    is_old = is_stale(answer.stamp, now) and answer.stamp < now
+    if answer.verdict is Verdict.LATE or is_old:
+        return Outcome(ErrorCode.OLD_HEADER_TIMESTAMP, answer.reason)
+    return Outcome(ErrorCode.INVALID_GOAL, answer.reason)
+
+
+def _check_joints(field: str, names: Collection[str], valid: Collection[str]) -> None:
+    """Check that a field names some of the valid joints, each once."""
+    if not names or len({*names}) < len(names) or not {*names} <= {*valid}:
+        raise UnknownJointError(
+            f'{field} must be some of {", ".join(valid) or "no joint"}, each once, got '
+            f'{", ".join(names) or "none"}'
+        )
+
+
+def _tolerances(
+    field: str, messages: Iterable[Any], joints: Collection[str]
+) -> dict[str, Tolerance]:
+    """Convert tolerances of some of the joints."""
+    found = {one.name: Tolerance(one.position, one.velocity) for one in messages}
+    if found:
+        _check_joints(field, [one.name for one in messages], joints)
+    for name, tolerance in found.items():
+        if not all(isfinite(limit) and (limit >= 0.0 or limit == _ERASED) for limit in tolerance):
+            raise ParameterError(
+                f'{field} of {name} must be positive, 0 or {_ERASED:g}, got {list(tolerance)}'
+            )
+    return found
+
+
+def _first_excess(tolerances: Mapping[str, Tolerance], joints: Mapping[str, FollowedJoint]) -> str:
+    found = (tolerance.excess(name, joints[name]) for name, tolerance in tolerances.items())
+    return next(filter(None, found), '')
