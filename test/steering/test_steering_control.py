@@ -196,7 +196,8 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
         controller = MultiHypothesisLaw(model, (0.0, 0.0), LIMITS)
         controller.update((1e-4, 0.0), 0, noise)
         left.append(controller.expected(0).covariance[0, 0])
-    assert left[1] > 8.0 * left[0]
+    # 16 times the variance, and to both the same variance for a possible gross error.
+    assert left[1] > 5.0 * left[0]
     with pytest.raises(ParameterError, match=r'at must be in \[0, 0\], got 1'):
         controller.update((0.0, 0.0), 1)
 
