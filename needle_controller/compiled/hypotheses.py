@@ -385,7 +385,7 @@ def _detect_fault(
     gross[_MEASURED] += 1.0
     gross[_LAST_X], gross[_LAST_Z] = off.real, off.imag
     counts[GROSS] = counts[GROSS] + 1 if sound < 0.5 else 0
-    return gross[_EVIDENCE] >= _STOP_EVIDENCE or counts[GROSS] > MOST_MISSING
+    return bool(gross[_EVIDENCE] >= _STOP_EVIDENCE or counts[GROSS] > MOST_MISSING)
 
 
 @kernel
