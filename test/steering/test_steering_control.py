@@ -275,7 +275,7 @@ def test_transient_faults_are_tolerated(change: dict[int, Any]) -> None:
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
 
 
-@pytest.mark.requirement('S-242')
+@pytest.mark.requirement('S-250')
 @pytest.mark.parametrize('seed', range(6))
 def test_repeated_gross_errors_are_discounted(seed: int) -> None:
     """Each third measurement is displaced by 5 to 10 mm in the same direction."""
@@ -286,7 +286,7 @@ def test_repeated_gross_errors_are_discounted(seed: int) -> None:
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
 
 
-@pytest.mark.requirement('S-143', 'S-144', 'S-146', 'S-148', 'S-243')
+@pytest.mark.requirement('S-143', 'S-144', 'S-146', 'S-148', 'S-251')
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
