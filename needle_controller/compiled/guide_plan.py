@@ -131,16 +131,19 @@ def hit_probability(boxed: Boxed[Steering]) -> float:
     """Return the probability that the tip can reach the target within 1 mm."""
     c = boxed.value
     (middles, sizes, errors), w = _reachable(c), weights(c.logs)
-    along_x = along_z = 0.0
+    found = 0.0
     for i in range(len(w)):
         x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
+        along_x = along_z = 0.0
         for a in range(len(_WEIGHTS)):
             off = errors[i] * _ABSCISSAS[a]
             if abs(x + off) <= HIT + sizes[i].real:
-                along_x += w[i] * _WEIGHTS[a]
+                along_x += _WEIGHTS[a]
             if abs(z + off) <= HIT + sizes[i].imag:
-                along_z += w[i] * _WEIGHTS[a]
-    return along_x * along_z
+                along_z += _WEIGHTS[a]
+        # The planes are independent in a hypothesis only.
+        found += w[i] * along_x * along_z
+    return found
 
 
 @kernel

@@ -7,6 +7,29 @@ the guide, x + i z, and unknown constants :math:`\theta` with mean :math:`\bar\t
 covariance P. Its mean is :math:`a \cdot b + x \cdot \bar\theta`, its covariance with the constants
 :math:`s = P \bar x`, and its variance :math:`x \cdot s`; a tip measurement is an update of rank
 one. See `needle_controller.steering.laws.multi_hypothesis`.
+
+A tip measurement has a gross error with the probability :math:`\epsilon`. Its innovation e, with
+the variance v along each axis, has the likelihood
+
+.. math:: L = (1 - \epsilon) N(e; v) + \epsilon N(e; v + \sigma_g^2)
+
+and no gross error with the probability :math:`r = (1 - \epsilon) N(e; v) / L`. The constants then
+are a mixture: updated with probability r, unchanged otherwise. A normal distribution of the same
+mean and covariance replaces it ([BarShalom2011]_, section 3.4, for measurements with clutter):
+
+.. math:: \bar\theta + r \frac{s}{v} e, \quad
+   P - r \left( 1 - (1 - r) \frac{|e|^2}{2 v} \right) \frac{s \bar s^T}{v}
+
+The probability :math:`\epsilon` is the mean of a beta distribution of the measurements so far.
+
+A fault of the sensor is an offset that stays: the evidence is a cumulative sum of the logarithm of
+the likelihood ratio of this fault and of the mixture over all hypotheses [Page1954]_.
+
+References
+----------
+.. [BarShalom2011] Y. Bar-Shalom, P. K. Willett, X. Tian, "Tracking and Data Fusion", YBS, 2011.
+.. [Page1954] E. S. Page, "Continuous inspection schemes", Biometrika 41, 1954.
+
 """
 
 from __future__ import annotations
@@ -38,10 +61,24 @@ _BEVEL_RELEASE: Final = 0.03
 #: Index of the bevel load among the constants.
 BEVEL: Final = 3
 
-#: Gate on the squared innovation over its variance (exceeded by noise once in 3 million tip
-#: measurements), and number of successive measurements outside the gate of all hypotheses that is
-#: a fault.
-_GATE, _MOST_IMPLAUSIBLE = 30.0, 2
+#: Standard deviation of a gross error of a tip measurement along each axis [m]: organs below the
+#: diaphragm move by 5 to 10 mm.
+_GROSS: Final = 5e-3
+
+#: Prior of the probability of a gross error, a beta distribution: the number of gross errors, and
+#: of all measurements, with the same effect.
+_GROSS_PRIOR, _COUNT_PRIOR = 0.1, 20.0
+
+#: A sensor fault: standard deviation of its offset, and of the change of the offset from one
+#: measurement to the next along each axis [m].
+_FAULT, _FAULT_CHANGE = 0.03, 2e-4
+
+#: Largest increase of the evidence of a sensor fault by one measurement, and evidence that stops
+#: the needle: a single measurement never does.
+_MOST_EVIDENCE, _STOP_EVIDENCE = 8.0, 10.0
+
+#: Squared distance beyond which each measurement has a gross error [m^2].
+_FARTHEST: Final = 0.1**2
 
 #: Least logarithm of the weight of a hypothesis, relative to the largest; then it is discarded.
 _LEAST_LOG: Final = -30.0
@@ -53,8 +90,12 @@ MOST_SAME: Final = 2
 MOST_MISSING: Final = 6
 
 #: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
-#: implausible and missing measurements.
-STEP, TURNS, SAME, IMPLAUSIBLE, MISSING = range(5)
+#: gross and missing measurements.
+STEP, TURNS, SAME, GROSS, MISSING = range(5)
+
+#: Indices of `Steering.gross`: expected number of gross errors, number of measurements, evidence
+#: of a sensor fault, and the last innovation along x and z [m].
+_ERRORS, _MEASURED, _EVIDENCE, _LAST_X, _LAST_Z = range(5)
 
 #: Result of the check of a tip measurement.
 VALID, LOST, FROZEN, OUTLIER = range(4)
@@ -104,9 +145,12 @@ class Steering(NamedTuple):
     #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
     roll: Vector
     last: Vector  #: last tip measurement [m], shape (2,)
-    #: Tip measurements so far, remaining turns, successive equal, implausible and missing
-    #: measurements, shape (5,).
+    #: Tip measurements so far, remaining turns, successive equal, gross and missing measurements,
+    #: shape (5,).
     counts: IntVector
+    #: Expected number of gross errors, number of measurements, evidence of a sensor fault, and the
+    #: last innovation along x and z [m], shape (5,).
+    gross: Vector
 
 
 class TipDistribution(NamedTuple):
@@ -235,28 +279,23 @@ def update(
     """
     c = boxed.value
     tip, w = tip_distribution(c, at, _guide_at_rest(c), 1.0), weights(c.logs)
-    predicted = _moments(w, tip)
     for i in range(len(w)):
         tip.variances[i] += variance
-    kind, counts = _check(c, complex(x, z), tip)
-    if counts:
-        largest = -inf
-        for i in range(len(w)):
-            if c.logs[i] > -inf:
-                _update_hypothesis(
-                    c, i, complex(x, z) - tip.means[i], tip.variances[i], tip.shared[i]
-                )
-                largest = max(largest, c.logs[i])
-        for i in range(len(w)):
-            if c.logs[i] < largest + _LEAST_LOG:
-                c.logs[i] = -inf
-    return kind, x - predicted.x, z - predicted.z
+    predicted = _moments(w, tip)
+    kind, used = _check_sensor(c, x, z)
+    off = complex(x - predicted.x, z - predicted.z)
+    if used:
+        sound, likelihood = _update_hypotheses(c, w, tip, complex(x, z))
+        spread = 0.5 * (predicted.xx + predicted.zz)
+        if _detect_fault(c, off, spread, sound, likelihood):
+            kind = OUTLIER
+    return kind, off.real, off.imag
 
 
 @inlined
-def _check(c: Steering, measured: complex, tip: TipDistribution) -> tuple[int, bool]:
-    """Check a tip measurement; return its kind and whether the update uses it."""
-    counts, x, z = c.counts, measured.real, measured.imag
+def _check_sensor(c: Steering, x: float, z: float) -> tuple[int, bool]:
+    """Count missing and equal tip measurements; return the kind and whether the update uses it."""
+    counts = c.counts
     if not (isfinite(x) and isfinite(z)):
         counts[MISSING] += 1
         return (LOST if counts[MISSING] > MOST_MISSING else VALID), False
@@ -264,30 +303,89 @@ def _check(c: Steering, measured: complex, tip: TipDistribution) -> tuple[int, b
     same = x == c.last[0] and z == c.last[1]
     counts[SAME] = counts[SAME] + 1 if same else 0
     c.last[0], c.last[1] = x, z
-    if same:
-        return (FROZEN if counts[SAME] >= MOST_SAME else VALID), False
-    for i in range(len(c.logs)):
-        off = measured - tip.means[i]
-        # False for an infinite distance and for nan.
-        if c.logs[i] > -inf and off.real**2 + off.imag**2 <= _GATE * tip.variances[i]:
-            counts[IMPLAUSIBLE] = 0
-            return VALID, True
-    counts[IMPLAUSIBLE] += 1
-    return (OUTLIER if counts[IMPLAUSIBLE] >= _MOST_IMPLAUSIBLE else VALID), False
+    return (FROZEN if counts[SAME] >= MOST_SAME else VALID), not same
+
+
+@inlined
+def _log_density(off: complex, variance: float) -> float:
+    """Return the logarithm of a normal density in both planes, up to a constant."""
+    # Finite also for a measurement whose square is not.
+    return -0.5 * min(off.real**2 + off.imag**2, _FARTHEST) / variance - log(variance)
+
+
+@compiled
+def _update_hypotheses(
+    c: Steering, w: FloatArray, tip: TipDistribution, measured: complex
+) -> tuple[float, float]:
+    """
+    Update all hypotheses and their weights with a tip measurement [m].
+
+    ``tip`` is the distribution of the measured tip with the noise of the measurement. Returns the
+    probability that the measurement has no gross error, and the logarithm of its likelihood.
+    """
+    share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.gross[_MEASURED])
+    likely, sounds, largest = np.full(len(w), -inf), np.zeros(len(w)), -inf
+    for i in range(len(w)):
+        if c.logs[i] == -inf:
+            continue
+        off, variance = measured - tip.means[i], tip.variances[i]
+        normal = log(1.0 - share) + _log_density(off, variance)
+        gross = log(share) + _log_density(off, variance + _GROSS**2)
+        likely[i] = max(normal, gross) + log(1.0 + exp(-abs(normal - gross)))
+        largest = max(largest, likely[i])
+        # False for an infinite distance.
+        if off.real**2 + off.imag**2 < _FARTHEST:
+            sounds[i] = exp(normal - likely[i])
+            _update_hypothesis(c, i, off, variance, tip.shared[i], sounds[i])
+    whole, sound, most = 0.0, 0.0, -inf
+    for i in range(len(w)):
+        part = w[i] * exp(likely[i] - largest)
+        whole += part
+        sound += part * sounds[i]
+        c.logs[i] += likely[i]
+        most = max(most, c.logs[i])
+    for i in range(len(w)):
+        if c.logs[i] < most + _LEAST_LOG:
+            c.logs[i] = -inf
+    return sound / whole, largest + log(whole)
 
 
 @inlined
 def _update_hypothesis(
-    c: Steering, i: int, off: complex, variance: float, shared: ComplexArray
+    c: Steering, i: int, off: complex, variance: float, shared: ComplexArray, sound: float
 ) -> None:
-    """Update a hypothesis and its weight with the innovation of a tip measurement [m]."""
+    """Update a hypothesis with an innovation [m] that has no gross error with a probability."""
+    # Mean and covariance of the mixture of the constants with and without the measurement.
+    squared = 0.5 * (off.real**2 + off.imag**2)
+    learned = sound * (1.0 - (1.0 - sound) * squared / variance)
     for j in range(len(shared)):
         gain = shared[j] / variance
-        c.mean[i, j] += gain * off
+        c.mean[i, j] += sound * gain * off
         to = c.covariance[i, j]
         for k in range(len(shared)):
-            to[k] -= gain * shared[k].conjugate()
-    c.logs[i] -= 0.5 * (off.real**2 + off.imag**2) / variance + log(variance)
+            to[k] -= learned * gain * shared[k].conjugate()
+
+
+@inlined
+def _detect_fault(
+    c: Steering, off: complex, variance: float, sound: float, likelihood: float
+) -> bool:
+    """Return whether innovations [m] are gross for too long, or are the offset of a fault."""
+    counts, gross = c.counts, c.gross
+    if counts[GROSS] > 0:
+        change = off - complex(gross[_LAST_X], gross[_LAST_Z])
+        faulty = _log_density(change, variance + _FAULT_CHANGE**2)
+    else:
+        faulty = -inf
+    # A fault may begin with any measurement.
+    faulty = max(faulty, _log_density(off, _FAULT**2))
+    found = gross[_EVIDENCE] + min(faulty - likelihood, _MOST_EVIDENCE)
+    gross[_EVIDENCE] = max(0.0, found)
+    gross[_ERRORS] += 1.0 - sound
+    gross[_MEASURED] += 1.0
+    gross[_LAST_X], gross[_LAST_Z] = off.real, off.imag
+    counts[GROSS] = counts[GROSS] + 1 if sound < 0.5 else 0
+    return bool(gross[_EVIDENCE] >= _STOP_EVIDENCE or counts[GROSS] > MOST_MISSING)
 
 
 @kernel

@@ -4,8 +4,8 @@ Steering law for all hypotheses: bring the tip to a target by guide and roll, on
 
 **Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its
 constants by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses
-together are a mixture of normal distributions. A measurement is implausible if it is outside the
-gate of every hypothesis.
+together are a mixture of normal distributions. A measurement may have a gross error, such as
+breathing, with a probability that is learned: see `needle_controller.compiled.hypotheses`.
 
 **Control.** In a hypothesis the final position of the tip is
 
@@ -172,18 +172,24 @@ class MultiHypothesisLaw(SteeringLaw):
             roll=np.full(points + 1, roll),
             last=np.full(2, nan),
             counts=np.array([0, turns, 0, 0, 0]),
+            gross=np.zeros(5),
         )
         self._boxed = Boxed(self._now)
+        #: Probability of a hit after the last change of the state; None if not computed yet.
+        self._hit_probability: float | None = None
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
         new = checked_target(target)
         before = self.target
-        self._now.target[:] = new
+        self._set_target(new)
         if self.hit_probability < _REFUSED:
             error = OutOfReachError(self._unreachable(), self.reach)
-            self._now.target[:] = before
+            self._set_target(before)
             raise error
+
+    def _set_target(self, target: FloatArray) -> None:
+        self._now.target[:], self._hit_probability = target, None
 
     # Estimates.
 
@@ -234,7 +240,9 @@ class MultiHypothesisLaw(SteeringLaw):
     @property
     def hit_probability(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
-        return hit_probability(self._boxed)
+        if self._hit_probability is None:
+            self._hit_probability = hit_probability(self._boxed)
+        return self._hit_probability
 
     @property
     def reach(self) -> Reach:
@@ -276,6 +284,7 @@ class MultiHypothesisLaw(SteeringLaw):
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
         x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
+        self._hit_probability = None
         kind, off_x, off_z = update(self._boxed, at, x, z, variance)
         if kind == VALID:
             return
@@ -292,6 +301,7 @@ class MultiHypothesisLaw(SteeringLaw):
 
     def plan(self) -> GuideSetpoint:
         now, k, last = self._now, self.step, self._model.steps - 1
+        self._hit_probability = None
         if k <= last:
             now.guide[k] = self._choose()
         advance(self._boxed)
