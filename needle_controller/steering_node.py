@@ -38,6 +38,7 @@ from needle_ros.status import Diagnosis, node_of, SteeringStatus
 from needle_ros.system_state import Authority
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.trajectory_client_node import TrajectoryClient
 from needle_ros.wire import Reading
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
@@ -48,6 +49,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _WATCH = 0.05
+
+#: Parameter with the action of a robot.
+_ACTION = 'trajectory_action'
 
 #: Longest time until a motion is acknowledged, in lock-step.
 _ARRIVAL = Delay(seconds=1.0)
@@ -96,6 +100,12 @@ class SteeringNode(CompiledNode):
         self.declare_text(
             'law', DEFAULT_LAW, f'steering law: one of {", ".join(STEERING_LAWS)}, or module:Class'
         )
+        self.declare_text(
+            _ACTION,
+            '',
+            'action follow_joint_trajectory of a robot that moves needle and guide, such as '
+            '/arm/follow_joint_trajectory; empty: the topic joint_trajectory',
+        )
         # Fixed at start: it determines the other defaults.
         self.declare_parameter(
             'needle',
@@ -109,6 +119,8 @@ class SteeringNode(CompiledNode):
             self.declare_settings(prefix, defaults_of(prefix, needle), names)
 
         self._loop: SteeringExecutive | None = None
+        #: Sends the motions to the action of a robot.
+        self._client: TrajectoryClient | None = None
         self._file = RecordFile(self.get_fully_qualified_name(), self.context.get_domain_id())
         #: Record before a restart and the source of its measurements, until they are compared.
         self._before: tuple[SteeringRecord, str] | None = None
@@ -145,6 +157,8 @@ class SteeringNode(CompiledNode):
         self._loop = SteeringExecutive(needle, steering, prior, settings, start=ThreadJob, law=law)
         self._loop.authority = self._authority
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
+        if action := self.text(_ACTION):
+            self._client = TrajectoryClient(self, action, self._hear)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
         self._tip_expected = self.publisher(contract.TIP_EXPECTED)
         self._record = self.publisher(contract.INSERTION_RECORD)
@@ -163,6 +177,9 @@ class SteeringNode(CompiledNode):
     def cleanup(self) -> None:
         """Discard the steering executive."""
         self._loop = self._told = self._before = None
+        if self._client is not None:
+            self._client.destroy()
+            self._client = None
 
     def activate(self) -> None:
         """Start to process measurements, and to check for missing inputs."""
@@ -186,7 +203,7 @@ class SteeringNode(CompiledNode):
             f'law {values["law"]}, needle {values["needle"]}, steps of '
             f'{1e3 * values["step_length"]:g} mm; takes {contract.TARGET.name}, '
             f'{contract.JOINT_STATES.name} and {contract.TIP_DEFLECTION.name}, publishes '
-            f'{contract.JOINT_TRAJECTORY.name} and {contract.TIP_EXPECTED.name}'
+            f'{values[_ACTION] or contract.JOINT_TRAJECTORY.name} and {contract.TIP_EXPECTED.name}'
         )
 
     # Inputs.
@@ -237,14 +254,17 @@ class SteeringNode(CompiledNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Pass other nodes' answers to motions to the executive."""
-        if self._loop is None or not self.is_active:
-            return
         for status in message.status:
             values = {one.key: one.value for one in status.values}
             answers = RequestStatus.from_values(values)
             if answers.takes:
                 node = printable(node_of(status.name).rpartition('/')[2])
-                self._act(self._loop.hear(node, answers, self.now()))
+                self._hear(node, answers)
+
+    def _hear(self, receiver: str, answers: RequestStatus) -> None:
+        """Process the answers of a receiver of the motions."""
+        if self._loop is not None and self.is_active:
+            self._act(self._loop.hear(receiver, answers, self.now()))
 
     def _on_request(self, word: str) -> tuple[bool, str]:
         if self._loop is None:
@@ -309,8 +329,12 @@ class SteeringNode(CompiledNode):
         if record is not None:
             self._keep(record)
         if move is not None:
-            self._trajectory.publish(self._message(move))
-            self._moved = True
+            message = self._message(move)
+            if self._client is not None:
+                self._client.send(message)
+            else:
+                self._trajectory.publish(message)
+                self._moved = True
         self._system.publish()
         if loop.expected is not self._told:
             self._told = loop.expected
