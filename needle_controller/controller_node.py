@@ -204,7 +204,8 @@ class ControllerNode(ModelNode):
             self._supervisor.requests,
             (contract.INSERTION,),
             self._follow,
-            lambda _joints, reason: self._supervisor.hold(reason),
+            lambda _joints: self._supervisor.hold(),
+            lambda _joints, reason: self._supervisor.discard(reason),
             self.now,
         )
 

@@ -187,9 +187,12 @@ class Supervisor(StateMachine[ForceCommand]):
             self._execute_request(stamp + 1)
         return answer
 
-    def hold(self, reason: str) -> None:
-        """Brake and hold, for a reason."""
+    def discard(self, reason: str) -> None:
+        """Discard the requests that await their start, for a reason."""
         self._waiting.discard(reason, (INSERTION,))
+
+    def hold(self) -> None:
+        """Brake and hold."""
         if self.controller is not None:
             self.controller.stop_motion()
 

@@ -48,7 +48,13 @@ class PlantTrajectories:
         if self.received:
             node.subscribe(topic, self._on_trajectory)
             self._action = TrajectoryAction(
-                node, self.requests, self._moved, self._follow, self._hold, simulated
+                node,
+                self.requests,
+                self._moved,
+                self._follow,
+                self._hold,
+                self._discard,
+                simulated,
             )
 
     def begin(self) -> None:
@@ -73,9 +79,11 @@ class PlantTrajectories:
         """End the goals of joints that something else moves."""
         self.requests.end(reason, joints)
 
-    def _hold(self, joints: Collection[str], reason: str) -> None:
-        """Hold joints now, also while no sample is taken."""
+    def _discard(self, joints: Collection[str], reason: str) -> None:
         self._waiting.discard(reason, joints)
+
+    def _hold(self, joints: Collection[str]) -> None:
+        """Hold joints now, also while no sample is taken."""
         self._run.hold([name for name in self._moved if name in joints])
 
     def sample(self, stamp: int) -> None:

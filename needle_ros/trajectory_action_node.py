@@ -74,7 +74,9 @@ class TrajectoryAction:
     request : callable
         Takes a trajectory with stamp [ns] and frame, as if it arrived on the topic.
     hold : callable
-        Holds joints at once, for a reason.
+        Holds joints at once.
+    discard : callable
+        Discards the requests of joints that await their start, for a reason.
     now : callable
         Returns the time of the stamps [ns].
 
@@ -86,11 +88,12 @@ class TrajectoryAction:
         requests: RequestLog,
         joints: Collection[str],
         request: Callable[[int, str, JointPath], None],
-        hold: Callable[[Collection[str], str], None],
+        hold: Callable[[Collection[str]], None],
+        discard: Callable[[Collection[str], str], None],
         now: Callable[[], int],
     ) -> None:
         self._node, self._requests, self._joints = node, requests, joints
-        self._request, self._hold, self._now = request, hold, now
+        self._request, self._hold, self._discard, self._now = request, hold, discard, now
         self._server: _GoalServer | None = None
         #: Goals in execution, by their stamps [ns].
         self._running: dict[int, _Execution] = {}
@@ -159,11 +162,11 @@ class TrajectoryAction:
             return
         del self._running[goal.stamp]
         if goal.moves:
-            self._hold(goal.joints - {*moved}, answer.reason)
+            self._hold(goal.joints - {*moved})
         self._finish(execution.handle, outcome_of(answer, self._now()))
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Hold the joints of a goal; its result follows when rclpy has changed its state."""
+        """End the motion of a goal; its result follows when rclpy has changed its state."""
         for execution in [*self._running.values()]:
             if execution.handle == handle:
                 self._end(execution, 'the goal was canceled')
@@ -178,12 +181,15 @@ class TrajectoryAction:
             self._finish(handle, Outcome(ErrorCode.SUCCESSFUL, 'the goal was canceled'))
 
     def _end(self, execution: _Execution, reason: str) -> None:
-        """End the execution of a goal, and hold its joints if there is a reason."""
+        """End the execution of a goal; with a reason, also its motion."""
         goal = execution.goal
         self._requests.unwatch(JOINT_TRAJECTORY, goal.stamp)
         del self._running[goal.stamp]
-        if reason:
-            self._hold(goal.joints, reason)
+        if reason and goal.moves:
+            self._hold(goal.joints)
+        elif reason:
+            # The joints follow something else until its start.
+            self._discard(goal.joints, reason)
 
     def update(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> None:
         """Check the goals in execution at a sample with a stamp [ns], and publish feedback."""

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from needle_ros.errors import ParameterError
 from needle_ros.requests import Acknowledgement, is_stale, Verdict
-from needle_ros.timing import nanoseconds
+from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import FollowedJoint, JointPath
 
 #: Value of a tolerance that disables its check, as 0 does.
@@ -65,8 +65,9 @@ class TrajectoryGoal:
     A goal with its tolerances by joint, for the joints of a receiver.
 
     It succeeds when the references of all joints have arrived and the joints are within
-    ``goal``. From the arrival on, this may take ``timeout`` [ns], or any time if it is 0.
-    Until then the joints must be within ``path`` of their references.
+    ``goal``. This may take ``timeout`` [ns] from the time of the last point on, as for
+    joint_trajectory_controller, or any time if it is 0. Until the references have arrived, the
+    joints must be within ``path`` of them.
     """
 
     trajectory: JointPath
@@ -77,8 +78,6 @@ class TrajectoryGoal:
     stamp: int = 0
     #: Whether its motion has begun.
     moves: bool = False
-    #: Time at which all references had arrived [ns].
-    arrived: int | None = None
 
     @classmethod
     def from_message(cls, message: Any, joints: Collection[str]) -> TrajectoryGoal:
@@ -109,17 +108,17 @@ class TrajectoryGoal:
     def check(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> Outcome | None:
         """Return the outcome at a sample with a stamp [ns], None while the goal is executed."""
         joints = {name: followed[name] for name in self.trajectory.joints}
-        if not all(joint.reference.arrived for joint in joints.values()):
-            self.arrived = None
-            excess = _first_excess(self.path, joints)
-            return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess) if excess else None
-        if self.arrived is None:
-            self.arrived = stamp
-        excess = _first_excess(self.goal, joints)
-        if not excess:
+        waits = [name for name, joint in joints.items() if not joint.reference.arrived]
+        excess = _first_excess(self.path if waits else self.goal, joints)
+        if waits and excess:
+            return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess)
+        if not waits and not excess:
             return Outcome(ErrorCode.SUCCESSFUL, '')
-        if 0 < self.timeout < stamp - self.arrived:
-            return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, excess)
+        late = stamp - self.stamp - round(self.trajectory.times[-1] * NANOSECONDS)
+        if 0 < self.timeout < late:
+            reason = excess or f'the reference of {waits[0]} has not arrived'
+            late_by = f'{late / NANOSECONDS:.3f} s after the last point'
+            return Outcome(ErrorCode.GOAL_TOLERANCE_VIOLATED, f'{reason}, {late_by}')
         return None
 
 
