@@ -257,7 +257,8 @@ class SteeringNode(CompiledNode):
         for status in message.status:
             values = {one.key: one.value for one in status.values}
             answers = RequestStatus.from_values(values)
-            if answers.takes:
+            # With an action, receivers of the topic take none of the motions.
+            if answers.takes and self._client is None:
                 node = printable(node_of(status.name).rpartition('/')[2])
                 self._hear(node, answers)
 

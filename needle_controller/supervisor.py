@@ -394,7 +394,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self.events.last_rejection = command.notice
             self.events.add(Severity.ERROR, command.notice)
             if controller.target is None:
-                self.requests.end(command.notice)
+                self._waiting.end(command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         force, depth = self._last.force, measured.depth

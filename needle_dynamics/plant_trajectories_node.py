@@ -44,6 +44,8 @@ class PlantTrajectories:
         self._sampled, self._period = 0, round(NANOSECONDS / constants.own.rate)
         self.rejected = 0
         self.stopped = ''
+        #: Error of the plant, after which it takes no sample; '' without one.
+        self._halted = ''
         self._action: TrajectoryAction | None = None
         if self.received:
             node.subscribe(topic, self._on_trajectory)
@@ -58,8 +60,8 @@ class PlantTrajectories:
             )
 
     def begin(self) -> None:
-        """Await the first sample of an active plant."""
-        self._sampled = 0
+        """Await the first sample of a plant that is active, or was reset."""
+        self._sampled, self._halted = 0, ''
 
     def destroy(self) -> None:
         """End all goals, and destroy the action."""
@@ -71,12 +73,14 @@ class PlantTrajectories:
         self._waiting.end(reason, Verdict.SUPERSEDED)
 
     def halt(self, reason: str) -> None:
-        """Discard all trajectories of a plant that cannot move, nor hold."""
+        """Discard all trajectories of a plant that cannot move, nor hold, until a reset."""
+        self._halted = reason
         self.requests.end(reason, self._moved)
         self.end(reason)
 
     def displace(self, reason: str, joints: Collection[str]) -> None:
-        """End the goals of joints that something else moves."""
+        """Discard the trajectories of joints that something else moves."""
+        self._discard(joints, reason)
         self.requests.end(reason, joints)
 
     def _discard(self, joints: Collection[str], reason: str) -> None:
@@ -107,20 +111,21 @@ class PlantTrajectories:
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         """Execute a trajectory if it is new and valid, or let it wait, and acknowledge it."""
-        self._follow(nanoseconds(message.header.stamp), '', JointPath.from_message(message))
+        self._follow(nanoseconds(message.header.stamp), JointPath.from_message(message))
 
-    def _follow(self, stamp: int, frame: str, path: JointPath) -> None:
+    def _follow(self, stamp: int, path: JointPath) -> None:
         topic = contract.JOINT_TRAJECTORY
         # In mode `simulation`, `insertion` is addressed to the controller.
         moved = tuple(name for name in path.joints or self._moved if name in self._moved)
         now = self._simulated() if self._node.is_active else stamp
-        known = self.requests.check(topic, stamp, now, frame, moved)
+        known = self.requests.check(topic, stamp, now, joints=moved)
         if known is not None:
             if known.verdict in (Verdict.REJECTED, Verdict.LATE):
                 self._reject(known.reason)
-        elif self.stopped:
+        elif self.stopped or self._halted:
             # A stop of the node `steering` is not an error of its sender.
-            self.requests.answer(topic, stamp, Verdict.SUPERSEDED, self.stopped)
+            verdict = Verdict.SUPERSEDED if self.stopped else Verdict.REJECTED
+            self.requests.answer(topic, stamp, verdict, self.stopped or self._halted)
         else:
             # Not active, or before the first sample.
             self._sampled = self._sampled if self._node.is_active and self._sampled else now

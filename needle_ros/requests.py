@@ -223,7 +223,8 @@ class RequestLog:
                 del self._watched[topic.name, stamp]
             watched.tell(made, ())
         if verdict is Verdict.ACCEPTED:
-            self.end(f'a newer {topic.name} is followed', {*joints}, besides=stamp)
+            newer = f'a newer {topic.name} is followed'
+            self.end(newer, {*joints}, besides=(topic.name, stamp))
         return made
 
     def watch(self, topic: Topic, stamp: int, joints: Iterable[str], tell: Listener) -> int:
@@ -232,7 +233,7 @@ class RequestLog:
 
         Returns the stamp [ns] of the request, made unique.
         """
-        while (topic.name, stamp) in self._answers:
+        while {(topic.name, stamp)} & (self._answers.keys() | self._watched.keys()):
             stamp += 1
         self._watched[topic.name, stamp] = _Watched(frozenset(joints), tell)
         return stamp
@@ -242,16 +243,22 @@ class RequestLog:
         self._watched.pop((topic.name, stamp), None)
 
     def end(
-        self, reason: str, moved: Collection[str] | None = None, *, besides: int | None = None
+        self,
+        reason: str,
+        moved: Collection[str] | None = None,
+        *,
+        besides: tuple[str, int] | None = None,
     ) -> None:
         """
-        Report the end of the watched requests, except for one stamp [ns].
+        Report the end of the watched requests, except for one by topic and stamp [ns].
 
         ``moved`` are the joints that something else moves from now on: only requests of one of
         them end. Without it all requests end.
         """
         for key, watched in [*self._watched.items()]:
-            if key[1] != besides and (moved is None or watched.joints & {*moved}):
+            concerned = moved is None or watched.joints & {*moved}
+            # A report may end other requests.
+            if key != besides and concerned and key in self._watched:
                 del self._watched[key]
                 ended = Acknowledgement(*key, Verdict.SUPERSEDED, printable(reason))
                 watched.tell(ended, moved or ())

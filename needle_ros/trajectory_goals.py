@@ -124,7 +124,8 @@ class TrajectoryGoal:
 
 def outcome_of(answer: Acknowledgement, now: int) -> Outcome:
     """Return the outcome of a goal whose request is refused at a time [ns]."""
-    is_old = is_stale(answer.stamp, now) and answer.stamp < now
+    rejected = answer.verdict is Verdict.REJECTED
+    is_old = rejected and is_stale(answer.stamp, now) and answer.stamp < now
     if answer.verdict is Verdict.LATE or is_old:
         return Outcome(ErrorCode.OLD_HEADER_TIMESTAMP, answer.reason)
     return Outcome(ErrorCode.INVALID_GOAL, answer.reason)

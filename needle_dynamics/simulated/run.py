@@ -177,6 +177,7 @@ class PlantRun:
             self.plant.tare()
         elif event.kind == RESET:
             self.plant = self.constants.make()
+            self._measured = []
             self.commands.forget()
             self._joint_commands.forget()
         self._events.append(event)
