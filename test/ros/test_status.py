@@ -19,6 +19,7 @@ from needle_ros.status import (
     ControllerPhase,
     ControllerStatus,
     InputStatus,
+    node_of,
     NodeStatus,
     PlantStatus,
     read_status,
@@ -184,3 +185,10 @@ def test_readers_use_the_dataclasses() -> None:
         if key in keys and path != Path(__file__).resolve()
     ]
     assert not broken, '\n'.join(broken)
+
+
+def test_statuses_of_other_nodes_keep_their_task() -> None:
+    """A node may report several tasks; an error of one must not hide behind another."""
+    names = ['/plant', '/plant: state', 'manager: activity', 'manager: hardware', 'a: b: state']
+    nodes = ['/plant', '/plant', 'manager: activity', 'manager: hardware', 'a: b']
+    assert [*map(node_of, names)] == nodes
