@@ -79,7 +79,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
         self.controller = controller
-        self._following = ResponseMonitor(controller.parameters, 0.5 * controller.settings.jump)
+        jump, longest = controller.settings.jump, controller.longest
+        self._following = ResponseMonitor(controller.parameters, 0.5 * jump, longest)
         self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
         self._robot = robot
         noise = {} if observed is None else observed.sensor_noise
@@ -398,7 +399,8 @@ class Supervisor(StateMachine[ForceCommand]):
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         force, depth = self._last.force, measured.depth
-        lost = self._following.update(stamp, depth, aim.velocity, force, measured.force)
+        load, following = self.bending.load, self._following
+        lost = following.update(stamp, depth, aim.velocity, force, measured.force, load)
         stopped = self._stop_for(safety.guard.tracking(error[0]) or self._following.fault, stamp)
         if stopped is not None:
             return stopped
@@ -413,7 +415,16 @@ class Supervisor(StateMachine[ForceCommand]):
         elif self.fault is not None:
             self.fault = None
             self.events.add(Severity.INFO, kind='recovery')
-        force, torque, limits = command.force, command.torque, controller.settings
+        if following.relaxed and not controller.relaxed:
+            self._warn(
+                'rest',
+                f'the encoders do not respond to {force:.3g} N at rest: they are frozen, or friction '
+                f'holds the needle {1e3 * abs(error[0]):.3g} mm from its target; no force until the '
+                'next motion',
+            )
+        controller.relaxed = following.relaxed
+        force = 0.0 if controller.relaxed else command.force
+        torque, limits = command.torque, controller.settings
         self._warn('buckling', buckling_warning(controller.parameters, depth, force))
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
