@@ -69,6 +69,8 @@ class Loop:
 
     Attributes
     ----------
+    rate : float
+        Rate of the measurements [Hz].
     now : int
         Time [ns].
     publishers : dict
@@ -98,7 +100,7 @@ class Loop:
         }
         own = {'needle': needle, 'rate': rate, 'depth': 0.02, 'seed': seed}
         self.run = PlantRun({**own, **true, **(plant or {})})
-        self.now, self._period = EPOCH, round(NANOSECONDS / rate)
+        self.rate, self.now, self._period = rate, EPOCH, round(NANOSECONDS / rate)
         self.publishers = {'wrench_command': 1}
         self.supervisor = Supervisor(lambda: self.now / NANOSECONDS)
         controller = Controller(nominal, law, settings=ControllerSettings(rate=rate), **options)

@@ -84,6 +84,11 @@ class ControllerSettings(CheckedSettings):
         open_low=True,
     )  # fmt: skip
 
+    @property
+    def longest_gap(self) -> float:
+        """Longest time between two measurements that can be compared [s]."""
+        return self.measurement_timeout + 1.0 / self.rate
+
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
         """
         Return the least and largest insertion depth to control [m].
@@ -215,9 +220,7 @@ class Controller:
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
-        #: Longest time between two measurements that can be compared [s].
-        self.longest = settings.measurement_timeout + self.period
-        self._displacement = DisplacementMonitor(settings.jump, self.longest)
+        self._displacement = DisplacementMonitor(settings.jump, settings.longest_gap)
         self._last_depth: float | None = None
         #: Whether the insertion force is zero although there is a target.
         self.relaxed = False

@@ -6,6 +6,7 @@ from __future__ import annotations
 from math import copysign, isnan
 from typing import Final, NamedTuple
 
+from needle_controller.controller import ControllerSettings
 from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
@@ -44,9 +45,9 @@ class StallMonitor:
     While the reference moves, the expected displacement is the least one, with friction stronger
     than the nominal one, and the lack of motion is a fault. While the reference rests, it is the
     largest one, with friction weaker than in the last motion: stronger friction may hold the
-    needle, so this is no fault, but ``relaxed`` is True: no force may act until the reference moves,
-    or the encoders do. In the latter case a load has moved the needle, and the force that held it
-    is expected to move nothing.
+    needle, so this is no fault, but ``relaxed`` is True: no force may act until the reference
+    moves, or the encoders do. In the latter case a load has moved the needle, and the force that
+    held it is expected to move nothing.
     """
 
     def __init__(self, axis: Axis, most: float, longest: float) -> None:
@@ -58,6 +59,8 @@ class StallMonitor:
         self.relaxed = False
         self._stamp: int | None = None
         self._begin(0.0)
+        #: Message at the measurement where ``relaxed`` begins.
+        self.notice: str | None = None
         #: Force that holds the needle against an unknown load while the reference rests [N].
         self._holding = 0.0
         self._learn()
@@ -106,7 +109,7 @@ class StallMonitor:
 
         Returns the fault, or None.
         """
-        before, self._stamp = self._stamp, stamp
+        before, self._stamp, self.notice = self._stamp, stamp, None
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
         if not 0.0 < elapsed <= self._longest:
             elapsed = 0.0
@@ -145,6 +148,10 @@ class StallMonitor:
         if rate == 0.0:
             self.relaxed = True
             self._holding += force
+            self.notice = (
+                f'the encoders do not respond to {force:.3g} N at rest; they are frozen, or '
+                'friction holds the needle: no force until the next motion'
+            )
             return None
         return (
             f'the encoders do not move: {1e3 * abs(moved):.3g} mm measured, more than '
@@ -160,10 +167,11 @@ class ResponseMonitor:
     A plant does not follow if it reports almost no force while a force is commanded, and the
     needle rests while its reference moves. It follows again as soon as one of these conditions
     ends. A robot that reports no force is not checked. ``lost`` is whether the plant does not
-    follow. See `StallMonitor` for ``fault``, ``relaxed``, ``most`` and ``longest``.
+    follow. See `StallMonitor` for ``fault`` and ``relaxed``; ``notice`` is a message for the user.
     """
 
-    def __init__(self, parameters: NeedleParameters, most: float, longest: float) -> None:
+    def __init__(self, parameters: NeedleParameters, settings: ControllerSettings) -> None:
+        most, longest = 0.5 * settings.jump, settings.longest_gap
         self._stall = StallMonitor(Axis.insertion(parameters), most, longest)
         self.forget()
 
@@ -175,6 +183,7 @@ class ResponseMonitor:
         """Reset to a plant that follows."""
         self.lost = False
         self.fault: str | None = None
+        self.notice: str | None = None
         self._mark: _Mark | None = None
         self._stall.forget()
 
@@ -201,19 +210,33 @@ class ResponseMonitor:
         """
         applied = commanded if isnan(reported) else reported
         self.fault = self._stall.update(stamp, depth, rate, applied, load)
+        self.lost = self._follows_not(stamp, depth, rate, commanded, reported)
+        self.notice = self._stall.notice
+        if self.lost:
+            self.notice = (
+                f'the plant does not follow: it reports {reported:.3g} N, {commanded:.3g} N is '
+                'commanded'
+            )
+        return self.lost
+
+    def _follows_not(
+        self, stamp: int, depth: float, rate: float, commanded: float, reported: float
+    ) -> bool:
+        """Return whether the plant does not follow."""
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
-            self.lost, self._mark = False, None
+            self._mark = None
             return False
         if self._mark is None:
             self._mark = _Mark(stamp, depth)
         mark = self._mark
         elapsed = min(stamp - mark.stamp, _PATIENCE) / NANOSECONDS
         moved = abs(depth - mark.depth) > _NOTHING * abs(rate) * elapsed
-        if self.lost and moved:
-            self.lost, self._mark = False, None
-        elif not self.lost and stamp - mark.stamp > _PATIENCE:
-            self.lost = not moved and rate != 0.0
-            if not self.lost:
+        lost = self.lost
+        if lost and moved:
+            lost, self._mark = False, None
+        elif not lost and stamp - mark.stamp > _PATIENCE:
+            lost = not moved and rate != 0.0
+            if not lost:
                 self._mark = None
-        return self.lost
+        return lost
