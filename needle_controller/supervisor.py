@@ -398,8 +398,8 @@ class Supervisor(StateMachine[ForceCommand]):
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         following, depth, load = self._following, measured.depth, self.bending.load
-        force = self._last.force, measured.force
-        lost = following.update(stamp, depth, aim.velocity, *force, load)
+        forces = self._last.force, measured.force
+        lost = following.update(stamp, depth, aim.velocity, *forces, load)
         stopped = self._stop_for(safety.guard.tracking(error[0]) or following.fault, stamp)
         if stopped is not None:
             return stopped

@@ -125,7 +125,9 @@ class StallMonitor:
         factor, axis = _STRONGER, self.axis
         if rate == 0.0:
             factor = _WEAKER * self._friction
-        force -= load + self._holding
+        force -= load
+        # The load may need any part of the force that held it.
+        force -= min(max(force, min(self._holding, 0.0)), max(self._holding, 0.0))
         if force < 0.0:
             factor *= axis.withdrawal
         push = abs(force) - factor * axis.coulomb
