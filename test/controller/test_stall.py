@@ -98,7 +98,7 @@ def test_encoders_frozen_at_any_moment_end_the_motion(law: str, begin: float) ->
     assert last < 1e-6
 
 
-@pytest.mark.requirement('S-260')
+@pytest.mark.requirement('S-263')
 @pytest.mark.parametrize('law', LAWS)
 def test_motion_after_encoders_froze_at_rest_is_stopped(law: str) -> None:
     """The next motion is stopped within the same distance."""
