@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from needle_controller import (
     Controller,
@@ -64,8 +64,13 @@ class Loop:
     """
     A plant and its controller.
 
+    `friction` is the true friction as a multiple of the nominal one, `plant` are further
+    parameters of the plant, and `options` of the controller.
+
     Attributes
     ----------
+    rate : float
+        Rate of the measurements [Hz].
     now : int
         Time [ns].
     publishers : dict
@@ -78,19 +83,27 @@ class Loop:
     """
 
     def __init__(
-        self, law: str = 'adaptive', rate: float = 200.0, seed: int = 1, friction: float = 1.0
+        self,
+        law: str = 'adaptive',
+        rate: float = 200.0,
+        seed: int = 1,
+        friction: float = 1.0,
+        *,
+        needle: str = 'phantom',
+        plant: Mapping[str, Any] | None = None,
+        **options: Any,
     ) -> None:
-        phantom = NeedleParameters.preset('phantom')
+        nominal = NeedleParameters.preset(needle)
         true = {
-            'model.coulomb_friction': friction * phantom.coulomb_friction,
-            'model.viscous_friction': friction * phantom.viscous_friction,
+            'model.coulomb_friction': friction * nominal.coulomb_friction,
+            'model.viscous_friction': friction * nominal.viscous_friction,
         }
-        own = {'needle': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed}
-        self.run = PlantRun({**own, **true})
-        self.now, self._period = EPOCH, round(NANOSECONDS / rate)
+        own = {'needle': needle, 'rate': rate, 'depth': 0.02, 'seed': seed}
+        self.run = PlantRun({**own, **true, **(plant or {})})
+        self.rate, self.now, self._period = rate, EPOCH, round(NANOSECONDS / rate)
         self.publishers = {'wrench_command': 1}
         self.supervisor = Supervisor(lambda: self.now / NANOSECONDS)
-        controller = Controller(phantom, law, settings=ControllerSettings(rate=rate))
+        controller = Controller(nominal, law, settings=ControllerSettings(rate=rate), **options)
         self.supervisor.configure(controller, SafetyLimits(), ObserverSettings())
         self.supervisor.activate(self.now, self.publishers)
         self.depth, self.acting = 0.02, 0.0

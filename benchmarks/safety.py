@@ -33,7 +33,9 @@ _GO, _RETURN = 0.5, 3.5
 _TARGETS: Final = 0.04, 0.025
 
 #: Start times of faults [s].
-MOMENTS: Final = {'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.45, 'back': 4.2}
+MOMENTS: Final = {
+    'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.45, 'arrived': 2.62, 'back': 4.2,
+}  # fmt: skip
 
 #: Duration of a fault, of the observation after it, and of the recovery [s].
 _LASTS, _WATCHED, _PATIENCE = 0.5, 0.5, 10.0
@@ -124,7 +126,12 @@ def _lies(topic: str) -> dict[str, _Alter]:
     def stamped(change: Callable[[int], int]) -> _Alter:
         return lambda _k, s, _f, _r: (s._replace(stamp=change(s.stamp)),)
 
-    return {
+    def at_rest(_k: int, s: Sent, f: Sent, _r: np.random.Generator) -> Iterable[Sent]:
+        # Position and velocity, and the true effort.
+        return (s._replace(values=[*f.values[:2], 0.0, 0.0, *s.values[4:]]),)
+
+    own: dict[str, _Alter] = {'frozen, no velocity': at_rest} if topic == JOINT_STATES.name else {}
+    return own | {
         'lost': lambda _k, _s, _f, _r: (),
         'half lost': lambda _k, s, _f, r: (s,) if r.random() < 0.5 else (),
         'one in ten': lambda k, s, _f, _r: (s,) if k % 10 == 0 else (),

@@ -84,6 +84,11 @@ class ControllerSettings(CheckedSettings):
         open_low=True,
     )  # fmt: skip
 
+    @property
+    def longest_gap(self) -> float:
+        """Longest time between two measurements that can be compared [s]."""
+        return self.measurement_timeout + 1.0 / self.rate
+
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
         """
         Return the least and largest insertion depth to control [m].
@@ -215,9 +220,10 @@ class Controller:
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
-        longest = settings.measurement_timeout + self.period
-        self._displacement = DisplacementMonitor(settings.jump, longest)
+        self._displacement = DisplacementMonitor(settings.jump, settings.longest_gap)
         self._last_depth: float | None = None
+        #: Whether the insertion force is zero although there is a target.
+        self.relaxed = False
         #: Check before the first motion: answers a measurement, and whether a motion is requested,
         #: with a command; None without a check.
         self.check: Callable[[Measurement, bool], ControllerOutput | None] | None = None
@@ -364,7 +370,7 @@ class Controller:
         self._insertion.reset()
         self._rotation.reset()
         self._last_depth = None
-        self._stopped = False
+        self._stopped = self.relaxed = False
 
     def release(self) -> None:
         """
@@ -435,7 +441,9 @@ class Controller:
         if self.settings.rotation:
             angle, rest = measured.angle, Setpoint(0.0)
             torque = self._rotation.command(angle, measured.angular_velocity, rest)
-        force = loop.command(depth, velocity, ahead, load)
+        if self.relaxed:
+            loop.unwind()
+        force = 0.0 if self.relaxed else loop.command(depth, velocity, ahead, load)
         self._hold.command(now, depth, force, loop.limit)
         return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
 

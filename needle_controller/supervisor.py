@@ -79,7 +79,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
         self.controller = controller
-        self._following = ResponseMonitor(controller.parameters, 0.5 * controller.settings.jump)
+        self._following = ResponseMonitor(controller.parameters, controller.settings)
         self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
         self._robot = robot
         noise = {} if observed is None else observed.sensor_noise
@@ -397,23 +397,23 @@ class Supervisor(StateMachine[ForceCommand]):
                 self._waiting.end(command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
-        force, depth = self._last.force, measured.depth
-        lost = self._following.update(stamp, depth, aim.velocity, force, measured.force)
-        stopped = self._stop_for(safety.guard.tracking(error[0]) or self._following.fault, stamp)
+        following, depth, load = self._following, measured.depth, self.bending.load
+        forces = self._last.force, measured.force
+        lost = following.update(stamp, depth, aim.velocity, *forces, load)
+        stopped = self._stop_for(safety.guard.tracking(error[0]) or following.fault, stamp)
         if stopped is not None:
             return stopped
-        controller.guide.waits = lost
+        controller.guide.waits, controller.relaxed = lost, following.relaxed
         if lost:
             controller.unwind()
-            self._log_fault(
-                'the plant does not follow: it reports '
-                f'{measured.force:.3g} N, {force:.3g} N is commanded',
-                'the reference waits',
-            )
-        elif self.fault is not None:
-            self.fault = None
-            self.events.add(Severity.INFO, kind='recovery')
-        force, torque, limits = command.force, command.torque, controller.settings
+            self._log_fault(following.notice or '', 'the reference waits')
+        else:
+            self._warn('rest', following.notice)
+            if self.fault is not None:
+                self.fault = None
+                self.events.add(Severity.INFO, kind='recovery')
+        force = 0.0 if following.relaxed else command.force
+        torque, limits = command.torque, controller.settings
         self._warn('buckling', buckling_warning(controller.parameters, depth, force))
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)

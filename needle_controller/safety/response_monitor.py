@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from math import isnan
+from math import copysign, isnan
 from typing import Final, NamedTuple
 
+from needle_controller.controller import ControllerSettings
 from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
@@ -17,12 +18,13 @@ _PATIENCE: Final = NANOSECONDS // 10
 _NOTHING: Final = 0.1
 
 
-#: Longest time between two measurements that can be compared [s].
-_GAP: Final = 0.1
+#: Friction as a multiple of the nominal one: the strongest, for a stop while the reference moves;
+#: and at rest as a multiple of the observed one, which is between these bounds.
+_STRONGER, _WEAKER = 1.5, 0.7
+_OBSERVED: Final = 0.1, 4.0
 
-#: Friction of a needle in other tissue, as a multiple of the nominal one: while the reference
-#: moves, and while it rests, where the law may approach its target slowly.
-_STRONGER, _RESTING = 1.5, 4.0
+#: Longest time of a displacement that shows the friction [ns].
+_WINDOW: Final = NANOSECONDS // 5
 
 
 class _Mark(NamedTuple):
@@ -34,46 +36,124 @@ class _Mark(NamedTuple):
 
 class StallMonitor:
     """
-    Expect a displacement from the applied force, with stronger friction than the nominal one.
+    Expect a displacement from the applied force, and compare it with the encoders.
 
-    Encoders that do not move while the expected displacement exceeds ``most`` [m] are frozen, or
-    the needle is blocked: no further force may act.
+    Encoders that do not move while more than ``most`` [m] is expected are frozen, or the needle is
+    held by its tissue. ``longest`` is the longest time between two measurements that can be
+    compared [s].
+
+    While the reference moves, the expected displacement is the least one, with friction stronger
+    than the nominal one, and the lack of motion is a fault. While the reference rests, it is the
+    largest one, with friction weaker than in the last motion: stronger friction may hold the
+    needle, so this is no fault, but ``relaxed`` is True: no force may act until the reference
+    moves, or the encoders do. In the latter case a load has moved the needle, and the force that
+    held it is expected to move nothing.
     """
 
-    def __init__(self, axis: Axis, most: float) -> None:
-        self.axis, self._most = axis, most
+    def __init__(self, axis: Axis, most: float, longest: float) -> None:
+        self.axis, self._most, self._longest = axis, most, longest
         self.forget()
 
     def forget(self) -> None:
         """Expect motion from the next measurement on."""
+        self.relaxed = False
         self._stamp: int | None = None
-        self._depth = self._velocity = self._expected = 0.0
+        self._begin(0.0)
+        #: Message at the measurement where ``relaxed`` begins.
+        self.notice: str | None = None
+        #: Force that holds the needle against an unknown load while the reference rests [N].
+        self._holding = 0.0
+        self._learn()
 
-    def update(self, stamp: int, depth: float, rate: float, force: float) -> str | None:
+    def _begin(self, depth: float) -> None:
+        """Expect motion from a depth [m] on."""
+        self._depth, self._velocity, self._expected = depth, 0.0, 0.0
+
+    def change(self, axis: Axis) -> None:
+        """Continue with another nominal friction."""
+        self.axis = axis
+        self._learn()
+
+    def _learn(self) -> None:
+        """Observe the friction from the next measurement on."""
+        #: Friction in the last motion, as a multiple of the nominal one.
+        self._friction = 1.0
+        self._mark: _Mark | None = None
+        #: Impulse since the mark [N s].
+        self._impulse = 0.0
+
+    def _observe(self, stamp: int, depth: float, impulse: float) -> None:
+        """Compare the mean force of a displacement with the nominal friction."""
+        if self._mark is not None:
+            self._impulse += impulse
+            moved, elapsed = depth - self._mark.depth, stamp - self._mark.stamp
+            if abs(moved) > _NOTHING * self._most:
+                axis, sign = self.axis, copysign(1.0, moved)
+                nominal = axis.coulomb * elapsed / NANOSECONDS + axis.viscous * abs(moved)
+                nominal *= 1.0 if moved > 0.0 else axis.withdrawal
+                low, high = _OBSERVED
+                spent = min(max(sign * self._impulse, low * nominal), high * nominal)
+                self._friction = spent / nominal if nominal > 0.0 else 1.0
+            elif elapsed <= _WINDOW:
+                return
+        self._mark, self._impulse = _Mark(stamp, depth), 0.0
+
+    def update(
+        self, stamp: int, depth: float, rate: float, force: float, load: float
+    ) -> str | None:
         """
         Process a measurement at a stamp [ns] and the force [N] that acted before it.
 
-        Takes insertion depth [m] and velocity of the reference [m/s].
+        Takes insertion depth [m], velocity of the reference [m/s] and the known load against the
+        force [N].
 
         Returns the fault, or None.
         """
-        before, self._stamp = self._stamp, stamp
-        factor, axis = _RESTING if rate == 0.0 else _STRONGER, self.axis
+        before, self._stamp, self.notice = self._stamp, stamp, None
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
+        if not 0.0 < elapsed <= self._longest:
+            elapsed = 0.0
+            self._begin(depth)
+            self._mark = None
+        self._observe(stamp, depth, (force - load) * elapsed)
+        moved = depth - self._depth
+        if rate != 0.0:
+            self.relaxed, self._holding = False, 0.0
+        elif self.relaxed:
+            self.relaxed = abs(moved) <= _NOTHING * self._most
+            return None
+        factor, axis = _STRONGER, self.axis
+        if rate == 0.0:
+            factor = _WEAKER * self._friction
+        force -= load
+        # The load may need any part of the force that held it.
+        force -= min(max(force, min(self._holding, 0.0)), max(self._holding, 0.0))
+        if force < 0.0:
+            factor *= axis.withdrawal
         push = abs(force) - factor * axis.coulomb
-        if not 0.0 < elapsed < _GAP or push <= 0.0 or self._expected * force < 0.0:
-            self._depth, self._velocity, self._expected = depth, 0.0, 0.0
+        if push <= 0.0:
+            self._velocity = 0.0
+        if (push <= 0.0 and rate != 0.0) or self._expected * force < 0.0:
+            self._begin(depth)
             return None
         # Implicit step: stable for any friction.
         speed = abs(self._velocity) + elapsed / axis.inertia * push
-        speed /= 1.0 + elapsed / axis.inertia * factor * axis.viscous
+        speed = max(speed / (1.0 + elapsed / axis.inertia * factor * axis.viscous), 0.0)
         self._velocity = speed
         self._expected += (speed if force > 0.0 else -speed) * elapsed
-        moved = depth - self._depth
         if abs(self._expected) <= self._most:
             return None
+        self._expected = 0.0
         if abs(moved) > _NOTHING * self._most:
-            self._depth, self._expected = depth, 0.0
+            self._depth = depth
+            return None
+        if rate == 0.0:
+            self.relaxed = True
+            self._holding += force
+            self.notice = (
+                f'the encoders do not respond to {force:.3g} N at rest; they are frozen, or '
+                'friction holds the needle: no force until the next motion'
+            )
             return None
         return (
             f'the encoders do not move: {1e3 * abs(moved):.3g} mm measured, more than '
@@ -89,49 +169,76 @@ class ResponseMonitor:
     A plant does not follow if it reports almost no force while a force is commanded, and the
     needle rests while its reference moves. It follows again as soon as one of these conditions
     ends. A robot that reports no force is not checked. ``lost`` is whether the plant does not
-    follow. ``fault`` is the fault of the stall monitor, see `StallMonitor` for
-    ``most``.
+    follow. See `StallMonitor` for ``fault`` and ``relaxed``; ``notice`` is a message for the user.
     """
 
-    def __init__(self, parameters: NeedleParameters, most: float) -> None:
-        self._stall = StallMonitor(Axis.insertion(parameters), most)
+    def __init__(self, parameters: NeedleParameters, settings: ControllerSettings) -> None:
+        most, longest = 0.5 * settings.jump, settings.longest_gap
+        self._stall = StallMonitor(Axis.insertion(parameters), most, longest)
         self.forget()
 
     def change(self, parameters: NeedleParameters) -> None:
         """Continue with another nominal friction."""
-        self._stall.axis = Axis.insertion(parameters)
+        self._stall.change(Axis.insertion(parameters))
 
     def forget(self) -> None:
         """Reset to a plant that follows."""
         self.lost = False
         self.fault: str | None = None
+        self.notice: str | None = None
         self._mark: _Mark | None = None
         self._stall.forget()
 
+    @property
+    def relaxed(self) -> bool:
+        """Whether no force may act while the reference rests."""
+        return self._stall.relaxed
+
     def update(
-        self, stamp: int, depth: float, rate: float, commanded: float, reported: float
+        self,
+        stamp: int,
+        depth: float,
+        rate: float,
+        commanded: float,
+        reported: float,
+        load: float = 0.0,
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
-        Takes insertion depth [m], velocity of the reference [m/s], also while it waits, and the
-        last commanded and the reported force [N]; the latter is NaN if the robot reports none.
+        Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
+        commanded and the reported force [N], and the known load against the force [N]; the
+        reported force is NaN if the robot reports none.
         """
         applied = commanded if isnan(reported) else reported
-        self.fault = self._stall.update(stamp, depth, rate, applied)
+        self.fault = self._stall.update(stamp, depth, rate, applied, load)
+        self.lost = self._follows_not(stamp, depth, rate, commanded, reported)
+        self.notice = self._stall.notice
+        if self.lost:
+            self.notice = (
+                f'the plant does not follow: it reports {reported:.3g} N, {commanded:.3g} N is '
+                'commanded'
+            )
+        return self.lost
+
+    def _follows_not(
+        self, stamp: int, depth: float, rate: float, commanded: float, reported: float
+    ) -> bool:
+        """Return whether the plant does not follow."""
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
-            self.lost, self._mark = False, None
+            self._mark = None
             return False
         if self._mark is None:
             self._mark = _Mark(stamp, depth)
         mark = self._mark
         elapsed = min(stamp - mark.stamp, _PATIENCE) / NANOSECONDS
         moved = abs(depth - mark.depth) > _NOTHING * abs(rate) * elapsed
-        if self.lost and moved:
-            self.lost, self._mark = False, None
-        elif not self.lost and stamp - mark.stamp > _PATIENCE:
-            self.lost = not moved and rate != 0.0
-            if not self.lost:
+        lost = self.lost
+        if lost and moved:
+            lost, self._mark = False, None
+        elif not lost and stamp - mark.stamp > _PATIENCE:
+            lost = not moved and rate != 0.0
+            if not lost:
                 self._mark = None
-        return self.lost
+        return lost
