@@ -349,7 +349,6 @@ class PlantNode(ModelNode):
     def _reset(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
         plant_run.perform(Event(RESET))
         self._trajectories.end('the plant was reset')
-        self._trajectories.requests.supersede(self._time.simulated(self.now()))
         self._halted = None
         self._set_fault({})
         return 'needle and noise reset; time continues'
