@@ -90,6 +90,9 @@ class SteeringNode(CompiledNode):
     KERNELS = (
         'needle_controller.compiled.guide_plan',
         'needle_controller.compiled.hypotheses',
+        # Of the laws `springs` and `broyden`.
+        'needle_dynamics.compiled.cut',
+        'needle_dynamics.compiled.cutting_needle',
         'needle_dynamics.compiled.superposition',
     )
 

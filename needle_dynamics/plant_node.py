@@ -352,7 +352,6 @@ class PlantNode(ModelNode):
         self._trajectories.end('the plant was reset')
         plant_run.perform(Event(RESET))
         self._trajectories.begin()
-        self._trajectories.requests.supersede(self._time.simulated(self.now()))
         self._halted = None
         self._set_fault({})
         return 'needle and noise reset; time continues'

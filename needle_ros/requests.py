@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from needle_ros.contract import REQUEST_AGE, Stamp, Topic
 from needle_ros.errors import NeedleError, printable
-from needle_ros.timing import apart, NANOSECONDS
+from needle_ros.timing import apart, NANOSECONDS, parse_nanoseconds
 from needle_ros.trajectories import LateTrajectoryError
 
 #: Interval of repetitions without an answer [s], and the maximum number of repetitions.
@@ -104,8 +104,9 @@ class RequestStatus:
             elif key.startswith(_REQUEST):
                 topic, _, stamp = key[len(_REQUEST) :].rpartition(' ')
                 verdict, _, reason = value.partition(': ')
-                if stamp.isdecimal() and verdict in _VERDICTS:
-                    answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
+                time = parse_nanoseconds(stamp)
+                if time is not None and verdict in _VERDICTS:
+                    answers.append(Acknowledgement(topic, time, Verdict(verdict), reason))
         return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:

@@ -38,7 +38,9 @@ REQUESTS = st.builds(
     RequestStatus,
     st.dictionaries(NAMES, st.lists(NAMES, max_size=3).map(tuple), max_size=2),
     st.lists(
-        st.builds(Acknowledgement, NAMES, st.integers(0), st.sampled_from(Verdict), st.text()),
+        st.builds(
+            Acknowledgement, NAMES, st.integers(0, 2**63 - 1), st.sampled_from(Verdict), st.text()
+        ),
         max_size=3,
         unique_by=lambda one: (one.topic, one.stamp),
     ).map(tuple),
