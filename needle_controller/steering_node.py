@@ -161,6 +161,11 @@ class SteeringNode(CompiledNode):
         self._loop.authority = self._authority
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         if action := self.text(_ACTION):
+            if settings.continuous:
+                raise ParameterError(
+                    f'continuous must be false with {_ACTION}: needle and guide are moved by '
+                    'separate trajectories, of which the action follows one'
+                )
             self._client = TrajectoryClient(self, action, self._hear)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
         self._tip_expected = self.publisher(contract.TIP_EXPECTED)
@@ -257,6 +262,9 @@ class SteeringNode(CompiledNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Pass other nodes' answers to motions to the executive."""
+        if self._client is not None:
+            # The action answers; the topic is not used.
+            return
         for status in message.status:
             values = {one.key: one.value for one in status.values}
             answers = RequestStatus.from_values(values)
