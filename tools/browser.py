@@ -92,6 +92,7 @@ class Tab:
 
     async def size(self, width: int, height: int) -> None:
         """Set the page size [pixels]."""
+        await self.call('Emulation.setScrollbarsHidden', hidden=True)
         await self.call(
             'Emulation.setDeviceMetricsOverride',
             width=width, height=height, deviceScaleFactor=1, mobile=width < 600,

@@ -397,6 +397,9 @@ def test_browser_compares_two_recordings(tmp_path: Path) -> None:
             await tab.wait(f"{texts}.includes('measured 60.00')", 'the cursor')
             # At 20 mm/s half a second later.
             assert 'measured, other 50.00' in await tab.run(texts)
+            # After the end of the second recording it has no value.
+            await tab.run('charts.cursor = 1e3, later()')
+            await tab.wait(f"{texts}.includes('measured, other –')", 'no value')
             lines = (await tab.run('charts.csv()')).splitlines()
             heads = lines[0].split(',')
             assert heads[1:5] == [

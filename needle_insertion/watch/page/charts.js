@@ -115,6 +115,7 @@ const needleCharts = (() => {
     record(signals, duration, other) {
       this.data = signals;
       this.other = other ? other.signals : {};
+      this.last = other ? other.end : duration;
       this.ends = other ? [Math.min(0, other.begin), Math.max(duration, other.end)] : [0, duration];
       this.whole();
     }
@@ -240,7 +241,9 @@ const needleCharts = (() => {
           [this.data, this.other].forEach((data, k) => {
             boxes[k].hidden = !names.includes(name) || !data[name];
             if (boxes[k].hidden) return;
-            const value = this.at(data[name], this.cursor === null ? now : this.cursor);
+            const time = this.cursor === null ? now : this.cursor;
+            /* The other recording may have ended before. */
+            const value = k && time > this.last ? null : this.at(data[name], time);
             const words = `${chart.signals[name][0]}${k ? ', other' : ''}`;
             const text = `${words} ${fixed(value === null ? null : value * chart.factor, chart.digits)}`;
             if (boxes[k].textContent !== text) boxes[k].textContent = text;
