@@ -4,7 +4,8 @@ Write screenshots of every page, at the width of a desktop and of a telephone.
 
 Run it from a clone on a machine with Chromium: ``python -m tools.screenshots``. It makes the
 pages with the commands of the package, in a temporary folder; ``--pages DIR`` keeps them, and
-takes those that exist. The first picture of the README is a copy of ``watch_1400.png``. It takes some minutes, most of them for the demo and `needle reproduce`.
+takes those that exist. It takes some minutes, most of them for the demo and `needle reproduce`.
+The first picture of the README is a copy of ``watch_1400.png``.
 """
 
 from __future__ import annotations
