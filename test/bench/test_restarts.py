@@ -11,13 +11,11 @@ import pytest
     ('line', 'named'),
     [
         (
-            'steering: target rejected: the insertion cannot be resumed: the guide is 2.00 mm '
-            'off its plan; retract the needle to 1.00 mm first',
+            'the insertion cannot be resumed: retract the needle to 1.00 mm first',
             True,
         ),
         (
-            'steering: target rejected: the needle is at 20.00 mm and has been steered; retract '
-            'it to 1.00 mm first',
+            'the needle is at 20.00 mm and has been steered; retract it to 1.00 mm first',
             True,
         ),
         ('steering: target rejected: stopped: the sensor is frozen; ~/clear_stop releases', True),
