@@ -19,6 +19,7 @@ from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import BaseNode
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
+from reproduction.protocol import SHIPPED_BAGS
 from support.ros_graph import RosGraph
 
 DONE = TransitionCallbackReturn.SUCCESS
@@ -44,18 +45,23 @@ def entities(node: BaseNode) -> Counter[str]:
         (ControllerNode, 'publisher /wrench_command'),
         (SteeringNode, 'publisher /joint_trajectory'),
         (SlicerNode, 'publisher /target'),
+        (RecorderNode, 'publisher /joint_states/_recorded'),
+        (PlayerNode, 'publisher /joint_states'),
+        (IdentificationNode, 'publisher /friction'),
     ],
 )
 @pytest.mark.parametrize('end', ['cleanup', 'shutdown', 'shutdown while active'])
 def test_cleanup_and_shutdown_destroy_what_was_created(
-    ros_graph: RosGraph, kind: Any, topic: str, end: str
+    ros_graph: RosGraph, tmp_path: Path, kind: Any, topic: str, end: str
 ) -> None:
-    """Requests of a user are answered in every state."""
-    node = ros_graph.add(kind, start=False)
+    """Requests of a user to stop the system are answered in every state."""
+    paths = {RecorderNode: tmp_path / 'bag', PlayerNode: SHIPPED_BAGS / 'friction_01'}
+    parameters = {'path': str(paths[kind])} if kind in paths else {}
+    node = ros_graph.add(kind, start=False, parameters=parameters)
     before = entities(node)
     assert not before[topic]
-    if kind is not SlicerNode:
-        assert before[f'service /{node.get_name()}/stop']
+    stops = before[f'service /{node.get_name()}/stop']
+    assert stops == (kind in (PlantNode, ControllerNode, SteeringNode))
     for _ in range(2):
         assert node.start(), node.failure
         assert entities(node)[topic] == 1
