@@ -101,7 +101,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
         known = {unit for role in roles if (unit := stated[role]) is not None}
         if not known and any(bodies[role] == bodies['depth'] for role in roles):
             known = {found['depth']}
-        if not known and group[0] == 'tip_x' and deep is not None:
+        if not known and 'tip_x' in group and deep is not None:
             known = _along(table, span * UNITS['depth'][deep or 'm'])
         if not known:
             large = any(
