@@ -6,6 +6,7 @@ from __future__ import annotations
 from time import monotonic
 from typing import Any
 
+from builtin_interfaces.msg import Duration as DurationMessage
 from geometry_msgs.msg import PointStamped
 from needle_controller.controller_node import ControllerNode
 from needle_controller.steering_node import SteeringNode
@@ -19,7 +20,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.ros_graph import RosGraph
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 
 def serve(node: Node, name: str) -> Node:
@@ -100,12 +101,19 @@ def test_rejected_target_is_never_reported_as_active(
     assert controller.diagnose().status.target is None
 
 
+#: A trajectory with a point before its start.
+BACKWARD = JointTrajectory(
+    joint_names=['insertion'],
+    points=[JointTrajectoryPoint(positions=[0.03], time_from_start=DurationMessage(sec=-1))],
+)
+
+
 @pytest.mark.requirement('S-277')
 @pytest.mark.parametrize(
     ('kind', 'parameters', 'message'),
     [
-        (PlantNode, {'mode': 'robot'}, JointTrajectory(joint_names=['elbow'])),
-        (ControllerNode, {}, JointTrajectory(joint_names=['insertion'])),
+        (PlantNode, {'mode': 'robot'}, BACKWARD),
+        (ControllerNode, {}, BACKWARD),
         (SteeringNode, {}, PointStamped()),
     ],
 )
