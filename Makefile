@@ -51,11 +51,11 @@ $(VENV)/.complete: requirements.lock setup.py package.xml
 
 # Additional dependencies of tests and checks.
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.complete
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements-dev.lock
 	touch $@
 
 $(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements-docs.lock
 	touch $@
 
 # Pins for all supported Python versions; run after a change of dependencies in setup.py.

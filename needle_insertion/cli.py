@@ -91,6 +91,14 @@ def _run(words: list[str]) -> int:
     COMMAND.set(shlex.join(['needle', *words]))
     if chosen in COMMANDS:
         command = _load(chosen)
+        at = words.index(chosen) + 1
+        try:
+            # A completion must not read recordings.
+            if '_ARGCOMPLETE' not in os.environ:
+                words = [*words[:at], *command.completed(words[at:])]
+        except NeedleError as error:
+            sys.stderr.write(f'error: {error}\n')
+            return 2
         words = _joined(words, command.signed)
     parser = _parser(chosen, command)
     if '_ARGCOMPLETE' in os.environ:

@@ -13,6 +13,7 @@ from typing import Any, Final, TYPE_CHECKING
 
 from needle_dynamics import FloatArray
 from needle_dynamics.display import Displayed, new_figure, shown
+from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_study.distribution import Distribution, distribution
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
+
+_PARTS: Final = 50  # largest number of parts of a study that shows its progress
 
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 
@@ -100,11 +103,17 @@ class Study:
         """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
 
-    def simulate(self) -> StudyTable:
+    def simulate(self, progress: Progress | None = None) -> StudyTable:
         """
         Simulate all samples in this process.
 
         `needle study` computes large studies on all cores, and writes them to files.
+
+        Parameters
+        ----------
+        progress : bool or callable, optional
+            True shows a progress bar; a function is called after each part. The samples are then
+            simulated in up to 50 parts, with the same results.
 
         Returns
         -------
@@ -112,7 +121,16 @@ class Study:
             Variables and metrics of each sample.
 
         """
-        return StudyTable(self, self.rows(0, self.samples))
+        if not progress:
+            return StudyTable(self, self.rows(0, self.samples))
+        parts = []
+        shares = np.array_split(np.arange(self.samples), min(self.samples, _PARTS))
+        with progress_of(progress, len(shares), 'parts') as advance:
+            for share in shares:
+                parts.append(self.rows(int(share[0]), len(share)))
+                advance()
+        values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return StudyTable(self, values)
 
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
         """Compute `count` samples from number `first` on: number, sampled values and metrics."""

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cut import insert, NO_FORCES
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.batch import thread_count
 from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
@@ -28,6 +29,7 @@ def insert_batch(
     rolls: ArrayLike = 0.0,
     seeds: Sequence[int] = (0,),
     workers: int | None = None,
+    progress: Progress | None = None,
 ) -> FloatArray:
     """
     Insert many needles in parallel; the result does not depend on the number of workers.
@@ -49,6 +51,8 @@ def insert_batch(
         Seed of the path noise, for all runs or for each.
     workers : int, optional
         Threads; one per core by default.
+    progress : bool or callable, optional
+        True shows a progress bar; a function is called after each run.
 
     Returns
     -------
@@ -115,11 +119,14 @@ def insert_batch(
     longest = values[:, 5].max()
     rooms = [empty_cut(longest, values[:, 1].min(), layers.shape[2]) for _ in range(workers)]
 
-    def take(worker: int) -> None:
-        share = np.arange(worker, runs, workers)
-        insert(values, layers, cell, wander, poses, share, rooms[worker], tips, NO_FORCES)
+    with progress_of(progress, runs, 'runs') as advance, ThreadPoolExecutor(workers) as pool:
 
-    with ThreadPoolExecutor(workers) as pool:
+        def take(worker: int) -> None:
+            for run in range(worker, runs, workers):
+                one = np.array([run])
+                insert(values, layers, cell, wander, poses, one, rooms[worker], tips, NO_FORCES)
+                advance()
+
         list(pool.map(take, range(workers)))
     x, z = tips[:, :, 0], tips[:, :, 1]
     return np.stack([x, np.broadcast_to(poses[:, :, 0], x.shape), z], axis=2)

@@ -17,8 +17,21 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
-from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
-from needle_identification.steering.columns import steering_columns, STEERING_ROLES
+from needle_identification.recordings.tables import (
+    guessed,
+    is_table,
+    read_table,
+    ROLES,
+    with_unit,
+)
+from needle_identification.steering.columns import (
+    check_depth,
+    is_inverted,
+    steering_columns,
+    steering_names,
+    STEERING_ROLES,
+)
+from needle_identification.steering.reading import JOINTS, read_steering_recording
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
 from needle_ros.axes import AXES
@@ -34,6 +47,9 @@ _MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest 
 
 #: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
 _EXPLAINED: Final = 0.3
+
+#: Least motion of a steered insertion, by role [m, rad].
+_STEERED: Final = {'guide_x': 2e-4, 'guide_z': 2e-4, 'roll': 0.1}
 
 _MAX_JOINTS: Final = 64  # largest number of joints of a topic that are inspected
 _TRIED: Final = 20_000  # largest number of samples on which a pair of force and motion is fitted
@@ -68,6 +84,7 @@ class Inspection:
     losses: tuple[str, ...]  #: missing or damaged parts
     words: tuple[str, ...]  #: probable force and motion, with the reason
     command: str  #: for identification; '' if no force and motion were found
+    lacking: str = ''  #: what must be completed in the command
 
 
 def inspect_recording(path: Path | str) -> Inspection:
@@ -101,7 +118,7 @@ def inspect_recording(path: Path | str) -> Inspection:
 
 def _table(path: Path) -> Inspection:
     table = read_table(path)
-    roles = guessed(table)
+    roles = {role: with_unit(table, role, spec) for role, spec in guessed(table).items()}
     columns = tuple(_column(name, values) for name, values in table.columns.items())
     content = Content(
         name=path.name, type_name='table', count=len(next(iter(table.columns.values()))),
@@ -112,18 +129,24 @@ def _table(path: Path) -> Inspection:
     lacking = [role for role in ('time', 'force') if role not in roles]
     if not {'depth', 'speed'} & set(roles):
         lacking.append('depth or speed')
-    command = f'needle identify friction {shlex.quote(str(path))}'
+    kind, unknown, columns_of = 'friction', '', roles
     steered = steering_columns(table)
     if lacking and {*STEERING_ROLES} - {*steered} <= {'roll'}:
         words = [f'{role} by name and values: {spec}' for role, spec in steered.items()]
-        command = f'needle identify steering {shlex.quote(str(path))}'
+        kind, columns_of = 'steering', steered
+        try:
+            check_depth(table, steered['depth'])
+        except RecordingError as error:
+            unknown = str(error)
     elif lacking:
-        words.append(f'no column looks like {" or ".join(lacking)}: name them with --columns')
-        names = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
-        command += f' --columns {shlex.quote(",".join(f"{r}={n}" for r, n in names.items()))}'
+        unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
+        columns_of = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
+    words += [unknown] * bool(unknown)
+    named = ','.join(f'{role}={spec}' for role, spec in columns_of.items())
     return Inspection(
         path=str(path), contents=(content,), losses=tuple(table.losses), words=tuple(words),
-        command=command,
+        command=shlex.join(['needle', 'identify', kind, str(path), '--columns', named]),
+        lacking=unknown,
     )  # fmt: skip
 
 
@@ -187,7 +210,9 @@ def _bag(path: Path) -> Inspection:
                     if np.isfinite(values).all() and np.ptp(values) > 0.0
                 ]
         contents.append(content)
-    words, command = _suggestion(path, signals)
+    words, command = _steered(path, signals)
+    if not command:
+        words, command = _suggestion(path, signals)
     if not command:
         with suppress(NeedleError):
             identify_stiffness(read_indentation_recording(path))
@@ -197,6 +222,32 @@ def _bag(path: Path) -> Inspection:
         path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
         command=command,
     )  # fmt: skip
+
+
+def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
+    """Return words and command for an insertion with a moved guide or a rotated needle."""
+    joints = {one.axis: one for one in signals if one.topic.type_name == wire.JOINT_STATE}
+    found = {role: name for role, name in steering_names(joints).items() if role in JOINTS}
+    moved = [
+        role for role, least in _STEERED.items()
+        if role in found and np.ptp(joints[found[role]].values) > least
+    ]  # fmt: skip
+    if 'depth' not in found or not moved:
+        return [], ''
+    # The signals are those that move: a joint at rest has its usual name.
+    columns = {role: name for role, name in found.items() if name != JOINTS[role]}
+    if is_inverted(joints[found['depth']].values):
+        columns['depth'] = f'-{found["depth"]}'
+    try:
+        recording = read_steering_recording(path, columns=columns)
+    except NeedleError:
+        return [], ''
+    what = (
+        f'{" and ".join(found[role] for role in moved)} moved during the insertion to '
+        f'{1e3 * recording.depth.max(initial=0.0):.0f} mm: the bending can be identified'
+    )
+    named = ['--columns', ','.join(f'{r}={n}' for r, n in columns.items())] if columns else []
+    return [what], shlex.join(['needle', 'identify', 'steering', str(path), *named])
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:

@@ -186,6 +186,16 @@ def unit_of(name: str, role: str) -> str | None:
     return word if word in UNITS[role] and word != name else None
 
 
+def with_unit(table: Table, role: str, name: str) -> str:
+    """Return a column for friction with mm or mm/s if it states no unit and is too large in m."""
+    if role not in _SUSPICIOUS or unit_of(name, role) is not None:
+        return name
+    finite = table.columns[name][np.isfinite(table.columns[name])]
+    if len(finite) and np.ptp(finite) > _SUSPICIOUS[role]:
+        return f'{name}[mm{"/s" if role == "speed" else ""}]'
+    return name
+
+
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
     """Return the values (n,) of a column in SI units, by its name with sign, factor and unit."""
     if role == 'time' and ':' in spec:

@@ -13,7 +13,7 @@ rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import pi
 import re
 from typing import Final
@@ -70,10 +70,25 @@ def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> di
     for role, unit in units.items():
         if unit_of(specs[role], role) is None and unit:
             specs[role] = f'{specs[role]}[{unit}]'
-    from_start = depth - depth[np.argmax(depth != 0.0)]
-    if from_start.max() < -from_start.min():
+    if is_inverted(depth):
         specs['depth'] = f'-{specs["depth"]}'
     return {**specs, **given}
+
+
+def is_inverted(depth: FloatArray) -> bool:
+    """Return whether a depth decreases into the tissue; zeros before its start do not count."""
+    from_start = depth - depth[np.argmax(depth != 0.0)]
+    return bool(from_start.max() < -from_start.min())
+
+
+def steering_names(names: Iterable[str]) -> dict[str, str]:
+    """Return the names that are usual for a role, by role."""
+    short = {plain_name(name): name for name in names}
+    return {
+        role: next(short[word] for word in usual if word in short)
+        for role, usual in _USUAL.items()
+        if not short.keys().isdisjoint(usual)
+    }
 
 
 def check_depth(table: Table, spec: str) -> None:

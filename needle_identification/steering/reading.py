@@ -44,13 +44,15 @@ import numpy as np
 _TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
 _MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
 
-#: Joints by role, and components of the tip.
-_JOINTS: Final = {
+#: Joints by role.
+JOINTS: Final = {
     'depth': contract.INSERTION,
     'guide_x': contract.GUIDE_X,
     'guide_z': contract.GUIDE_Z,
     'roll': contract.ROLL,
 }
+
+#: Components of the tip by role.
 _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
@@ -111,7 +113,7 @@ def read_steering_recording(
     tip = chosen_topic(bag, topics, _TIP, tip_topic)
     motion = chosen_topic(bag, topics, _MOTION, motion_topic)
     present = {name for names in first_names(bag, motion) for name in names}
-    joints = {role: signed(columns.get(role, name)) for role, name in _JOINTS.items()}
+    joints = {role: signed(columns.get(role, name)) for role, name in JOINTS.items()}
     if 'roll' not in columns and contract.ROLL not in present:
         del joints['roll']
     if missing := {name for _, name in joints.values()} - present:

@@ -37,7 +37,7 @@ class TipResponses(NamedTuple):
     bevel: FloatArray  # (n, 2) x and z, per curvature of a long needle by the bevel [m^2]
 
 
-class Insertion:
+class SimulatedCauses:
     """A recorded insertion for each cause, in one order; the lengths are given later."""
 
     def __init__(self, recording: SteeringRecording, order: str) -> None:

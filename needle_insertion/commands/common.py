@@ -26,6 +26,8 @@ class Subcommand(NamedTuple):
     add_arguments: Callable[[ArgumentParser], None]
     run: Callable[[Namespace], int]
     signed: tuple[str, ...] = ()  #: options whose value may begin with a minus sign
+    #: Returns the words of the command with those that the user left out.
+    completed: Callable[[Sequence[str]], list[str]] = list
 
 
 def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '') -> None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from itertools import takewhile
 from pathlib import Path
+import shlex
 import sys
-from typing import Any
+from typing import Any, Final
 
 from needle_identification import (
     ESTIMATORS,
@@ -16,6 +18,7 @@ from needle_identification import (
     IdentificationError,
     identify_friction,
     identify_stiffness,
+    inspect_recording,
     read_friction_recording,
     read_indentation_recording,
     StiffnessSettings,
@@ -42,8 +45,15 @@ from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.quantities import quantities
 
+#: Kinds of identification.
+KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        'needle identify RECORDINGS [OPTIONS] chooses friction, stiffness or steering by the '
+        'content of the recordings, as needle inspect does, and prints the command'
+    )
     what = parser.add_subparsers(required=True, metavar='WHAT')
     friction = what.add_parser(
         'friction',
@@ -310,6 +320,41 @@ def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
     return True
 
 
+def _chosen(words: Sequence[str]) -> list[str]:
+    """Insert the kind and the options for recordings that are given without a kind."""
+    first = words[0] if words else '-'
+    if first in KINDS or first.startswith('-') or not _is_recording(first):
+        return list(words)
+    given = list(takewhile(lambda word: not word.startswith('-'), words))
+    reasons = []
+    for name in given:
+        try:
+            with ProgressLine(f'reading {name}', brief=True):
+                found = inspect_recording(name)
+        except (NeedleError, OSError) as error:
+            reasons.append(str(error))
+            continue
+        if found.command and not found.lacking:
+            break
+        reasons.append(f'{found.path}: {found.lacking or "; ".join(found.words)}')
+    else:
+        # The reason of the first recording: the others are probably alike.
+        raise IdentificationError(reasons[0])
+    kind, _, *options = shlex.split(found.command)[2:]
+    chosen = [kind, *given, *options, *words[len(given) :]]
+    # Values with a minus sign are quoted where the terminal needs it.
+    sys.stderr.write(shown(f'chosen: {shlex.join(["needle", "identify", *chosen])}') + '\n')
+    return chosen
+
+
+def _is_recording(word: str) -> bool:
+    path = Path(word)
+    return path.exists() or bool(path.suffix) or len(path.parts) > 1
+
+
 COMMAND = Subcommand(
-    _add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes', '--truth')
+    _add_arguments,
+    _run,
+    signed=('--force-axis', '--motion-axis', '--axes', '--truth'),
+    completed=_chosen,
 )

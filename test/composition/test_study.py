@@ -86,6 +86,17 @@ def test_samples_are_independent_of_chunks(design: str) -> None:
             assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
 
 
+def test_progress_does_not_change_the_samples() -> None:
+    study, calls = build_study({**SMALL, 'samples': 60}), list[None]()
+    found = study.simulate(progress=lambda: calls.append(None)).values
+    # At most 50 parts.
+    assert len(calls) == 50
+    whole = study.rows(0, 60)
+    assert list(found) == list(whole)
+    for name, values in found.items():
+        assert np.array_equal(values, whole[name], equal_nan=True)
+
+
 @pytest.mark.parametrize(('law', 'count'), [('multi_hypothesis', 5), ('open_loop', 300)])
 def test_samples_are_independent_of_their_batch(law: str, count: int) -> None:
     """Bit-identical; open-loop samples are computed in batches of some hundreds."""

@@ -8,11 +8,15 @@ from pathlib import Path
 import shlex
 
 from needle_identification import inspect_recording, RecordingError
+from needle_identification.recordings.tables import column_roles
+from needle_identification.steering.columns import STEERING_ROLES
+from needle_identification.steering.reading import read_steering_recording
 from needle_insertion.cli import main
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_typestore, Stores
+from support.steered_recording import recorded_plant
 from support.strokes import strokes
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -147,7 +151,13 @@ def test_a_table_of_a_steered_insertion_is_recognized(tmp_path: Path) -> None:
     rows = '\n'.join(f'{1 + k},{-5 * k},{2 + k},{0.1 * k},{-5 * k},{0.2 * k}' for k in range(9))
     path.write_text(f'Base x,Base y,Base z,Tip x,Tip y,Tip z\n{rows}\n', encoding='utf-8')
     found = inspect_recording(path)
-    assert shlex.split(found.command) == ['needle', 'identify', 'steering', str(path)]
+    columns = (
+        'depth=-Base y[mm],guide_x=Base x[mm],guide_z=Base z[mm],tip_x=Tip x[mm],tip_z=Tip z[mm]'
+    )
+    words = ['needle', 'identify', 'steering', str(path), '--columns', columns]
+    assert shlex.split(found.command) == words
+    read = read_steering_recording(path, columns=column_roles(columns, STEERING_ROLES))
+    assert read.depth.max() == pytest.approx(0.04)
     assert 'depth by name and values: -Base y[mm]' in found.words
 
 
@@ -158,3 +168,61 @@ def test_a_missing_recording_gives_a_one_line_error(capsys: pytest.CaptureFixtur
     out, err = capsys.readouterr()
     assert 'try: needle identify friction bags/friction_01' in out
     assert len(err.strip().splitlines()) == 1
+
+
+def test_a_bag_with_a_moved_guide_is_proposed_for_steering(tmp_path: Path) -> None:
+    own = recorded_plant(tmp_path, 1)
+    assert inspect_recording(own).command == f'needle identify steering {own}'
+    names = {'insertion': 'depth', 'guide_x': 'x_guide', 'guide_z': 'z_guide'}
+    other = recorded_plant(tmp_path, 2, names)
+    command = inspect_recording(other).command
+    assert '--columns depth=-depth,guide_x=x_guide,guide_z=z_guide' in command
+    columns = column_roles(shlex.split(command)[-1], STEERING_ROLES)
+    assert read_steering_recording(other, columns=columns).depth.max() > 0.09
+
+
+def test_units_of_a_friction_table_are_in_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In mm without a unit, the command gives the coefficients of the table in m."""
+    made, path = strokes(seed=3), tmp_path / 'run.csv'
+    found = []
+    for factor in (1.0, 1e3):
+        rows = np.column_stack([made.time, factor * made.depth, made.force])
+        np.savetxt(path, rows, delimiter=',', header='time,position,force', comments='')
+        assert main(['identify', str(path), '--json']) == 0
+        out, err = capsys.readouterr()
+        unit = '[mm]' if factor > 1.0 else ''
+        assert f'time=time,depth=position{unit},force=force' in err
+        found.append([one['mean'] for one in json.loads(out)['statistics'].values()])
+    # 18 digits in the file.
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+@pytest.mark.parametrize(('kind', 'many'), [('friction', 3), ('stiffness', 1)])
+def test_identify_chooses_the_kind_of_inspect(
+    kind: str, many: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bags = [f'bags/{kind}_0{k + 1}' for k in range(many)]
+    assert main(['identify', kind, *bags, '--json']) == 0
+    expected = capsys.readouterr().out
+    assert main(['identify', *bags, '--json']) == 0
+    out, err = capsys.readouterr()
+    assert out == expected
+    assert f'chosen: needle identify {kind} {" ".join(bags)}' in err
+
+
+def test_recordings_without_a_kind_are_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'run.csv'
+    path.write_text('a,b,c\n1,2,3\n2,3,4\n')
+    for words, reason in (
+        ([str(path)], 'no column looks like time or force or depth or speed: name them'),
+        (['nowhere.csv'], 'nowhere.csv cannot be read'),
+    ):
+        assert main(['identify', *words]) == 2
+        out, err = capsys.readouterr()
+        assert not out
+        assert reason in err
+        assert len(err.strip().splitlines()) == 1

@@ -71,6 +71,13 @@ def test_results_are_independent_of_workers(workers: int) -> None:
     assert_array_equal(insert_batch(**values, workers=workers), insert_batch(**values, workers=1))
 
 
+def test_progress_is_called_for_each_run() -> None:
+    values, calls = drawn(20), list[None]()
+    found = insert_batch(**values, progress=lambda: calls.append(None))
+    assert len(calls) == 20
+    assert_array_equal(found, insert_batch(**values))
+
+
 @settings(max_examples=30)
 @given(some.data())
 def test_common_values_are_broadcast_to_all_runs(data: some.DataObject) -> None:
