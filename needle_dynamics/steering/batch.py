@@ -122,9 +122,10 @@ def insert_batch(
     with progress_of(progress, runs, 'runs') as advance, ThreadPoolExecutor(workers) as pool:
 
         def take(worker: int) -> None:
-            for run in range(worker, runs, workers):
-                one = np.array([run])
-                insert(values, layers, cell, wander, poses, one, rooms[worker], tips, NO_FORCES)
+            share = np.arange(worker, runs, workers)
+            # One call for all runs, or one for each that is reported.
+            for part in share[:, np.newaxis] if progress else [share]:
+                insert(values, layers, cell, wander, poses, part, rooms[worker], tips, NO_FORCES)
                 advance()
 
         list(pool.map(take, range(workers)))
