@@ -62,7 +62,8 @@ class Client:
         """
         Return a goal: tolerances as ``path`` or ``goal`` (joint, position, velocity).
 
-        ``late`` is the goal_time_tolerance [s], ``others`` are other fields.
+        ``late`` is the goal_time_tolerance [s]; ``component`` are the fields, path or goal, with a
+        tolerance of a multi-DOF joint.
         """
         kind = import_module('control_msgs.msg').JointTolerance
         goal = self.kind.Goal(trajectory=message)
@@ -70,6 +71,9 @@ class Client:
             for name, position, *velocity in tolerances.get(field, ()):
                 one = kind(name=name, position=position, velocity=sum(velocity, 0.0))
                 getattr(goal, f'{field}_tolerance').append(one)
+        kind = import_module('control_msgs.msg').JointComponentTolerance
+        for field in tolerances.get('component', ()):
+            getattr(goal, f'component_{field}_tolerance').append(kind(joint_name='base'))
         late = divmod(round(tolerances.get('late', 0.0) * SECOND), SECOND)
         goal.goal_time_tolerance.sec, goal.goal_time_tolerance.nanosec = late
         return goal
@@ -246,6 +250,8 @@ def test_violated_tolerance_aborts_and_holds(
         ({'joints': ['insertion'] * 2}, 'INVALID_JOINTS', 'got insertion, insertion'),
         ({'path': [('elbow', 1.0)]}, 'INVALID_JOINTS', 'path_tolerance must be some of'),
         ({'goal': [('insertion', -2.0)]}, 'INVALID_GOAL', 'goal_tolerance of insertion must be'),
+        ({'component': ['path']}, 'INVALID_GOAL', 'component_path_tolerance must be empty'),
+        ({'component': ['goal']}, 'INVALID_GOAL', 'must be empty, got base'),
         ({'points': []}, 'INVALID_GOAL', 'trajectory has no points'),
         ({'points': [(1.0, [9.0])]}, 'INVALID_GOAL', 'must'),
         ({'points': [(1.0, [0.03]), (0.5, [0.03])]}, 'INVALID_GOAL', 'increasing'),
