@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any, Generic, TypeVar
 
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import conversion
 from numba.core import types
 from numba.experimental import structref
 
@@ -56,6 +56,6 @@ def prepare_box(kind: Any) -> None:
         _box.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
 
 
-@compiled
+@conversion
 def _box(value: _Value) -> Boxed[_Value]:
     return Boxed(value)

@@ -130,6 +130,11 @@ def compiled(function: _Function) -> _Function:
     return cast(_Function, _Compiled(function, no_cpython_wrapper=True))
 
 
+def conversion(function: _Function) -> _Function:
+    """Compile a function that Python calls for any argument types; the caller prepares them."""
+    return cast(_Function, _Compiled(function))
+
+
 def inlined(function: _Function) -> _Function:
     """Compile a part of a hot loop into its callers: a call would pass each number of an array."""
     return cast(_Function, _Compiled(function, forceinline=True, no_cpython_wrapper=True))

@@ -7,19 +7,24 @@ from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 import re
+from time import thread_time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.srv import GetState
 from needle_controller import LAWS
+from needle_controller.controller_node import ControllerNode
 from needle_controller.reference.generator import REFERENCES
 from needle_controller.steering.law import DEFAULT_LAW, STEERING_LAWS
+from needle_controller.steering_node import SteeringNode
 from needle_dynamics.compiled.store import SUFFIX
+from needle_dynamics.plant_node import PlantNode
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.status import SteeringPhase, SteeringStatus
+from numba.core.event import install_recorder
 import pytest
 from rclpy.node import Node
 from rclpy.task import Future
@@ -33,6 +38,9 @@ LARGEST_IMPORT = 20_000
 
 #: Longest part of a line of ``-X importtime``: own and cumulative time [us], module.
 IMPORT = re.compile(r'import time:\s+\d+ \|\s+(\d+) \|\s*(\S+)')
+
+#: Longest processor time of `configure` and `activate` [s].
+LONGEST_BLOCK = 0.2
 
 #: Minimum number of sequential requests answered by a compiling node.
 RESPONSES = 10
@@ -267,6 +275,23 @@ def test_nodes_respond_while_they_compile(ros_graph: RosGraph, tmp_path: Path) -
         for number in re.findall(r'(\d+) functions compiled', path.read_text())
     ]
     assert sum(compiled) == len([*folder.glob(f'*{SUFFIX}')])
+
+
+@pytest.mark.parametrize('kind', [PlantNode, ControllerNode, SteeringNode])
+def test_configure_compiles_nothing_after_the_preparation(ros_graph: RosGraph, kind: Any) -> None:
+    """
+    The executor answers `get_state` and `~/stop` before and after `configure`, not within it.
+
+    The time of the processor is counted, which other processes do not lengthen.
+    """
+    node = ros_graph.add(kind, start=False)
+    node._preparation.complete()
+    with install_recorder('numba:compile') as compilations:
+        begun = thread_time()
+        assert node.start(), node.failure
+        blocked = thread_time() - begun
+    assert not compilations.buffer
+    assert blocked < LONGEST_BLOCK
 
 
 def _answers(graph: RosGraph, user: Node, name: str) -> Callable[[], list[str]]:
