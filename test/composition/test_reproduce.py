@@ -194,8 +194,10 @@ def test_results_are_pages_for_a_browser(
     assert main(['reproduce', what, '-o', str(tmp_path)]) == 0
     assert f'wrote {tmp_path}/reproduce.html' in capsys.readouterr().out
     seen = look_at(tmp_path / 'reproduce.html')
+    source = (tmp_path / 'reproduce.html').read_text(encoding='utf-8')
     for word in words:
-        assert word in seen.text
+        # On a phone the heads of a wide table are repeated in its cells by the style.
+        assert word in seen.text or f' data-head="{word}"' in source
     assert [width > 0 for _, width in seen.images] == [True] * pictures
     assert seen.requests == []
     assert seen.overflow == 0
