@@ -99,7 +99,8 @@ class RecorderNode(BaseNode):
         # The timers must run while the simulation time is paused.
         steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         steady_timer(self, _FLUSH_PERIOD, self._flush)
-        steady_timer(self, _TAKE_PERIOD, self._take)
+        # The timers of ROS 2 Kilted pass an argument to a callback that accepts one.
+        steady_timer(self, _TAKE_PERIOD, lambda: self._take())
 
     def cleanup(self) -> None:
         """Complete the bag after an error; otherwise it is complete already."""
