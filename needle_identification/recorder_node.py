@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 import sys
 import time
@@ -99,7 +100,8 @@ class RecorderNode(BaseNode):
         # The timers must run while the simulation time is paused.
         steady_timer(self, _DISCOVERY_PERIOD, self._discover)
         steady_timer(self, _FLUSH_PERIOD, self._flush)
-        steady_timer(self, _TAKE_PERIOD, self._take)
+        # The timers of ROS 2 Kilted pass an argument to a callback that accepts one.
+        steady_timer(self, _TAKE_PERIOD, partial(self._take, _AT_ONCE))
 
     def cleanup(self) -> None:
         """Complete the bag after an error; otherwise it is complete already."""
@@ -209,7 +211,7 @@ class RecorderNode(BaseNode):
             except OSError as error:
                 self._give_up(self._bag, error)
 
-    def _take(self, most: int = _AT_ONCE) -> None:
+    def _take(self, most: int) -> None:
         """Write the received messages with their time of reception by the middleware."""
         for topic, recorded in self._recorded.items():
             if self._bag is None:
