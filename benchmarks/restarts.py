@@ -15,6 +15,7 @@ import argparse
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+import re
 import sys
 from tempfile import TemporaryDirectory
 from time import monotonic
@@ -67,8 +68,10 @@ _STEERING: Final[dict[str, object]] = {
     'measurement_timeout': 5.0,
 }
 
-#: Words of a rejected target that name an action.
-_ACTIONS: Final = ('retract', 'clear_stop', 'send', 'wait')
+#: Actions in the line of a rejected target, as docs/steering.md and docs/safety.md document them.
+_ACTION: Final = re.compile(
+    r'retract (the needle|it) (to -?[\d.]+ mm )?first$|~/clear_stop releases$'
+)
 
 
 class RestartOutcome(NamedTuple):
@@ -189,8 +192,7 @@ class InterruptedInsertion:
         self._graph.spin_until(ended, 'the end', _HANGS)
         success, line = pending.outcome
         if not success:
-            named = any(word in line for word in _ACTIONS)
-            return RestartOutcome('named' if named else 'stopped', phase, line)
+            return RestartOutcome('named' if names_action(line) else 'stopped', phase, line)
         status = self._status()
         if status is not None and status.phase is SteeringPhase.STOPPED:
             return RestartOutcome('stopped', phase, status.fault)
@@ -198,6 +200,11 @@ class InterruptedInsertion:
         off = float(np.linalg.norm(np.array([x, y, z]) - TARGET))
         kind = 'target' if off < LARGEST_MISS else 'missed'
         return RestartOutcome(kind, phase, f'{1e3 * off:.2f} mm from the target')
+
+
+def names_action(line: str) -> bool:
+    """Return whether the line of a rejected target names an action of the user."""
+    return _ACTION.search(line) is not None
 
 
 def interrupt(after: float, logs: Path) -> RestartOutcome:

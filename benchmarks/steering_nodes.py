@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
@@ -32,7 +32,7 @@ from needle_controller.steering.motion import JointMotion
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NEEDLES
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.run import Event, follow, PlantRun, TRAJECTORY
 from needle_ros.contract import (
     BASE,
     BASE_WRENCH,
@@ -46,11 +46,11 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
     WRENCH_COMMAND,
 )
-from needle_ros.errors import ParameterError
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.system_state import Authority, Mode
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import JointPath
+from needle_ros.waiting_requests import WaitingRequests
 from needle_ros.wire import Reading
 
 #: Rate of samples [Hz], and start time [ns].
@@ -241,6 +241,9 @@ class RobotNode(GraphNode):
         graph, self._mode = self.graph, Mode.RUNNING
         self._moved = GUIDE_JOINTS
         self._log = RequestLog({JOINT_TRAJECTORY: self._moved}, steady=graph.steady)
+        self._waiting = WaitingRequests(self._log)
+        #: Time of the newest sample, 0 before the first [ns].
+        self._sampled = 0
         graph.run.begin()
         graph.run.commands.count_commanders(1)
         self.obey(graph.now)
@@ -256,6 +259,8 @@ class RobotNode(GraphNode):
         for name, _, values in measured:
             if name in ROUTES:
                 self.graph.post(name, _reading(name, now, values), self.name)
+        self._sampled = now
+        self._waiting.execute(now + PERIOD, self.graph.run, 0.0)
 
     def take(self, topic: str, content: Any, now: int) -> None:
         run = self.graph.run
@@ -271,7 +276,7 @@ class RobotNode(GraphNode):
             run.commands.offer(content.stamp, content.frame, force, torque, now)
 
     def _follow(self, move: JointMotion, now: int) -> None:
-        """Follow the guide in a trajectory."""
+        """Follow the guide in a trajectory, from its stamp on, as `PlantTrajectories`."""
         own = [k for k, name in enumerate(move.joints) if name in self._moved]
         joints = [move.joints[k] for k in own]
         stopped, log, topic = self.authority.reason, self._log, JOINT_TRAJECTORY
@@ -280,16 +285,11 @@ class RobotNode(GraphNode):
         if stopped:
             log.answer(topic, move.stamp, Verdict.SUPERSEDED, f'stopped: {stopped}')
             return
-        verdict, reason = Verdict.ACCEPTED, ''
-        content = {
-            'joints': joints, 'times': move.times.tolist(),
-            'positions': move.positions[:, own].tolist(), 'efforts': [[]] * len(move.times),
-        }  # fmt: skip
-        try:
-            self.graph.run.perform(Event(TRAJECTORY, content))
-        except ParameterError as error:
-            verdict, reason = Verdict.REJECTED, str(error)
-        log.answer(topic, move.stamp, verdict, reason, joints)
+        times, positions = move.times.tolist(), move.positions[:, own].tolist()
+        path = JointPath(joints, times, positions, efforts=[[]] * len(times))
+        request = self._waiting.add(topic, move.stamp, joints, partial(follow, path, joints))
+        sampled = self._sampled or now
+        self._waiting.execute(sampled + PERIOD, self.graph.run, request.elapsed(sampled))
 
     def request(self, word: str, now: int) -> None:
         self.authority.request(word)
@@ -298,9 +298,12 @@ class RobotNode(GraphNode):
     def watch(self, now: int) -> None:
         self.obey(now)
 
-    def obey(self, _now: int) -> None:
+    def obey(self, now: int) -> None:
         mode, before = self.authority.mode, self._mode
         self._mode = mode
+        if mode in (Mode.STOPPED, Mode.RETRACTING) and mode is not before:
+            self._log.supersede(now)
+            self._waiting.end(f'the system is {mode.value}', Verdict.SUPERSEDED)
         if mode is Mode.STOPPED and mode is not before:
             self._halt()
         self.graph.run.commands.stopped = mode is Mode.STOPPED and self.graph.robot == CONTRACT

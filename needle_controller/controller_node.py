@@ -345,9 +345,9 @@ class ControllerNode(ModelNode):
             # The plant moves the guide of a steered needle.
             return
         header, path = message.header, JointPath.from_message(message)
-        self._follow(nanoseconds(header.stamp), header.frame_id, path)
+        self._follow(nanoseconds(header.stamp), path, header.frame_id)
 
-    def _follow(self, stamp: int, frame: str, path: JointPath) -> None:
+    def _follow(self, stamp: int, path: JointPath, frame: str = '') -> None:
         self._act(self._supervisor.trajectory(stamp, frame, path, self.now()))
 
     def _who_publishes(self) -> dict[str, int]:

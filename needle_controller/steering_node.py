@@ -90,6 +90,9 @@ class SteeringNode(CompiledNode):
     KERNELS = (
         'needle_controller.compiled.guide_plan',
         'needle_controller.compiled.hypotheses',
+        # Of the laws `springs` and `broyden`.
+        'needle_dynamics.compiled.cut',
+        'needle_dynamics.compiled.cutting_needle',
         'needle_dynamics.compiled.superposition',
     )
 
@@ -158,6 +161,11 @@ class SteeringNode(CompiledNode):
         self._loop.authority = self._authority
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         if action := self.text(_ACTION):
+            if settings.continuous:
+                raise ParameterError(
+                    f'continuous must be false with {_ACTION}: needle and guide are moved by '
+                    'separate trajectories, of which the action follows one'
+                )
             self._client = TrajectoryClient(self, action, self._hear)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
         self._tip_expected = self.publisher(contract.TIP_EXPECTED)
@@ -254,10 +262,14 @@ class SteeringNode(CompiledNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Pass other nodes' answers to motions to the executive."""
+        if self._client is not None:
+            # The action answers; the topic is not used.
+            return
         for status in message.status:
             values = {one.key: one.value for one in status.values}
             answers = RequestStatus.from_values(values)
-            if answers.takes:
+            # With an action, receivers of the topic take none of the motions.
+            if answers.takes and self._client is None:
                 node = printable(node_of(status.name).rpartition('/')[2])
                 self._hear(node, answers)
 

@@ -135,7 +135,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return self._command(ForceCommand(now))
 
     def _begin(self, now: int) -> None:
-        """Discard all measurements and requests."""
         self._waiting = WaitingRequests(self.requests)
         self._time = now
         self.safety.begin(now)
@@ -188,11 +187,9 @@ class Supervisor(StateMachine[ForceCommand]):
         return answer
 
     def discard(self, reason: str) -> None:
-        """Discard the requests that await their start, for a reason."""
         self._waiting.discard(reason, (INSERTION,))
 
     def hold(self) -> None:
-        """Brake and hold."""
         if self.controller is not None:
             self.controller.stop_motion()
 
@@ -394,7 +391,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self.events.last_rejection = command.notice
             self.events.add(Severity.ERROR, command.notice)
             if controller.target is None:
-                self.requests.end(command.notice)
+                self._waiting.end(command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         following, depth, load = self._following, measured.depth, self.bending.load

@@ -173,14 +173,15 @@ class PlantNode(ModelNode):
         self._set_fault({})
         self._display = PlantDisplay(self)
         self._display.use_frames(self.text('frame_prefix'))
-        self._trajectories = PlantTrajectories(
-            self, plant_run, lambda: self._time.simulated(self.now())
-        )
         self._commanders = PlantCommanders(
             self, self._on_command, self._on_joint_commands, self._check_commanders
         )
         if self.get_parameter('publish_tf').value:
             self._display.offer_transform(constants.mode)
+        # `cleanup` destroys its action: nothing after it may fail.
+        self._trajectories = PlantTrajectories(
+            self, plant_run, lambda: self._time.simulated(self.now())
+        )
         self._run = plant_run
         if publishes:
             self._samples.offer_clock()
@@ -347,9 +348,10 @@ class PlantNode(ModelNode):
         return f'stepped to {self._time.stamp / NANOSECONDS:.6f} s'
 
     def _reset(self, plant_run: PlantRun, _request: Trigger.Request) -> str:
-        plant_run.perform(Event(RESET))
+        # The joints of a goal hold where they are measured: before the reset.
         self._trajectories.end('the plant was reset')
-        self._trajectories.requests.supersede(self._time.simulated(self.now()))
+        plant_run.perform(Event(RESET))
+        self._trajectories.begin()
         self._halted = None
         self._set_fault({})
         return 'needle and noise reset; time continues'

@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
+from typing import Final
 
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.joint_commands import moved_joints
-from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.run import follow, PlantRun
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
-from needle_ros.errors import ParameterError, printable
+from needle_ros.errors import printable
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
@@ -19,14 +20,17 @@ from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.waiting_requests import WaitingRequests
 from trajectory_msgs.msg import JointTrajectory
 
+_INACTIVE: Final = 'the plant is not active'
+
 
 class PlantTrajectories:
     """
     Receive trajectories as messages and goals, execute each once, and acknowledge it.
 
     A trajectory starts at the sample nearest before its stamp: it waits for this sample, or joins
-    if it arrives later. Without a stamp, or in a plant that is not active, it starts on arrival.
-    While `stopped` is not empty, none is executed. `simulated` returns the simulated time [ns].
+    if it arrives later. Without a stamp, it starts on arrival, or with the activation of a plant
+    that is not active, which rejects those with a stamp. While `stopped` is not empty, none is
+    executed. `simulated` returns the simulated time [ns].
     """
 
     def __init__(self, node: BaseNode, plant_run: PlantRun, simulated: Callable[[], int]) -> None:
@@ -44,6 +48,8 @@ class PlantTrajectories:
         self._sampled, self._period = 0, round(NANOSECONDS / constants.own.rate)
         self.rejected = 0
         self.stopped = ''
+        #: Error of the plant, after which it takes no sample; '' without one.
+        self._halted = ''
         self._action: TrajectoryAction | None = None
         if self.received:
             node.subscribe(topic, self._on_trajectory)
@@ -58,8 +64,8 @@ class PlantTrajectories:
             )
 
     def begin(self) -> None:
-        """Await the first sample of an active plant."""
-        self._sampled = 0
+        """Await the first sample of a plant that is active, or was reset."""
+        self._sampled, self._halted = 0, ''
 
     def destroy(self) -> None:
         """End all goals, and destroy the action."""
@@ -67,16 +73,19 @@ class PlantTrajectories:
             self._action.destroy()
 
     def end(self, reason: str) -> None:
-        """Discard the trajectories that wait, and end the goals, whose joints hold."""
+        """Discard the trajectories sent until now, and end the goals, whose joints hold."""
+        self.requests.supersede(self._simulated())
         self._waiting.end(reason, Verdict.SUPERSEDED)
 
     def halt(self, reason: str) -> None:
-        """Discard all trajectories of a plant that cannot move, nor hold."""
+        """Discard all trajectories of a plant that cannot move, nor hold, until a reset."""
+        self._halted = reason
         self.requests.end(reason, self._moved)
         self.end(reason)
 
     def displace(self, reason: str, joints: Collection[str]) -> None:
-        """End the goals of joints that something else moves."""
+        """Discard the trajectories of joints that something else moves."""
+        self._discard(joints, reason)
         self.requests.end(reason, joints)
 
     def _discard(self, joints: Collection[str], reason: str) -> None:
@@ -95,36 +104,33 @@ class PlantTrajectories:
 
     def _begin(self, until: int, elapsed: float) -> None:
         """Execute the requests that start before a time [ns], at a time after their start [s]."""
-        while (request := self._waiting.take(until)) is not None:
-            topic, stamp, moved, act = request
-            try:
-                act(self._run, elapsed)
-            except ParameterError as error:
-                self._reject(str(error))
-                self.requests.reject(topic, stamp, error)
-            else:
-                self.requests.answer(topic, stamp, Verdict.ACCEPTED, joints=moved)
+        for error in self._waiting.execute(until, self._run, elapsed):
+            self._reject(str(error))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         """Execute a trajectory if it is new and valid, or let it wait, and acknowledge it."""
-        self._follow(nanoseconds(message.header.stamp), '', JointPath.from_message(message))
+        self._follow(nanoseconds(message.header.stamp), JointPath.from_message(message))
 
-    def _follow(self, stamp: int, frame: str, path: JointPath) -> None:
+    def _follow(self, stamp: int, path: JointPath) -> None:
         topic = contract.JOINT_TRAJECTORY
         # In mode `simulation`, `insertion` is addressed to the controller.
         moved = tuple(name for name in path.joints or self._moved if name in self._moved)
-        now = self._simulated() if self._node.is_active else stamp
-        known = self.requests.check(topic, stamp, now, frame, moved)
+        now = self._simulated()
+        known = self.requests.check(topic, stamp, now, joints=moved)
         if known is not None:
             if known.verdict in (Verdict.REJECTED, Verdict.LATE):
                 self._reject(known.reason)
-        elif self.stopped:
+        elif self.stopped or self._halted:
             # A stop of the node `steering` is not an error of its sender.
-            self.requests.answer(topic, stamp, Verdict.SUPERSEDED, self.stopped)
+            verdict = Verdict.SUPERSEDED if self.stopped else Verdict.REJECTED
+            self.requests.answer(topic, stamp, verdict, self.stopped or self._halted)
+        elif stamp and not self._node.is_active:
+            self._reject(_INACTIVE)
+            self.requests.reject(topic, stamp, _INACTIVE)
         else:
             # Not active, or before the first sample.
             self._sampled = self._sampled if self._node.is_active and self._sampled else now
-            request = self._waiting.add(topic, stamp, moved, partial(_follow, path, moved))
+            request = self._waiting.add(topic, stamp, moved, partial(follow, path, moved))
             # A stop waits for no sample.
             until = now + 1 if path.stops else 0
             due = max(self._sampled + self._period, until)
@@ -141,15 +147,3 @@ class PlantTrajectories:
         """Publish the status of the node if it lacks results of requests."""
         if self.requests.due():
             self._node.publish_diagnostics()
-
-
-def _follow(path: JointPath, moved: Sequence[str], plant_run: PlantRun, elapsed: float) -> None:
-    """Follow a trajectory, at a time after its start [s]; without points, stop its joints."""
-    if path.stops:
-        if path.joints and not moved:
-            raise ParameterError(f'moves none of the joints {list(path.joints)}')
-        plant_run.hold(moved)
-        return
-    joints, times, positions, _, efforts = path.after(elapsed)
-    content = {'joints': joints, 'times': times, 'positions': positions, 'efforts': efforts}
-    plant_run.perform(Event(TRAJECTORY, content))

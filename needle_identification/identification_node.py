@@ -144,10 +144,6 @@ class IdentificationNode(BaseNode):
         self._applications: list[_Application] = []
         self._setters: dict[str, Client] = {}
         self._calls = Calls(self)
-        self._friction = self.publisher(contract.FRICTION, always=True)
-        self._stiffness = self.publisher(contract.STIFFNESS, always=True)
-        self.create_service(Trigger, '~/identify', self._on_identify)
-        _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
 
     # Transitions.
 
@@ -168,6 +164,10 @@ class IdentificationNode(BaseNode):
             name: self.create_client(SetParameters, f'{name}/set_parameters')
             for name in self.get_parameter('apply_to').value
         }
+        self._friction = self.publisher(contract.FRICTION, always=True)
+        self._stiffness = self.publisher(contract.STIFFNESS, always=True)
+        self.create_service(Trigger, '~/identify', self._on_identify)
+        _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
 
     def cleanup(self) -> None:
         """Disconnect from the nodes of ``apply_to``."""

@@ -95,13 +95,11 @@ class PlayerNode(BaseNode):
         self._left_out: dict[str, str] = {}
         self._contested: set[str] = set()
         self._played = 0
-        self.create_service(SetBool, '~/pause', self._on_pause)
-        self.create_service(Trigger, '~/step', self._on_step)
 
     # Transitions.
 
     def configure(self) -> None:
-        """Open the recording and create its publishers."""
+        """Open the recording and create its publishers and the services."""
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a recording to play, got nothing')
@@ -130,6 +128,8 @@ class PlayerNode(BaseNode):
             self._outputs[name] = self.create_publisher(kinds[name], name, qos)
         if publishes:
             self._clock_publisher = self.create_publisher(ClockMessage, '/clock', _CLOCK)
+        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.create_service(Trigger, '~/step', self._on_step)
 
     def _chosen(
         self, path: Path, topics: Sequence[BagTopic], publishes: bool

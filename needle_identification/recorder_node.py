@@ -76,7 +76,6 @@ class RecorderNode(BaseNode):
         self._left_out: set[str] = set()
         #: Stamp of the newest recorded sample [ns]; a plant may wait for it.
         self._recorded_stamp = 0
-        self._reports = self.publisher(RECORDED, always=True)
         #: Readers of the topics that contain each sample.
         self._sampled = {
             self.resolve_topic_name(topic.name): MessageReader(topic.type_name).read
@@ -84,12 +83,6 @@ class RecorderNode(BaseNode):
         }
         #: Publication sequence number of the newest message of each topic.
         self._newest: dict[str, int] = {}
-        self.create_service(Trigger, '~/start', self._on_start)
-        self.create_service(Trigger, '~/stop', self._on_stop)
-        # The timers must run while the simulation time is paused.
-        steady_timer(self, _DISCOVERY_PERIOD, self._discover)
-        steady_timer(self, _FLUSH_PERIOD, self._flush)
-        steady_timer(self, _TAKE_PERIOD, self._take)
 
     def configure(self) -> None:
         path = self.text('path')
@@ -100,6 +93,18 @@ class RecorderNode(BaseNode):
         names = self.get_parameter('topics').value
         self._all = '*' in names
         self._names = {self.resolve_topic_name(name) for name in names if name != '*'}
+        self._reports = self.publisher(RECORDED, always=True)
+        self.create_service(Trigger, '~/start', self._on_start)
+        self.create_service(Trigger, '~/stop', self._on_stop)
+        # The timers must run while the simulation time is paused.
+        steady_timer(self, _DISCOVERY_PERIOD, self._discover)
+        steady_timer(self, _FLUSH_PERIOD, self._flush)
+        steady_timer(self, _TAKE_PERIOD, self._take)
+
+    def cleanup(self) -> None:
+        """Complete the bag after an error; otherwise it is complete already."""
+        if self._bag is not None:
+            self._end(self._bag)
 
     def activate(self) -> None:
         self._begin()

@@ -82,7 +82,7 @@ class LifeCycle:
         if number not in valid.values():
             self._refuse(
                 f'transition {asked.label or asked.id} is not valid in state '
-                f'{machine.current_state[1]}; valid are {", ".join(valid)}'
+                f'{machine.current_state[1]}; valid are {", ".join(valid) or "none"}'
             )
         elif number != _CONFIGURE or self._preparation.is_complete:
             response.success = self._trigger(number)

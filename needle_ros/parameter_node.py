@@ -17,6 +17,7 @@ from sys import float_info
 from typing import Any, ClassVar, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.quantities import quantity
 from needle_ros.settings import check_choice, constraints, from_values, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
@@ -68,8 +69,8 @@ class ParameterNode(LifecycleNode):
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
-        #: Names of numeric parameters.
-        self._numbers: set[str] = set()
+        #: Units of the numeric parameters.
+        self._units: dict[str, str] = {}
         self.shared: frozenset[str] = frozenset()
         self._configured = False
         self.add_on_set_parameters_callback(self._check_change)
@@ -121,7 +122,7 @@ class ParameterNode(LifecycleNode):
                     FloatingPointRange(from_value=low, to_value=high)
                 ]
             if 'unit' in meta:
-                self._numbers.add(prefix + item.name)
+                self._units[prefix + item.name] = meta['unit']
             if isinstance(default, tuple):
                 default = list(default)
             self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
@@ -143,10 +144,10 @@ class ParameterNode(LifecycleNode):
         return from_values(kind, values, prefix)
 
     def _meant(self, name: str, value: Any) -> Any:
-        """Parse numbers that PyYAML reads as strings, such as 1e-3."""
-        if name in self._numbers and isinstance(value, str):
-            with suppress(ValueError):
-                return float(value)
+        """Parse numbers that PyYAML reads as strings, such as 1e-3 and 5mm."""
+        if name in self._units and isinstance(value, str):
+            with suppress(ParameterError):
+                return quantity(value, self._units[name])
         return value
 
     def _value(self, name: str) -> Any:
@@ -226,7 +227,7 @@ class ParameterNode(LifecycleNode):
             )
         try:
             if parameters:
-                self.change({parameter.name: parameter.value for parameter in parameters})
+                self.change({one.name: self._meant(one.name, one.value) for one in parameters})
         except NeedleError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

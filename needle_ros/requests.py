@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from needle_ros.contract import REQUEST_AGE, Stamp, Topic
 from needle_ros.errors import NeedleError, printable
-from needle_ros.timing import apart, NANOSECONDS
+from needle_ros.timing import apart, NANOSECONDS, parse_nanoseconds
 from needle_ros.trajectories import LateTrajectoryError
 
 #: Interval of repetitions without an answer [s], and the maximum number of repetitions.
@@ -104,8 +104,9 @@ class RequestStatus:
             elif key.startswith(_REQUEST):
                 topic, _, stamp = key[len(_REQUEST) :].rpartition(' ')
                 verdict, _, reason = value.partition(': ')
-                if stamp.isdecimal() and verdict in _VERDICTS:
-                    answers.append(Acknowledgement(topic, int(stamp), Verdict(verdict), reason))
+                time = parse_nanoseconds(stamp)
+                if time is not None and verdict in _VERDICTS:
+                    answers.append(Acknowledgement(topic, time, Verdict(verdict), reason))
         return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
@@ -223,7 +224,8 @@ class RequestLog:
                 del self._watched[topic.name, stamp]
             watched.tell(made, ())
         if verdict is Verdict.ACCEPTED:
-            self.end(f'a newer {topic.name} is followed', {*joints}, besides=stamp)
+            newer = f'a newer {topic.name} is followed'
+            self.end(newer, {*joints}, besides=(topic.name, stamp))
         return made
 
     def watch(self, topic: Topic, stamp: int, joints: Iterable[str], tell: Listener) -> int:
@@ -232,7 +234,7 @@ class RequestLog:
 
         Returns the stamp [ns] of the request, made unique.
         """
-        while (topic.name, stamp) in self._answers:
+        while {(topic.name, stamp)} & (self._answers.keys() | self._watched.keys()):
             stamp += 1
         self._watched[topic.name, stamp] = _Watched(frozenset(joints), tell)
         return stamp
@@ -242,16 +244,22 @@ class RequestLog:
         self._watched.pop((topic.name, stamp), None)
 
     def end(
-        self, reason: str, moved: Collection[str] | None = None, *, besides: int | None = None
+        self,
+        reason: str,
+        moved: Collection[str] | None = None,
+        *,
+        besides: tuple[str, int] | None = None,
     ) -> None:
         """
-        Report the end of the watched requests, except for one stamp [ns].
+        Report the end of the watched requests, except for one by topic and stamp [ns].
 
         ``moved`` are the joints that something else moves from now on: only requests of one of
         them end. Without it all requests end.
         """
         for key, watched in [*self._watched.items()]:
-            if key[1] != besides and (moved is None or watched.joints & {*moved}):
+            concerned = moved is None or watched.joints & {*moved}
+            # A report may end other requests.
+            if key != besides and concerned and key in self._watched:
                 del self._watched[key]
                 ended = Acknowledgement(*key, Verdict.SUPERSEDED, printable(reason))
                 watched.tell(ended, moved or ())

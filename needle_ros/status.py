@@ -51,8 +51,12 @@ _Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
 
 
 def node_of(name: str) -> str:
-    """Return the node in the name of a DiagnosticStatus, with or without a task."""
-    return name.partition(':')[0]
+    """
+    Return the node in the name of a DiagnosticStatus, with or without the task of these nodes.
+
+    Nodes of others keep their tasks, so that each of their statuses has its own name.
+    """
+    return name.removesuffix(f': {TASK}')
 
 
 def entry(default: Any, unit: str, description: str) -> Any:

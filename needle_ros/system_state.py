@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import islice
 from time import time_ns
 from typing import Final, NamedTuple
 
 from needle_ros.errors import printable
+from needle_ros.timing import NANOSECONDS, parse_nanoseconds
 
 #: Keys of a state as values of a DiagnosticStatus.
 _MODE: Final = 'mode'
@@ -25,6 +27,17 @@ _MOTION: Final = 'motion'
 
 _PAUSED: Final = 'paused'
 _RETRACTING: Final = 'retracting'
+
+#: Maximum number of nodes in a state; of values in a message, two for each node and two; and of
+#: characters of a key, a word and the longest name of a node in ROS.
+_MOST_NODES: Final = 64
+_MOST_VALUES: Final = 2 * _MOST_NODES + 2
+_LONGEST_KEY: Final = len(_CLEARED) + 255
+
+#: Maximum time of an entry after the present [ns], 100 years, more than between a clock that is
+#: set and one that begins in 1970. Later requests follow each entry, so that their times, too,
+#: must be accepted and have at most 19 digits.
+_LARGEST_LEAD: Final = 100 * 365 * 24 * 3600 * NANOSECONDS
 
 #: Default insertion depth at the end of a retraction [m].
 RETRACT_DEPTH: Final = 0.01
@@ -55,6 +68,9 @@ class Stop(NamedTuple):
 
     time: int
     reason: str
+
+
+_NO_STOP: Final = Stop(0, '')
 
 
 class _Motion(NamedTuple):
@@ -102,12 +118,22 @@ class SystemState:
         return max(self.motion.time, *self.cleared.values(), *times, 0)
 
     def merged(self, other: SystemState) -> SystemState:
-        """Return the newest entries of two states."""
+        """Return the newest entries of two states; stops in effect are kept before others."""
         stops, cleared = dict(self.stops), dict(self.cleared)
         for node, stop in other.stops.items():
             stops[node] = max(stop, stops.get(node, stop))
         for node, time in other.cleared.items():
             cleared[node] = max(time, cleared.get(node, time))
+        names = {*stops, *cleared}
+        if len(names) > _MOST_NODES:
+
+            def priority(node: str) -> tuple[bool, int, str]:
+                stop, end = stops.get(node, _NO_STOP).time, cleared.get(node, 0)
+                return stop > end, max(stop, end), node
+
+            for node in sorted(names, key=priority)[:-_MOST_NODES]:
+                stops.pop(node, None)
+                cleared.pop(node, None)
         return SystemState(stops, cleared, max(self.motion, other.motion))
 
     def to_values(self) -> dict[str, str]:
@@ -125,17 +151,18 @@ class SystemState:
     def from_values(cls, values: Mapping[str, str]) -> SystemState:
         """Parse a state from values of a DiagnosticStatus; invalid entries are ignored."""
         stops, cleared, motion = {}, {}, _Motion()
-        for key, value in values.items():
+        for key, value in islice(values.items(), _MOST_VALUES):
             number, _, rest = value.partition(' ')
-            if not (number.isascii() and number.isdecimal()):
+            time = parse_nanoseconds(number)
+            if time is None or len(key) > _LONGEST_KEY:
                 continue
             if key.startswith(_STOP) and rest:
-                stops[key[len(_STOP) :]] = Stop(int(number), printable(rest))
+                stops[key[len(_STOP) :]] = Stop(time, printable(rest))
             elif key.startswith(_CLEARED):
-                cleared[key[len(_CLEARED) :]] = int(number)
+                cleared[key[len(_CLEARED) :]] = time
             elif key == _MOTION:
                 words = rest.split()
-                motion = _Motion(int(number), _RETRACTING in words, _PAUSED in words)
+                motion = _Motion(time, _RETRACTING in words, _PAUSED in words)
         return cls(stops, cleared, motion)
 
 
@@ -167,7 +194,11 @@ class Authority:
         return max(self._time(), self.state.newest + 1)
 
     def receive(self, state: SystemState) -> None:
-        """Merge the state of another node."""
+        """Merge the state of another node, unless its time is one that no clock has."""
+        if state.newest <= self._time() + _LARGEST_LEAD:
+            self._merge(state)
+
+    def _merge(self, state: SystemState) -> None:
         merged = self.state.merged(state)
         self.changed |= merged != self.state
         self.state = merged
@@ -176,12 +207,12 @@ class Authority:
         """Stop the system, for a reason that is not empty; a stop of this node is kept."""
         own = self.state.stops.get(self.node)
         if own is None or own.time <= self.state.cleared.get(self.node, 0):
-            self.receive(SystemState(stops={self.node: Stop(self._next(), printable(reason))}))
+            self._merge(SystemState(stops={self.node: Stop(self._next(), printable(reason))}))
 
     def clear(self) -> None:
         """Clear all stops that this node knows: nothing moves until the next request."""
         cleared = {node: stop.time for node, stop in self.state.stops.items()}
-        self.receive(SystemState(cleared=cleared, motion=_Motion(self._next())))
+        self._merge(SystemState(cleared=cleared, motion=_Motion(self._next())))
 
     def run(self) -> None:
         """End a retraction, for another motion that a user has requested."""
@@ -190,7 +221,7 @@ class Authority:
 
     def _change(self, **change: bool) -> None:
         motion = self.state.motion._replace(time=self._next(), **change)
-        self.receive(SystemState(motion=motion))
+        self._merge(SystemState(motion=motion))
 
     def request(self, word: str, obstacle: str = '') -> tuple[bool, str]:
         """

@@ -72,7 +72,7 @@ class TrajectoryAction:
     joints : collection of str
         Joints that it moves.
     request : callable
-        Takes a trajectory with stamp [ns] and frame, as if it arrived on the topic.
+        Takes a trajectory with its stamp [ns], as if it arrived on the topic.
     hold : callable
         Holds joints at once.
     discard : callable
@@ -87,7 +87,7 @@ class TrajectoryAction:
         node: BaseNode,
         requests: RequestLog,
         joints: Collection[str],
-        request: Callable[[int, str, JointPath], None],
+        request: Callable[[int, JointPath], None],
         hold: Callable[[Collection[str]], None],
         discard: Callable[[Collection[str], str], None],
         now: Callable[[], int],
@@ -131,7 +131,6 @@ class TrajectoryAction:
     def _on_goal(self, handle: ServerGoalHandle) -> None:
         """Turn a goal into a request."""
         handle.execute()
-        header = handle.request.trajectory.header
         try:
             if not self._node.is_active:
                 raise ParameterError(_INACTIVE)
@@ -147,10 +146,11 @@ class TrajectoryAction:
         def tell(answer: Acknowledgement, moved: Collection[str]) -> None:
             self._on_answer(execution, answer, moved)
 
-        stamp = nanoseconds(header.stamp) or self._now()
+        stamp = nanoseconds(handle.request.trajectory.header.stamp) or self._now()
         goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, tell)
         self._running[goal.stamp] = execution
-        self._request(goal.stamp, header.frame_id, goal.trajectory)
+        # Joint positions have no frame: MoveIt sends the frame of its model.
+        self._request(goal.stamp, goal.trajectory)
 
     def _on_answer(
         self, execution: _Execution, answer: Acknowledgement, moved: Collection[str]
@@ -161,8 +161,9 @@ class TrajectoryAction:
         if not answer.refused:
             return
         del self._running[goal.stamp]
-        if goal.moves:
-            self._hold(goal.joints - {*moved})
+        left = goal.joints - {*moved}
+        if goal.moves and left:
+            self._hold(left)
         self._finish(execution.handle, outcome_of(answer, self._now()))
 
     def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:

@@ -85,7 +85,7 @@ class TrajectoryGoal:
         Convert a goal of the action, for the joints of a receiver.
 
         Raises `UnknownJointError` for other joints, and `ParameterError` for a goal without
-        points, with a multi-DOF joint, or with an invalid tolerance.
+        points, with a multi-DOF joint or its tolerances, or with an invalid tolerance.
         """
         trajectory = JointPath.from_message(message.trajectory)
         _check_joints('joint_names', trajectory.joints, joints)
@@ -93,6 +93,10 @@ class TrajectoryGoal:
             raise ParameterError('trajectory has no points; cancel a goal to stop its joints')
         if message.multi_dof_trajectory.joint_names or message.multi_dof_trajectory.points:
             raise ParameterError('multi_dof_trajectory must be empty')
+        for field in ('component_path_tolerance', 'component_goal_tolerance'):
+            # They are for multi-DOF joints.
+            if names := [one.joint_name for one in getattr(message, field)]:
+                raise ParameterError(f'{field} must be empty, got {", ".join(names)}')
         return cls(
             trajectory,
             _tolerances('path_tolerance', message.path_tolerance, trajectory.joints),
@@ -124,7 +128,8 @@ class TrajectoryGoal:
 
 def outcome_of(answer: Acknowledgement, now: int) -> Outcome:
     """Return the outcome of a goal whose request is refused at a time [ns]."""
-    is_old = is_stale(answer.stamp, now) and answer.stamp < now
+    rejected = answer.verdict is Verdict.REJECTED
+    is_old = rejected and is_stale(answer.stamp, now) and answer.stamp < now
     if answer.verdict is Verdict.LATE or is_old:
         return Outcome(ErrorCode.OLD_HEADER_TIMESTAMP, answer.reason)
     return Outcome(ErrorCode.INVALID_GOAL, answer.reason)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 from needle_ros.contract import REQUEST_AGE, Topic
+from needle_ros.errors import ParameterError
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS
 
@@ -59,6 +60,24 @@ class WaitingRequests:
                 self._waiting.remove(one)
                 return one
         return None
+
+    def execute(self, until: int, context: Any, elapsed: float) -> list[ParameterError]:
+        """
+        Execute and answer the requests sent before a time [ns]; return the errors.
+
+        `context` is the object for their actions, `elapsed` the time since their stamps [s].
+        """
+        errors = []
+        while (request := self.take(until)) is not None:
+            topic, stamp, joints, act = request
+            try:
+                act(context, elapsed)
+            except ParameterError as error:
+                errors.append(error)
+                self._requests.reject(topic, stamp, error)
+            else:
+                self._requests.answer(topic, stamp, Verdict.ACCEPTED, joints=joints)
+        return errors
 
     def discard(self, reason: str, joints: Iterable[str]) -> None:
         """Discard the requests of some joints, superseded for a reason."""

@@ -146,9 +146,8 @@ class Rig:
             ),
             'the recorder',
         )
-        message = _trajectory(protocol)
-        message.header.stamp = node.get_clock().now().to_msg()
-        self._trajectory.publish(message)
+        # Without a stamp it starts with the activation.
+        self._trajectory.publish(_trajectory(protocol))
         self._trajectory.wait_for_all_acked(Duration(seconds=10.0))
         self._wrench.message = None
         graph.change(node, 'plant', ACTIVATE)

@@ -20,7 +20,7 @@ from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import InsertionStrategy
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
-from needle_controller.steering.insertion_status import describe, describe_phase
+from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl
@@ -116,7 +116,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if self.planner.job is not None:
             return Phase.PLANNING
         if self._retraction is not None:
-            return Phase.IDLE if self._retraction.done else Phase.RETRACTING
+            return Phase.IDLE if self._retraction.ended else Phase.RETRACTING
         if self._insertion is None:
             return Phase.IDLE
         return Phase.STOPPED if self.fault else self._insertion.phase
@@ -125,6 +125,10 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def steers(self) -> bool:
         """Whether an insertion is under way."""
         return self.phase in (Phase.GUIDING, Phase.INSERTING, Phase.MEASURING)
+
+    @property
+    def _moves(self) -> bool:
+        return self.phase in _MOVING and self._motions.known
 
     @property
     def busy(self) -> bool:
@@ -265,29 +269,30 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def _change_mode(self, mode: Mode, before: Mode, now: int) -> JointMotion | None:
         if mode is Mode.STOPPED:
             return self.halt(self.authority.reason, now)
-        # A stop before is not sent again: it would end the motion that a user requests.
         self._motions.discard_stop()
         if mode is Mode.RETRACTING:
-            return self._retract(now)
+            return self._retract(before, now)
         if mode is Mode.PAUSED:
-            return self._motions.pause(now) if self.phase in _MOVING else None
+            return self._motions.pause(now) if self._moves else None
+        if self._retraction is not None:
+            # A user moves the needle by the controller.
+            self._retraction.ended = True
         if before is Mode.PAUSED:
             return self._run(lambda insertion: insertion.resume(now), now)
         return None
 
-    def _retract(self, now: int) -> JointMotion | None:
-        """Withdraw the needle, and return the guide to its zero; this ends an insertion."""
+    def _retract(self, before: Mode, now: int) -> JointMotion | None:
+        """End an insertion; the retraction begins with the next positions of the joints."""
         self.requests.supersede(now)
         self._cancel(Verdict.SUPERSEDED, 'the needle is retracted')
-        if not self._motions.known:
-            return None
+        halt = None
         if self.steers:
+            halt = self._motions.pause(now) if self._moves else None
             self.fault = 'a user has requested the retraction'
-        self._motions.monitor.forget()
-        if self._retraction is None or self._retraction.done:
-            self._retraction = Retraction(self._motions, self.settings)
-            self.events.add(Severity.INFO, 'the needle is withdrawn')
-        return self._retraction.follow(now)
+        if before is Mode.PAUSED or self._retraction is None or self._retraction.ended:
+            self._motions.monitor.forget()
+            self._retraction = Retraction(self._motions, self.settings, self.events)
+        return halt
 
     def _stop(self, why: str, now: int) -> JointMotion | None:
         """Stop the whole system: axial force, needle and guide."""
@@ -308,10 +313,12 @@ class SteeringExecutive(StateMachine[JointMotion]):
         """
         self.requests.supersede(now)
         self._cancel(Verdict.REJECTED, f'stopped: {why}')
-        moves = self.phase in _MOVING
+        moves = self._moves
         if not (self.steers or moves):
             return None
         self.fault, self._retraction = why, None
+        if self._obeyed is Mode.RETRACTING:
+            self._retraction = Retraction(self._motions, self.settings, self.events)
         self._motions.monitor.forget()
         self.events.add(Severity.ERROR, f'stopped: {why}')
         return self._motions.stop(now) if moves else None
@@ -331,13 +338,13 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
         """
         refusal = self._motions.monitor.hear(node, status)
-        if not refusal:
+        if refusal is None:
             return None
         if self.steers:
-            return self._stop(refusal, now)
-        # Only once: the answer is repeated each second.
-        self._motions.monitor.forget()
-        if self.phase is Phase.STOPPED:
+            return self._stop(str(refusal), now)
+        if self._retraction is not None:
+            self._retraction.hear(refusal)
+        elif self.phase is Phase.STOPPED:
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
 
@@ -354,8 +361,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
         """
         found = dict(zip(reading.names, reading.values[0], strict=False))
-        missing = [name for name in self.settings.joints if name not in found]
-        if missing:
+        if missing := [name for name in self.settings.joints if name not in found]:
             got = f'got names {list(reading.names)}'
             self.events.reject(f'joint_states lacks a position of {", ".join(missing)}, {got}')
             return None
@@ -372,8 +378,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             if self.phase is Phase.DONE and motions.beyond:
                 self.fault = f'after the insertion {motions.astray()}'
                 return self._stop(self.fault, now)
-            retraction = self._retraction
-            return None if retraction is None else retraction.follow(now)
+            return None if self._retraction is None else self._retraction.follow(stamp, now)
         if motions.astray():
             return self._stop(motions.astray(), now)
         if self.phase is Phase.MEASURING:
@@ -440,14 +445,17 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return halt
         if self.phase is Phase.PLANNING:
             return self._begin_if_planned(now)
+        silence = self._joint_stream.silence(now)
+        silent = f'no joint_states received within {silence:.2f} s' if silence > timeout else ''
         if not self.steers:
+            if self._retraction is not None and self._obeyed is Mode.RETRACTING:
+                self._retraction.watch(silent)
             return None
         for stream in self._streams:
             if stream.publishers > 1:
                 return self._stop(f'{stream.publishers} nodes publish {stream.name}', now)
-        silence = self._joint_stream.silence(now)
-        if silence > timeout:
-            return self._stop(f'no joint_states received within {silence:.2f} s', now)
+        if silent:
+            return self._stop(silent, now)
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
@@ -487,14 +495,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
             last_rejection=self.events.last_rejection,
             requests=self.requests.status(),
         )
-        if self.phase is Phase.STOPPED:
-            return Severity.ERROR, f'stopped: {self.fault}', status
-        if warning:
-            return Severity.WARNING, warning, status
-        if insertion is not None and self.phase is Phase.DONE:
-            line, severity = insertion.law.outcome()
-            return severity, f'done: {line}', status
-        line = describe_phase(status)
-        if self.phase is Phase.IDLE and insertion is None:
-            line += self.planner.advice(float(self._motions.at[0]))
-        return Severity.INFO, line, status
+        failure = '' if self._retraction is None else self._retraction.failure
+        advice = '' if insertion else self.planner.advice(float(self._motions.at[0]))
+        return (*summarize(status, insertion, failure, advice), status)

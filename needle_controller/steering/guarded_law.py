@@ -193,7 +193,7 @@ class GuardedLaw:
         return to
 
     def outcome(self) -> tuple[str, Severity]:
-        """Describe the tip at the end; a warning if it is not within 1 mm of the target."""
+        """Describe the tip at the end; a warning unless it is within 1 mm with its interval."""
         there, measured = self.expected, self.measured
         if measured is None:
             return 'the needle is at the target depth; its tip is not measured', Severity.WARNING
@@ -203,12 +203,15 @@ class GuardedLaw:
             tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
         x, z = np.asarray(self.law.target)
         miss = float(np.linalg.norm(tip - (x, self.depths[-1], z)))
+        most = miss + float(half.max())
         words = ', '.join(
             f'{axis} = {1e3 * center:.2f} ± {1e3 * width:.2f} mm'
             for axis, center, width in zip('xyz', tip, half, strict=True)
         )
         line = f'the tip is at {words} (95 %), {1e3 * miss:.2f} mm from the target'
-        return line, Severity.INFO if miss <= HIT else Severity.WARNING
+        if most <= HIT:
+            return line, Severity.INFO
+        return f'{line}, at most {1e3 * most:.2f} mm', Severity.WARNING
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import Final
 
 from needle_controller.steering.insertion import InsertionStrategy
 from needle_dynamics.arrays import FloatArray
+from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
 from needle_ros.system_state import Mode
@@ -75,9 +76,26 @@ def describe(
     return status, warning
 
 
-def describe_phase(status: SteeringStatus) -> str:
-    """Describe the phase for users."""
+def summarize(
+    status: SteeringStatus, insertion: InsertionStrategy | None, failure: str, advice: str
+) -> tuple[Severity, str]:
+    """
+    Return severity and state in one line, for users.
+
+    ``failure`` is the reason why a retraction has failed, and ``advice`` follows the line of an
+    idle node; both may be ''.
+    """
+    if status.phase is Phase.STOPPED:
+        return Severity.ERROR, f'stopped: {status.fault}'
+    if failure and status.phase is Phase.IDLE:
+        return Severity.ERROR, failure
+    if status.warning:
+        return Severity.WARNING, status.warning
+    if insertion is not None and status.phase is Phase.DONE:
+        line, severity = insertion.law.outcome()
+        return severity, f'done: {line}'
+    words = _DESCRIPTIONS[status.phase]
     if status.planned_fraction is not None:
-        return f'{_DESCRIPTIONS[status.phase]}: {status.planned_fraction:.0%}'
+        return Severity.INFO, f'{words}: {status.planned_fraction:.0%}'
     paused = '; paused' if status.system is Mode.PAUSED else ''
-    return f'{_DESCRIPTIONS[status.phase]}{paused}'
+    return Severity.INFO, f'{words}{paused}{advice if status.phase is Phase.IDLE else ""}'

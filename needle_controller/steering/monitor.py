@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -24,6 +24,18 @@ _REACTION: Final = 0.3
 _STREAMED: Final = 64
 
 
+class MotionRefusal(NamedTuple):
+    """Answer of a node that does not execute the last motion."""
+
+    node: str
+    verdict: Verdict
+    reason: str
+    joints: tuple[str, ...]  #: joints that the node moves
+
+    def __str__(self) -> str:
+        return f'{self.node} {self.verdict.value} the motion: {self.reason}'
+
+
 class MotionMonitor:
     """
     Compare the last motion with the joint positions, and with the answers to it.
@@ -38,16 +50,20 @@ class MotionMonitor:
         #: Stamps of the motion with its repetitions, and of the motions of a stream [ns].
         self._stamps: list[int] = []
         self._streamed: deque[int] = deque(maxlen=_STREAMED)
+        #: Node and stamp of the refusals, which are repeated in each status.
+        self._refused: set[tuple[str, int]] = set()
         self.forget()
 
     def forget(self) -> None:
         """Discard the motion: nothing is monitored."""
         self._stamps.clear()
         self._streamed.clear()
+        self._refused.clear()
         self._begin = self._goal = np.zeros(len(self._joints))
         self._pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
         self._arrives = False
-        self._overdue = 0
+        #: Time from which each joint is late [ns].
+        self._overdue = np.zeros(len(self._joints), dtype=np.int64)
 
     def begin(
         self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False
@@ -68,14 +84,12 @@ class MotionMonitor:
         way, room = np.abs(self._goal - self._begin), self._room
         self._pending = way > (self._tolerances if arrives else room)
         self._arrives = arrives
-        visible = 0.0
         for k in np.flatnonzero(self._pending):
             gone = move.positions[:, columns.index(int(k))] - at[k]
             gone = gone * np.sign(self._goal[k] - at[k])
             seen = len(gone) - 1 if arrives else int(np.argmax(gone >= min(room[k], way[k])))
-            visible = max(visible, float(move.times[seen]))
-        wait = max(REPEAT_AFTER, visible + _REACTION)
-        self._overdue = move.stamp + round(wait * NANOSECONDS)
+            wait = max(REPEAT_AFTER, float(move.times[seen]) + _REACTION)
+            self._overdue[k] = move.stamp + round(wait * NANOSECONDS)
 
     @property
     def _room(self) -> FloatArray:
@@ -99,26 +113,30 @@ class MotionMonitor:
         else:
             gone = (at - self._begin) * np.sign(self._goal - self._begin)
             self._pending &= gone < self._room
-        return bool(self._pending.any()) and stamp >= self._overdue
+        return bool((self._pending & (stamp >= self._overdue)).any())
 
     @property
     def exhausted(self) -> bool:
         """Whether the largest number of repetitions is reached."""
         return len(self._stamps) > REPEATS
 
-    def hear(self, node: str, status: RequestStatus) -> str:
+    def hear(self, node: str, status: RequestStatus) -> MotionRefusal | None:
         """
         Process the status of a node that takes trajectories.
 
-        Returns why the node does not execute the motion, '' if it does.
+        Returns once that the node does not execute the motion, None if it does.
         """
-        if JOINT_TRAJECTORY.name not in status.takes:
-            return ''
+        joints = status.takes.get(JOINT_TRAJECTORY.name)
+        if joints is None:
+            return None
         self._receivers[node] = status
         for one in status.answers:
-            if one.topic == JOINT_TRAJECTORY.name and self._refuses(one):
-                return f'{node} {one.verdict.value} the motion: {one.reason}'
-        return ''
+            if one.topic != JOINT_TRAJECTORY.name or (node, one.stamp) in self._refused:
+                continue
+            if self._refuses(one):
+                self._refused.add((node, one.stamp))
+                return MotionRefusal(node, one.verdict, one.reason, joints)
+        return None
 
     def _refuses(self, answer: Acknowledgement) -> bool:
         """Return whether an answer rejects the last motion."""
@@ -134,7 +152,8 @@ class MotionMonitor:
 
     def failure(self) -> str:
         """Describe how often the motion was sent, and which nodes answered."""
-        names = {self._joints[k] for k in np.flatnonzero(self._pending)}
+        late = np.flatnonzero(self._pending) if self._pending.any() else range(len(self._joints))
+        names = {self._joints[k] for k in late}
         takers = {
             node: status
             for node, status in self._receivers.items()

@@ -87,6 +87,11 @@ class MotionControl:
         self.origin, self.goal = self.goal, goal
         return self._move(now, self.origin)
 
+    def go(self, goal: FloatArray, now: int, *, again: bool = False) -> JointMotion | None:
+        """Send needle and guide to positions [m, rad], from their present positions."""
+        self.origin, self.goal = self.at.copy(), goal
+        return self._move(now, self.origin, again=again)
+
     def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> JointMotion | None:
         duration = duration_of(self.goal - begin, self._settings)
         self.due = now + round(duration * NANOSECONDS)
@@ -122,17 +127,11 @@ class MotionControl:
         )
         return self._stamped(move, now)
 
-    def withdraw(self, depth: float, now: int) -> JointMotion:
-        """Send the needle alone to a smaller depth [m]."""
-        begin, end = self.at[:1], np.array([depth])
-        duration = duration_of(np.array([depth - self.at[0], 0.0, 0.0]), self._settings)
-        return self._stamped(smooth(self._settings.joints[:1], begin, end, duration), now)
-
     def guide_toward(self, position: FloatArray, duration: float, now: int) -> JointMotion:
-        """Send the guide to a position [m], in a duration [s] or at `guide_speed`."""
+        """Send the guide to rest at a position [m], in a duration [s] or at `guide_speed`."""
         way = position - self.at[1:3]
         duration = max(duration, float(np.hypot(*way)) / self._settings.guide_speed)
-        return self.guide_to(position, way / duration, duration, now)
+        return self.guide_to(position, np.zeros(2), duration, now)
 
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
@@ -143,7 +142,8 @@ class MotionControl:
 
     def repeat(self, now: int) -> JointMotion | None:
         """Send the motion again: the message may have been lost."""
-        failure = f'{self.missed(self.monitor.pending)}: {self.monitor.failure()}'
+        pending = self.monitor.pending
+        failure = f'{self.missed(pending if pending.any() else None)}: {self.monitor.failure()}'
         if self.monitor.exhausted:
             raise SteeringFaultError(failure)
         self._events.add(Severity.WARNING, f'{failure}; sent again')
@@ -202,13 +202,13 @@ class MotionControl:
         end, limit = self.at.copy(), self._settings.guide_limit
         # A needle that rests, or whose positions are implausible, is not moved into the tissue.
         moving = min(max(self.velocity, 0.0), self._settings.speed)
-        end[0] = min(end[0] + 0.5 * BRAKING * moving, self.goal[0])
+        end[0] = min(end[0] + 0.5 * BRAKING * moving, max(self.origin[0], self.goal[0]))
         end[0] = max(end[0], min(self.origin[0], 0.0))
         end[1:3] = np.clip(end[1:3], -limit, limit)
         return end
 
     def discard_stop(self) -> None:
-        """Do not send the last stop again."""
+        """Do not send the last stop again: it would end the next motion."""
         self._halt = None
 
     def _send_stop(self, end: FloatArray, now: int) -> JointMotion:
@@ -226,7 +226,7 @@ class MotionControl:
         return halt
 
     def stop_again(self, stamp: int, now: int) -> JointMotion | None:
-        """Send the stop again to a needle that still moves."""
+        """Send the stop again to a needle that still advances; never beyond its present depth."""
         depth = float(self.at[0])
         if self._halted is None:
             self._halted = stamp, depth
@@ -234,8 +234,9 @@ class MotionControl:
         if self._halt is None or stamp - since < _STOP_AGAIN * NANOSECONDS:
             return None
         self._halted = stamp, depth
-        if abs(depth - before) < STILL:
-            self._halt = None
+        if depth - before < STILL:
+            # A needle that is withdrawn, for example by hand, may advance later.
+            self._halt = None if depth - before > -STILL else self._halt
             return None
         if not self._stops:
             self._halt = None
@@ -244,4 +245,6 @@ class MotionControl:
         self._events.add(
             Severity.ERROR, 'the needle still moves after the stop; stop command sent again'
         )
-        return self._send_stop(self._halt, now)
+        end = self._halt.copy()
+        end[0] = min(end[0], depth)
+        return self._send_stop(end, now)

@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+from needle_controller.steering.law import SteeringFaultError
+from needle_controller.steering.monitor import MotionRefusal
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_ros.requests import REPEAT_AFTER
+from needle_dynamics.arrays import FloatArray
+from needle_ros.contract import INSERTION
+from needle_ros.event_log import EventLog, Severity
+from needle_ros.requests import REPEAT_AFTER, Verdict
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -15,51 +20,103 @@ class Retraction:
     """
     Withdraw a needle to `retract_depth`, and reduce the guide offset with the insertion depth.
 
-    The position of the guide is proportional to the remaining distance, so that the needle leaves
-    along its path; it is zero at the end. A needle that is not deeper rests. `done` is whether
-    needle and guide have arrived.
+    It begins with the first positions, and is one motion of needle and guide in proportion, so
+    that the needle leaves along its path. A needle that is not deeper rests. A controller that
+    withdraws the needle by itself supersedes the motion: then the guide follows the depth, and
+    the retraction ends where the needle rests. `ended` is whether it is over: needle and guide
+    rest at the end, or it has failed, with the reason `failure`.
     """
 
-    def __init__(self, motions: MotionControl, settings: ExecutiveSettings) -> None:
-        self._motions, self._settings = motions, settings
-        self.done = False
-        self._begin = motions.at.copy()
-        self._end = min(settings.retract_depth, float(self._begin[0]))
-        #: Time of the last guide motion and of the last insertion motion [ns], and the insertion
-        #: depth then [m].
-        self._guided = 0
-        self._sent: tuple[int, float] | None = None
+    def __init__(
+        self, motions: MotionControl, settings: ExecutiveSettings, events: EventLog
+    ) -> None:
+        self._motions, self._settings, self._events = motions, settings, events
+        self.ended, self.failure = False, ''
+        events.add(Severity.INFO, 'the needle is withdrawn')
+        #: Positions at the begin [m, rad], shape (joints,), None before; depth at the end [m].
+        self._begin: FloatArray | None = None
+        self._end = settings.retract_depth
+        #: Whether another node withdraws the needle; time of the last guide motion then [ns].
+        self._follows, self._guided = False, 0
+        #: Stamp [ns] and insertion depth [m] since which the needle rests.
+        self._rest = 0, np.inf
 
-    def follow(self, now: int) -> JointMotion | None:
-        """Return the next motion at the present positions; the insertion is repeated if lost."""
-        if self.done:
+    def follow(self, stamp: int, now: int) -> JointMotion | None:
+        """Return the next motion at the present positions."""
+        try:
+            return None if self.ended else self._follow(stamp, now)
+        except SteeringFaultError as error:
+            self._fail(str(error))
             return None
+
+    def hear(self, refusal: MotionRefusal) -> None:
+        """Process that a node does not execute the motion."""
+        if self.ended:
+            return
+        if refusal.verdict is Verdict.REJECTED:
+            self._fail(str(refusal))
+        elif refusal.joints == (INSERTION,):
+            self._follows = self._is_deep
+        # A motion that another node supersedes does not begin, and is sent again.
+
+    def watch(self, silent: str) -> None:
+        """Process that the positions of the joints are not received, if that is not ''."""
+        if silent and self._begin is not None and not self.ended:
+            self._fail(silent)
+
+    def _fail(self, why: str) -> None:
+        self.ended, self.failure = True, f'the retraction has failed: {why}'
+        self._events.add(Severity.ERROR, self.failure)
+
+    def _follow(self, stamp: int, now: int) -> JointMotion | None:
         motions, settings = self._motions, self._settings
-        depth, guide = float(motions.at[0]), motions.at[1:3]
-        rest, begin = depth - self._end, float(self._begin[0]) - self._end
-        if rest > settings.depth_tolerance:
-            if self._is_due(depth, now):
-                self._sent = now, depth
-                return motions.withdraw(self._end, now)
-        elif np.abs(guide).max() <= settings.guide_tolerance:
-            self.done = True
-        interval = 1.0 / settings.rate
-        if self.done or now - self._guided < interval * NANOSECONDS:
+        if self._begin is None:
+            self._begin = motions.at.copy()
+            return self._withdraw(now)
+        depth = float(motions.at[0])
+        if abs(depth - self._rest[1]) > STILL:
+            self._rest = stamp, depth
+        rest = (stamp - self._rest[0]) / NANOSECONDS
+        if self._follows:
+            return self._end_follow(now) if rest >= REPEAT_AFTER else self._follow_depth(now)
+        if self._is_deep or np.abs(motions.at[1:3]).max() > settings.guide_tolerance:
+            late = stamp > motions.due + settings.patience * NANOSECONDS
+            overdue = late or motions.monitor.is_late(motions.at, stamp)
+            return motions.repeat(now) if overdue else None
+        self.ended = rest >= settings.settle_time
+        return None
+
+    @property
+    def _is_deep(self) -> bool:
+        return bool(self._motions.at[0] > self._end + self._settings.depth_tolerance)
+
+    def _withdraw(self, now: int, *, again: bool = False) -> JointMotion | None:
+        """Send needle and guide to the end; a needle is never moved into the tissue."""
+        motions = self._motions
+        self._end = min(self._end, float(motions.at[0]))
+        goal = motions.at.copy()
+        goal[:3] = self._end, 0.0, 0.0
+        move = motions.go(goal, now, again=again)
+        motions.again = lambda later: self._withdraw(later, again=True)
+        return move
+
+    # Another node withdraws the needle.
+
+    def _follow_depth(self, now: int) -> JointMotion | None:
+        """Move the guide with the measured depth."""
+        motions, interval = self._motions, 1.0 / self._settings.rate
+        if self._begin is None or now - self._guided < interval * NANOSECONDS:
             return None
         self._guided = now
+        begin, *guide = self._begin[:3]
         # At the end of the guide motion.
-        rest += motions.velocity * interval
-        part = min(max(rest / begin, 0.0), 1.0) if begin > settings.depth_tolerance else 0.0
-        return motions.guide_toward(part * self._begin[1:3], interval, now)
+        depth = motions.at[0] + motions.velocity * interval
+        part = (depth - self._end) / max(begin - self._end, self._settings.depth_tolerance)
+        move = motions.guide_toward(min(max(part, 0.0), 1.0) * np.array(guide), interval, now)
+        motions.monitor.stream(move)
+        return move
 
-    def _is_due(self, depth: float, now: int) -> bool:
-        """Return whether the withdrawal must be sent: first, or again to a needle at rest."""
-        if self._sent is None:
-            return True
-        since, before = self._sent
-        if now - since < REPEAT_AFTER * NANOSECONDS:
-            return False
-        if abs(depth - before) > STILL:
-            self._sent = now, depth
-            return False
-        return True
+    def _end_follow(self, now: int) -> JointMotion | None:
+        """Return the guide to its zero: the needle rests at the depth of the other node."""
+        self._follows, self._end = False, float(self._motions.at[0])
+        return self._withdraw(now)

@@ -45,7 +45,7 @@ class ExecutiveSettings(SteeringLimits):
     rate: float = constant(
         20.0,
         'Hz',
-        'rate of guide commands, if continuous and during a retraction',
+        'rate of guide commands, if continuous and while a controller withdraws the needle',
         low=1.0,
         high=50.0,
     )

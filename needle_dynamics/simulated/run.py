@@ -21,7 +21,7 @@ from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.timing import NANOSECONDS
-from needle_ros.trajectories import FollowedJoint
+from needle_ros.trajectories import FollowedJoint, JointPath
 from needle_ros.wire import Reading
 
 #: Event kinds.
@@ -177,6 +177,7 @@ class PlantRun:
             self.plant.tare()
         elif event.kind == RESET:
             self.plant = self.constants.make()
+            self._measured = []
             self.commands.forget()
             self._joint_commands.forget()
         self._events.append(event)
@@ -211,3 +212,15 @@ class PlantRun:
         self.commands.hold(stamp, self.plant.depth - before)
         self._measured = measured
         return measured
+
+
+def follow(path: JointPath, moved: Sequence[str], plant_run: PlantRun, elapsed: float) -> None:
+    """Follow a trajectory, at a time after its start [s]; without points, stop its joints."""
+    if path.stops:
+        if path.joints and not moved:
+            raise ParameterError(f'moves none of the joints {list(path.joints)}')
+        plant_run.hold(moved)
+        return
+    joints, times, positions, _, efforts = path.after(elapsed)
+    content = {'joints': joints, 'times': times, 'positions': positions, 'efforts': efforts}
+    plant_run.perform(Event(TRAJECTORY, content))

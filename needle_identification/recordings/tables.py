@@ -147,7 +147,7 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
 
 def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
     """Find columns by role from usual names, in order of preference, lower case without signs."""
-    plain = {name: _plain(name) for name in table.columns}
+    plain = {name: plain_name(name) for name in table.columns}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
         for word in usual:
@@ -169,7 +169,7 @@ def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> 
     return found
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
     """Return a name without its unit, case and signs."""
     if match := _BRACKETS.match(name):
         name = match[1]

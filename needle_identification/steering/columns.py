@@ -2,20 +2,25 @@
 """
 Find the columns of a steered insertion in a table, by their names and values.
 
-A unit that no name states is found by the size of the values: a needle is inserted by less than
-a meter. Depth that decreases into the tissue is inverted. Columns with times of their own, such as
-``Base sec`` and ``Base nanosec`` for ``Base x``, are measured where these times change, and repeat
-the last measurement in all other rows.
+A unit that no name states is that of another column of the same body, as in ``Base x`` and
+``Base y``, else it is found by the size of the values: a needle is inserted by 25 mm to 1 m, the
+tip moves along the needle as far as the needle, and sideways by less than 100 mm. A depth that
+could be in cm or mm has no unit: the user must state it. Depth that decreases into the tissue is
+inverted. Columns with times of their own, such as ``Base sec`` and ``Base nanosec`` for
+``Base x``, are measured where these times change, and repeat the last measurement in all other
+rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import pi
 import re
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_identification.recordings.tables import guessed, Table, unit_of
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.tables import guessed, plain_name, Table, unit_of, UNITS
 import numpy as np
 
 #: Roles of the columns; without a roll column the roll is zero.
@@ -23,7 +28,7 @@ STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll'
 
 #: Usual column names by role, in lower case without separators.
 _USUAL: Final = {
-    'depth': ('depth', 'insertion', 'insertiondepth', 'guidey', 'basey', 'robot', 'tipy'),
+    'depth': ('depth', 'insertion', 'insertiondepth', 'guidey', 'basey'),
     'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
     'guide_z': ('guidez', 'basez', 'zguide', 'zbase'),
     'tip_x': ('tipx', 'xtip'),
@@ -31,8 +36,21 @@ _USUAL: Final = {
     'roll': ('roll', 'rotation', 'theta'),
 }
 
-#: Change of a position that is too large for one in m.
+#: Largest depth in m, and smallest depth in mm; between them the unit is cm or mm.
 _LARGE: Final = 1.0
+_SMALL: Final = 25.0
+
+#: Largest lateral motion, and largest distance from the origin of a frame [m].
+_LATERAL: Final = 0.1
+_FAR: Final = 2.0
+
+_TURNS: Final = 4.0 * pi  #: largest roll [rad]
+
+#: Motion of the tip along the needle over the insertion of the needle, at least.
+_ALONG: Final = 0.5
+
+#: Usual names of the position of the tip along the needle.
+_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}
 
 _MOVED: Final = ('depth', 'guide_x', 'guide_z')
 
@@ -40,28 +58,81 @@ _MOVED: Final = ('depth', 'guide_x', 'guide_z')
 _COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)
 
 
-def steering_columns(table: Table) -> dict[str, str]:
-    """Return the columns by role that are found, with sign and unit, as in ``--columns``."""
-    found = guessed(table, _USUAL)
-    specs: dict[str, str] = {role: found[role] for role in STEERING_ROLES if role in found}
+def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the columns by role that are given or found, with sign and unit: ``--columns``."""
+    given, found = given or {}, guessed(table, _USUAL)
+    names = {**found, **{role: _column_of(table, spec) for role, spec in given.items()}}
+    specs = {role: names[role] for role in STEERING_ROLES if names.get(role) in table.columns}
     if 'depth' not in specs:
-        return specs
+        return {**specs, **given}
+    units = _units(table, specs, given)
     depth = _measured(table.columns[specs['depth']])
-    deep = np.ptp(depth) > _LARGE
-    for role, name in specs.items():
-        stated = unit_of(name, role) is not None or role == 'roll'
-        if not stated and (deep or np.ptp(_measured(table.columns[name])) > _LARGE):
-            specs[role] = f'{name}[mm]'
+    for role, unit in units.items():
+        if unit_of(specs[role], role) is None and unit:
+            specs[role] = f'{specs[role]}[{unit}]'
     from_start = depth - depth[np.argmax(depth != 0.0)]
     if from_start.max() < -from_start.min():
         specs['depth'] = f'-{specs["depth"]}'
-    return specs
+    return {**specs, **given}
+
+
+def check_depth(table: Table, spec: str) -> None:
+    """Raise a RecordingError if the unit of a depth that was found is not known."""
+    name = spec.lstrip('-')
+    if name not in table.columns or unit_of(name, 'depth') is not None:
+        return
+    if (span := float(np.ptp(_measured(table.columns[name])))) > _LARGE:
+        raise RecordingError(
+            f'{table.path}: {name} spans {span:.3g} without a unit, mm or cm: '
+            f"use --columns 'depth={spec}[mm]' or 'depth={spec}[cm]'"
+        )
+
+
+def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
+    """Return the unit of each role, '' if unknown or in SI units."""
+    stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
+    moved = {role: _measured(table.columns[name]) for role, name in specs.items()}
+    bodies = {role: re.sub(r'^[xyz]|[xyz]$', '', plain_name(name)) for role, name in specs.items()}
+    span = float(np.ptp(moved['depth']))
+    deep = stated['depth'] or ('' if span <= _LARGE else 'mm' if span >= _SMALL else None)
+    found = {'depth': deep or ''}
+    for group in (('guide_x', 'guide_z'), ('tip_x', 'tip_z')):
+        roles = [role for role in group if role in specs]
+        known = {unit for role in roles if (unit := stated[role]) is not None}
+        if not known and any(bodies[role] == bodies['depth'] for role in roles):
+            known = {found['depth']}
+        if not known and 'tip_x' in group and deep is not None:
+            known = _along(table, span * UNITS['depth'][deep or 'm'])
+        if not known:
+            large = any(
+                np.ptp(moved[role]) > _LATERAL or np.abs(moved[role]).max() > _FAR
+                for role in roles
+            )
+            known = {'mm' if large else ''}
+        for role in roles:
+            found[role] = stated[role] or min(known)
+    if 'roll' in specs:
+        turned = np.abs(moved['roll']).max() > _TURNS
+        found['roll'] = stated['roll'] or ('deg' if turned else '')
+    return found
+
+
+def _along(table: Table, depth: float) -> set[str]:
+    """Return the unit in which the tip moves along the needle by the depth [m], if any."""
+    names = guessed(table, _TIP_ALONG)
+    if 'along' not in names or not depth:
+        return set()
+    span = float(np.ptp(_measured(table.columns[names['along']])))
+    for unit in ('m', 'cm', 'mm'):
+        if _ALONG < span * UNITS['depth'][unit] / depth < 1.0 / _ALONG:
+            return {'' if unit == 'm' else unit}
+    return set()
 
 
 def new_rows(table: Table, specs: Mapping[str, str]) -> tuple[BoolArray, list[str]]:
     """Return in which rows guide and depth are measured, and the columns of their times."""
     rows = len(next(iter(table.columns.values())))
-    words = [re.escape(word) for word in _sources(specs)]
+    words = [re.escape(word) for word in _sources(table, specs)]
     own = re.compile(rf'(?:{"|".join(words)})[\s._-]*n?(?:ano)?secs?', re.IGNORECASE)
     times = [name for name in table.columns if words and own.fullmatch(name.strip())]
     if not times:
@@ -78,7 +149,14 @@ def _measured(column: FloatArray) -> FloatArray:
     return found if len(found) else np.zeros(1)
 
 
-def _sources(specs: Mapping[str, str]) -> set[str]:
+def _sources(table: Table, specs: Mapping[str, str]) -> set[str]:
     """Return the names of the measured bodies, such as ``Base`` for ``Base x``."""
-    moved = [specs[role].lstrip('-').removesuffix('[mm]') for role in _MOVED if role in specs]
+    moved = [_column_of(table, specs[role]) for role in _MOVED if role in specs]
     return {part for name in moved if (part := _COMPONENT.sub('', name)) not in ('', name)}
+
+
+def _column_of(table: Table, spec: str) -> str:
+    """Return the name of a column without sign, factor, unit and shift."""
+    if spec in table.columns:
+        return spec
+    return re.split(r'\s*[*\[@]', spec.lstrip('-'), maxsplit=1)[0].strip()

@@ -78,14 +78,14 @@ class MixedModel:
         # The contrasts are normalized by white noise, the last ratios.
         each = [*ratios, np.zeros(3)]
         rows = max(map(len, depths))
-        self._half = np.zeros((len(each), len(depths), 1, rows, rows))
+        self._half = np.zeros((len(each), len(depths), rows, rows))
         self._logs = np.zeros(len(each))
         for k, ratio in enumerate(each):
             unique = {depth.tobytes(): depth for depth in depths}
             known = {key: _whitening(covariance(one, ratio)) for key, one in unique.items()}
             for i, depth in enumerate(depths):
                 half, log = known[depth.tobytes()]
-                self._half[k, i, 0, : len(half), : len(half)] = half
+                self._half[k, i, : len(half), : len(half)] = half
                 self._logs[k] += 2.0 * log
 
     def likelihood(
@@ -93,10 +93,13 @@ class MixedModel:
     ) -> Likelihood:
         """Fit the drift, (2, n, c) for each recording, to what the guide leaves, (2, n) [m]."""
         c = columns[0].shape[-1]
-        both = np.zeros((len(wanted), 2, self._half.shape[-1], c + 1))
+        both = np.zeros((len(wanted), self._half.shape[-1], 2, c + 1))
         for at, column, one in zip(both, columns, wanted, strict=True):
-            at[:, : one.shape[1], :c], at[:, : one.shape[1], c] = column, one
-        rows = (self._half @ both).reshape(len(self._half), -1, c + 1)
+            n = one.shape[1]
+            at[:n, :, :c], at[:n, :, c] = np.swapaxes(column, 0, 1), one.T
+        # One product for both planes.
+        planes = both.reshape(*both.shape[:2], -1)
+        rows = (self._half @ planes).reshape(len(self._half), -1, c + 1)
         design, tips = rows[..., :c], rows[..., c]
         normal = np.swapaxes(design, 1, 2) @ design + _WEAK**2 * np.eye(c)
         inverse = np.linalg.inv(normal)

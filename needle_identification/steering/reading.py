@@ -30,7 +30,12 @@ from needle_identification.recordings.tables import (
     Table,
 )
 from needle_identification.recordings.timebase import merge
-from needle_identification.steering.columns import new_rows, steering_columns, STEERING_ROLES
+from needle_identification.steering.columns import (
+    check_depth,
+    new_rows,
+    steering_columns,
+    STEERING_ROLES,
+)
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
 from needle_ros.axes import signed, signed_axis
@@ -138,11 +143,11 @@ def read_steering_table(
     """
     Read an insertion from a table; roles missing in ``columns`` are found by names and values.
 
-    If no column is given, the rows without a new measurement of the guide are left out.
+    Rows without a new measurement of the guide are left out.
     """
     path = Path(path)
     table = read_table(path)
-    specs = {**steering_columns(table), **columns}
+    specs = steering_columns(table, columns)
     specs = {role: specs[role] for role in STEERING_ROLES if role in specs}
     missing = [role for role in STEERING_ROLES if role not in specs and role != 'roll']
     if missing:
@@ -153,11 +158,11 @@ def read_steering_table(
     losses = list(table.losses)
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
         losses.append(f'columns by their names and values: {words}')
-    new = np.ones(len(next(iter(table.columns.values()))), dtype=np.bool_)
-    if not columns:
-        new, times = new_rows(table, specs)
-        if times:
-            losses.append(f'rows in which {" or ".join(times)} changes: {np.count_nonzero(new)}')
+    if 'depth' not in columns:
+        check_depth(table, specs['depth'])
+    new, times = new_rows(table, specs)
+    if times:
+        losses.append(f'rows in which {" or ".join(times)} changes: {np.count_nonzero(new)}')
     values = {role: _shifted(table, role, spec, losses) for role, spec in specs.items()}
     moved = np.column_stack([values[role] for role in specs if not role.startswith('tip')])
     usable = np.isfinite(moved).all(axis=1)

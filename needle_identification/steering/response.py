@@ -25,6 +25,9 @@ TERMS: Final = {
 #: responses are smooth functions of them.
 _ELEMENT: Final = 1.5e-3
 
+_CAUSES: Final = np.arange(3)
+_NO_WANDER: Final = np.zeros((1, 0, 2))
+
 
 class TipResponses(NamedTuple):
     """Tip motion at the samples by cause."""
@@ -34,46 +37,49 @@ class TipResponses(NamedTuple):
     bevel: FloatArray  # (n, 2) x and z, per curvature of a long needle by the bevel [m^2]
 
 
-def responses(
-    recording: SteeringRecording, free: float, length: float, skin: float, order: str
-) -> TipResponses:
-    """Simulate a recorded insertion for each cause; lengths in m, skin over tissue stiffness."""
-    depth, guide = recording.depth, recording.guide - recording.guide[0]
-    poses = np.zeros((3, len(depth), 6))
-    poses[:, :, 0] = depth
-    poses[0, :, 1], poses[0, :, 3] = guide.T
-    poses[1, :, 4] = 1.0
-    poses[2, :, 5] = recording.roll
-    if order == 'guide first':
-        # The guide moves to its next position before the needle, except at the last depth.
-        poses = np.repeat(poses, 2, axis=1)[:, 1:]
-        poses[:, 1::2, 0] = depth[:-1]
-    # The response depends only on lengths: unit bending stiffness.
-    reach = float(depth.max()) + free
-    # Nodes at the depths of guide motions, for equal steps.
-    steps = np.diff(depth)
-    step = float(np.median(steps[steps > _ELEMENT])) if (steps > _ELEMENT).any() else _ELEMENT
-    element = step / ceil(step / _ELEMENT - 1e-6)
-    tissue = 4.0 / length**4
-    constants = np.array([[1.0, element, skin * tissue, 0.0, 0.0, reach, free]])
-    layers = np.zeros((3, 3, 1))
-    layers[:, 1] = tissue
-    layers[2, 2] = 1.0 / length
-    tips = np.empty((3, poses.shape[1], 2))
-    insert(
-        constants,
-        layers,
-        1.0,
-        np.zeros((1, 0, 2)),
-        poses,
-        np.arange(3),
-        empty_cut(reach, element, 1),
-        tips,
-        NO_FORCES,
-    )
-    if order == 'guide first':
-        tips = tips[:, ::2]
-    return TipResponses(guide=tips[0], tilt=tips[1, :, 1], bevel=tips[2])
+class Insertion:
+    """A recorded insertion for each cause, in one order; the lengths are given later."""
+
+    def __init__(self, recording: SteeringRecording, order: str) -> None:
+        depth, guide = recording.depth, recording.guide - recording.guide[0]
+        poses = np.zeros((3, len(depth), 6))
+        poses[:, :, 0] = depth
+        poses[0, :, 1], poses[0, :, 3] = guide.T
+        poses[1, :, 4] = 1.0
+        poses[2, :, 5] = recording.roll
+        if order == 'guide first':
+            # The guide moves to its next position before the needle, except at the last depth.
+            poses = np.repeat(poses, 2, axis=1)[:, 1:]
+            poses[:, 1::2, 0] = depth[:-1]
+        self._poses, self._deepest = poses, float(depth.max())
+        self._every = 2 if order == 'guide first' else 1
+        # Nodes at the depths of guide motions, for equal steps.
+        steps = np.diff(depth)
+        step = float(np.median(steps[steps > _ELEMENT])) if (steps > _ELEMENT).any() else _ELEMENT
+        self._element = step / ceil(step / _ELEMENT - 1e-6)
+
+    def responses(self, free: float, length: float, skin: float) -> TipResponses:
+        """Simulate the insertion for lengths in m, and skin over tissue stiffness."""
+        # The response depends only on lengths: unit bending stiffness.
+        reach, element, tissue = self._deepest + free, self._element, 4.0 / length**4
+        constants = np.array([[1.0, element, skin * tissue, 0.0, 0.0, reach, free]])
+        layers = np.zeros((3, 3, 1))
+        layers[:, 1] = tissue
+        layers[2, 2] = 1.0 / length
+        tips = np.empty((3, self._poses.shape[1], 2))
+        insert(
+            constants,
+            layers,
+            1.0,
+            _NO_WANDER,
+            self._poses,
+            _CAUSES,
+            empty_cut(reach, element, 1),
+            tips,
+            NO_FORCES,
+        )
+        guide, tilt, bevel = tips[:, :: self._every]
+        return TipResponses(guide=guide, tilt=tilt[:, 1], bevel=bevel)
 
 
 def drift(term: str, recording: SteeringRecording, r: TipResponses) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_identification.steering.mixed import Likelihood, MixedModel
 from needle_identification.steering.recording import SteeringRecording
-from needle_identification.steering.response import drift, responses, TipResponses
+from needle_identification.steering.response import drift, Insertion, TipResponses
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -43,10 +43,11 @@ class Tips:
         self.recordings, self.order = recordings, order
         self.moved = [np.column_stack([one.depth, one.guide])[one.known] for one in recordings]
         self.measured = [one.tip[one.known].T for one in recordings]  # (2, n) [m]
+        self._insertions = [Insertion(one, order) for one in recordings]
         self.of = lru_cache(maxsize=8000)(self._responses)
 
     def _responses(self, at: int, free: float, length: float, skin: float) -> TipResponses:
-        return responses(self.recordings[at], free, length, skin, self.order)
+        return self._insertions[at].responses(free, length, skin)
 
 
 class Optimum(NamedTuple):

@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import print_each, Subcommand
+from needle_insertion.commands.common import print_each, Subcommand, with_unit
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
 
@@ -25,11 +25,19 @@ HOST, PORT = '127.0.0.1', 8642
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        'Show needle, forces, limits and node messages on a page in a browser: live, or from a '
-        'bag.'
+        'Show needle, forces, limits and node messages on a page in a browser: live, from a bag, '
+        'or from two bags in comparison.'
     )
     parser.add_argument(
         'bag', type=Path, nargs='?', metavar='BAG', help='recording to show (default: live)'
+    )
+    parser.add_argument(
+        'other', type=Path, nargs='?', metavar='OTHER', help='recording to compare with BAG'
+    )
+    parser.add_argument(
+        '--shift',
+        help='time added to those of OTHER (default: both start to move at the same time)',
+        **with_unit('s'),
     )
     parser.add_argument(
         '--time',
@@ -58,6 +66,8 @@ def _run(options: argparse.Namespace) -> int:
     """Serve the page until a signal arrives."""
     if options.bag is not None and options.control:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
+    if options.shift is not None and options.other is None:
+        raise ParameterError('--shift needs two recordings: add OTHER, or omit --shift')
     # A signal before the page is served, or a second signal at the end, also ends the command.
     with suppress(KeyboardInterrupt):
         asyncio.run(_recorded(options) if options.bag is not None else _live(options))
@@ -66,12 +76,17 @@ def _run(options: argparse.Namespace) -> int:
 
 async def _recorded(options: argparse.Namespace) -> None:
     from needle_insertion.watch.live import RecordedReader
-    from needle_insertion.watch.recorded import ShownRecording
+    from needle_insertion.watch.recorded import compare, ShownRecording
     from needle_insertion.watch.server import Server
 
     recording = ShownRecording(options.bag, options.time)
     print_each('warning', recording.losses)
-    await _serve(Server(lambda: RecordedReader(recording), options.host, options.port))
+    comparison = None
+    if options.other is not None:
+        other = ShownRecording(options.other, options.time)
+        print_each('warning', other.losses)
+        comparison = compare(recording, other, options.shift)
+    await _serve(Server(lambda: RecordedReader(recording, comparison), options.host, options.port))
 
 
 async def _live(options: argparse.Namespace) -> None:

@@ -28,6 +28,12 @@ import numpy as np
 #: Colors: insertion and results, withdrawal, data, pale data, fits.
 _IN, _OUT, _DATA, _LIGHT, _FIT = '#1f5fa8', '#c25a00', '#8b95a1', '#c3cad2', '#111111'
 
+#: Color and name of samples that a fit does not use.
+_EXCLUDED, _NAMED = '#7a1f6b', 'excluded from the fit'
+
+#: Width of a figure [in]: its text is readable at the width of a telephone, too.
+_WIDTH: Final = 4.8
+
 #: Largest number of drawn points of a line, in large and small plots.
 _MOST_POINTS: Final = 8000
 _MOST_SMALL: Final = 300
@@ -45,14 +51,24 @@ def _sides(fit: Fit) -> Iterator[tuple[BoolArray, str, str, str]]:
 def friction_data(estimate: FrictionEstimate) -> Figure:
     """Draw the filtered force over time and against velocity, with the fit."""
     fit = estimate.fit
-    figure = Figure(figsize=(9.0, 7.5), layout='constrained')
+    figure = Figure(figsize=(_WIDTH, 7.5), layout='constrained')
     above, below = figure.subplots(2, 1)
-    time, force = _thinned(fit.time - fit.time[0], fit.force)
-    above.plot(time, force, color=_LIGHT, linewidth=3.0, label='measured, filtered')
-    model = np.where(fit.used, fit.model, np.nan)
-    above.plot(*_thinned(fit.time - fit.time[0], model), color=_FIT, linewidth=1.2, label='fit')
+    time = fit.time - fit.time[0]
+    for values, style in (
+        (fit.force, {'color': _LIGHT, 'linewidth': 3.0, 'label': 'measured, filtered'}),
+        (
+            np.where(fit.used, np.nan, fit.force),
+            {'color': _EXCLUDED, 'linewidth': 1.2, 'linestyle': ':', 'label': _NAMED},
+        ),
+        (
+            np.where(fit.used, fit.model, np.nan),
+            {'color': _FIT, 'linewidth': 1.2, 'label': 'fit'},
+        ),
+    ):
+        above.plot(*_thinned(time, values), **style)
     _label(above, 'time [s]', 'force on the needle [N]')
     _legend_above(above)
+    _excluded(below, fit, _MOST_POINTS, 3.0)
     for side, words, color, mark in _sides(fit):
         speed, force = _thinned(1e3 * fit.velocity[side], fit.force[side])
         below.plot(speed, force, mark, color=color, markersize=2.5, alpha=0.4, label=words)
@@ -67,11 +83,18 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
     return figure
 
 
+def _excluded(axes: Axes, fit: Fit, most: int, size: float) -> None:
+    """Draw the samples that the fit does not use, against velocity."""
+    out = ~fit.used
+    speed, force = _thinned(1e3 * fit.velocity[out], fit.force[out], most=most)
+    axes.plot(speed, force, 'x', color=_EXCLUDED, markersize=size, alpha=0.5, label=_NAMED)
+
+
 def friction_residuals(estimate: FrictionEstimate) -> Figure:
     """Draw the residual over time, against velocity, and as a histogram."""
     fit = estimate.fit
-    figure = Figure(figsize=(9.0, 6.5), layout='constrained')
-    over, against, often = figure.subplot_mosaic([['time', 'time'], ['speed', 'size']]).values()
+    figure = Figure(figsize=(_WIDTH, 8.0), layout='constrained')
+    over, against, often = figure.subplots(3, 1)
     residual = 1e3 * (fit.force - fit.model)
     reach = float(np.abs(residual[fit.used]).max())
     edges = np.linspace(-reach, reach, 41).tolist()
@@ -102,6 +125,7 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
     )
     for axes, estimate in zip(panels, estimates, strict=True):
         fit = estimate.fit
+        _excluded(axes, fit, _MOST_SMALL, 2.0)
         for side, words, color, mark in _sides(fit):
             order = np.argsort(fit.velocity[side])
             speed, force, model = (
@@ -124,7 +148,7 @@ def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str])
 
 def _small_multiples(names: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list[Axes]]:
     """Return a figure with a small plot for each name, in rows, with shared axes."""
-    figure, panels = _panels(len(names), 5, 0.6, 1.7, sharex=True)
+    figure, panels = _panels(len(names), 3, 0.6, 1.3, sharex=True)
     for axes, name in zip(panels, names, strict=True):
         axes.set_title(name, fontsize='small')
         _label(axes, '', '')
@@ -139,7 +163,7 @@ def _panels(
     """Return a figure with plots in rows of at most `most`, with heights and a margin [in]."""
     columns = min(count, most)
     lines = -(-count // columns)
-    figure = Figure(figsize=(9.0, margin + height * lines), layout='constrained')
+    figure = Figure(figsize=(_WIDTH, margin + height * lines), layout='constrained')
     panels = figure.subplots(lines, columns, sharex=sharex, sharey=True, squeeze=False)
     for axes in panels.flat[count:]:
         axes.set_visible(False)
@@ -158,7 +182,7 @@ def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
 
 def stiffness_levels(summary: StiffnessSummary) -> Figure:
     """Draw each entry of the matrix against the force, with Table 2."""
-    figure = Figure(figsize=(9.0, 6.5), layout='constrained')
+    figure = Figure(figsize=(_WIDTH, 5.5), layout='constrained')
     for axes, (name, (means, deviations)) in zip(
         figure.subplots(2, 2, sharex=True).flat, TABLE_2.items(), strict=True
     ):
@@ -183,7 +207,7 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
     for axes in figure.axes[2:]:
         axes.set_xlabel('force [N]')
     figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), loc='outside upper left', ncols=2,
+        *figure.axes[0].get_legend_handles_labels(), loc='outside upper left',
         frameon=False,
     )  # fmt: skip
     return figure
@@ -192,8 +216,8 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
 def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
     """Draw force against displacement, and the displacements in the plane, with the fit."""
     presses = estimate.presses
-    figure = Figure(figsize=(9.0, 4.8), layout='constrained')
-    left, right = figure.subplots(1, 2)
+    figure = Figure(figsize=(_WIDTH, 8.5), layout='constrained')
+    above, below = figure.subplots(2, 1)
     force = np.hypot(*presses.force.T)
     along = np.einsum('ij,ij->i', presses.displacement, presses.force) / force
     colors = colormaps['twilight_shifted'](np.linspace(0.1, 0.9, presses.direction.max() + 1))
@@ -201,19 +225,19 @@ def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
         of = presses.direction == index
         way = presses.force[of].mean(axis=0)
         order = np.argsort(force[of])
-        left.plot(
+        above.plot(
             1e3 * np.append(0.0, along[of][order]), np.append(0.0, force[of][order]), 'o-',
             color=color, markersize=4.0, linewidth=1.0,
             label=f'{round(np.degrees(np.arctan2(way[1], way[0]))) % 360}°',
         )  # fmt: skip
-        right.plot(*1e3 * presses.displacement[of].T, 'o', color=color, markersize=4.0)
-    _ellipses(right, estimate)
-    _principal_axes(right, estimate.levels[-1])
-    _label(left, 'displacement along the force [mm]', 'force [N]')
-    left.set(xlim=(0.0, None), ylim=(0.0, None))
-    left.legend(title='direction, from x toward z', ncols=2, frameon=False, loc='lower right')
-    _label(right, 'displacement x [mm]', 'displacement z [mm]')
-    right.set_aspect('equal', 'datalim')
+        below.plot(*1e3 * presses.displacement[of].T, 'o', color=color, markersize=4.0)
+    _ellipses(below, estimate)
+    _principal_axes(below, estimate.levels[-1])
+    _label(above, 'displacement along the force [mm]', 'force [N]')
+    above.set(xlim=(0.0, None), ylim=(0.0, None))
+    above.legend(title='direction, from x toward z', ncols=2, frameon=False, loc='lower right')
+    _label(below, 'displacement x [mm]', 'displacement z [mm]')
+    below.set_aspect('equal', 'datalim')
     return figure
 
 
@@ -237,7 +261,7 @@ def spread_figure(
     means: Sequence[Statistic], rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]]
 ) -> Figure:
     """Draw each parameter of each recording with its interval, and the mean with its interval."""
-    figure, panels = _panels(len(means), 4, 0.0, 1.2 + 0.24 * len(rows), sharex=False)
+    figure, panels = _panels(len(means), 2, 0.0, 1.2 + 0.24 * len(rows), sharex=False)
     for axes, mean in zip(panels, means, strict=True):
         for place, (_, found) in enumerate(rows):
             one = found.get(mean.name)
@@ -271,7 +295,7 @@ def _typeset(words: str) -> str:
 def _legend_above(axes: Axes, **options: Any) -> None:
     """Put the legend above the plot."""
     axes.legend(
-        loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False,
+        loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
         borderaxespad=0.2, handletextpad=0.5, **options,
     )  # fmt: skip
 

@@ -141,7 +141,8 @@ def _friction_pictures(
             'friction_data',
             f'{name}, with mu_s nearest to the median: force over time and against velocity '
             f'after the low-pass filter, and the fit of {", ".join(shown.terms)} to the samples '
-            'in steady motion.',
+            f'in steady motion. {np.count_nonzero(~shown.fit.used)} of {len(shown.fit.used)} '
+            'samples are excluded: the needle rests, accelerates or has just turned.',
             figures.friction_data(shown),
             f'Two plots of {name}. The force over time follows the strokes of the needle, with '
             'the fitted force superimposed. Against velocity the force jumps at zero by 2 mu_s '
@@ -157,7 +158,8 @@ def _friction_pictures(
         ),
         Picture(
             'friction_each',
-            'Force against velocity of each recording, and its fit.',
+            'Force against velocity of each recording, and its fit. Crosses are samples that are '
+            'excluded from the fit.',
             figures.friction_each(
                 estimates[:_MOST_EACH], [label[one.name] for one in estimates[:_MOST_EACH]]
             ),
@@ -189,9 +191,9 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
         'cards': [
             _card(result),
             (
-                'Is it a spring?',
-                f'{sum(springs)} of {len(springs)} matrices are',
-                'by the curl of the force, within its uncertainty',
+                'Symmetric stiffness matrices',
+                f'{sum(springs)} of {len(springs)}',
+                'tested by the curl of the force; a spring has a symmetric matrix',
             ),
         ],
         'predictions': prediction_lines(summary),
@@ -259,8 +261,8 @@ def _stiffness_pictures(
         ),
         Picture(
             'stiffness_presses',
-            f'{name}, with k_a nearest to the median. Left: force against displacement along '
-            'each direction. Right: rest positions of the end-effector, the fitted ellipse of '
+            f'{name}, with k_a nearest to the median. Above: force against displacement along '
+            'each direction. Below: rest positions of the end-effector, the fitted ellipse of '
             'each force level, and the principal axes at '
             'the largest force.',
             figures.stiffness_presses(shown),

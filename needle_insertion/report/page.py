@@ -26,6 +26,8 @@ from needle_ros.files import write_whole
 _LONGEST_NUMBER: Final = 40
 
 _SENTENCE: Final = 30  #: largest length of a cell without sentences
+#: Largest width of a table that fits a telephone [characters], with the space after a column.
+_NARROW, _SPACE = 42, 2
 #: Headings, and smallest number of headings for a table of contents.
 _HEADING: Final = re.compile('<h2 id="([^"]*)">(.*?)</h2>')
 _FEWEST_HEADINGS: Final = 4
@@ -48,9 +50,16 @@ def _kind(cell: str) -> str:
     return _VERDICTS.get(cell, 'number' if is_number else '')
 
 
-def _has_sentences(rows: Sequence[Sequence[str]]) -> bool:
-    """Whether cells of a table contain sentences."""
-    return any(len(cell) > _SENTENCE for row in rows for cell in row[1:])
+def _layout(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
+    """Return the style class of a table on a telephone: stacked cells, cards, or ''."""
+    if any(len(cell) > _SENTENCE for row in rows for cell in row[1:]):
+        return 'words'
+    columns = zip(heads, *rows, strict=True)
+    # Heads are broken between words.
+    width = sum(
+        max(*map(len, column[1:]), *map(len, column[0].split()), 0) + _SPACE for column in columns
+    )
+    return 'cards' if width > _NARROW else ''
 
 
 def _anchor(words: str) -> str:
@@ -84,7 +93,7 @@ TEMPLATES.filters.update(
     kind=_kind,
     anchor=_anchor,
     contents=_contents,
-    has_sentences=_has_sentences,
+    layout=_layout,
     zip=partial(zip, strict=True),
 )
 

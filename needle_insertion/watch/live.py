@@ -10,8 +10,8 @@ import json
 from time import monotonic
 from typing import Any, Final
 
-from needle_insertion.watch.recorded import PagePlayback, ShownRecording
-from needle_insertion.watch.view import RATE, row, SPAN, View
+from needle_insertion.watch.recorded import Comparison, PagePlayback, ShownRecording
+from needle_insertion.watch.view import RATE, SPAN, View
 from needle_ros.errors import ParameterError
 
 PERIOD: Final = 1.0 / RATE  #: time between two frames [s]
@@ -39,7 +39,7 @@ class Live:
             now = monotonic()
             self._poll(now)
             frame = self._view.frame(now)
-            frame['row'] = row(frame)
+            frame['row'] = self._view.row(now)
             self.history.append(frame['row'])
             self.scene = self._view.scene
             self.number, self.frame = self.number + 1, _json(frame)
@@ -86,10 +86,10 @@ class LiveReader:
 
 
 class RecordedReader:
-    """Frames of a recording for one reader."""
+    """Frames of a recording for one reader, with those of another if it is compared."""
 
-    def __init__(self, recording: ShownRecording) -> None:
-        self._recording = recording
+    def __init__(self, recording: ShownRecording, comparison: Comparison | None = None) -> None:
+        self._recording, self._comparison = recording, comparison
         self._playback = PagePlayback(recording.duration)
         self._setting = {
             'control': False,
@@ -116,8 +116,11 @@ class RecordedReader:
         self._asked.clear()
         at = playback.at
         view = self._recording.view(at)
+        frame = view.frame(at)
+        if self._comparison is not None:
+            frame['other'] = self._comparison.needle(at)
         content: dict[str, Any] = {
-            'frame': view.frame(at),
+            'frame': frame,
             'playback': {'playing': playback.playing, 'speed': playback.speed},
         }
         if view.scene != self._scene:
@@ -125,6 +128,8 @@ class RecordedReader:
             self._scene = view.scene
             if first:
                 content |= {'setting': self._setting, 'signals': self._recording.signals()}
+                if self._comparison is not None:
+                    content['other'] = self._comparison.content()
         return _json(content)
 
     def take(self, message: dict[str, Any]) -> None:

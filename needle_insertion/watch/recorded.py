@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import ceil, log2, nan
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -17,7 +20,7 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.samples import are_gaps
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
-from needle_insertion.watch.view import RATE, row, SIGNALS, topic_of, View
+from needle_insertion.watch.view import EFFORT, RATE, Signal, signal_of, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import node_of
@@ -34,6 +37,12 @@ _OTHERS: Final = (contract.NEEDLE_SHAPE, contract.TIP_EXPECTED, contract.DIAGNOS
 
 #: Largest number of stored messages per topic; longer recordings are decimated by two.
 _MOST: Final = 8192
+
+#: Shortest pause that is a gap of a thinned signal [intervals of the thinning].
+_GAP: Final = 5.0
+
+#: Change of the depth that is a motion of the needle [m]: above the noise of encoders.
+_MOVED: Final = 1e-4
 
 #: Difference of the durations by stamps and by arrival that is reported [s].
 _SLACK: Final = 10.0
@@ -63,15 +72,65 @@ class _Kept(Generic[_Item]):
             self.interval = max(2.0 * self.interval, 2.0 * span / _MOST)
             del self._times[1::2], self._items[1::2]
 
-    def items(self) -> Iterator[tuple[float, _Item, bool]]:
-        """Yield time and content of each message, and whether a gap precedes it."""
-        steps = np.diff(np.array(self._times), prepend=self._times[:1])
-        return zip(self._times, self._items, are_gaps(steps).tolist(), strict=True)
-
     def at(self, time: float) -> tuple[float, _Item] | None:
         """Return time and content of the newest message at a time."""
         k = bisect_right(self._times, time) - 1
         return (self._times[k], self._items[k]) if k >= 0 else None
+
+
+class _Curve:
+    """Values of a signal by time; of many, the smallest and the largest of each interval."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._values: list[float] = []
+        self._interval = 0.0
+
+    def add(self, time: float, value: float | None) -> None:
+        """Store a value, unless its time is before the newest."""
+        if self._times and time < self._times[-1]:
+            return
+        self._times.append(time)
+        self._values.append(nan if value is None else value)
+        if len(self._times) > 2 * _MOST:
+            self._thin()
+
+    def _thin(self) -> None:
+        """Keep the smallest and the largest value of each interval, at most `_MOST` in all."""
+        times, values = np.array(self._times), np.array(self._values)
+        shortest = 2.0 * max(times[-1] - times[0], 1e-6) / (_MOST - 4)
+        # A power of two: each interval consists of whole earlier intervals.
+        self._interval = max(self._interval, 2.0 ** ceil(log2(shortest)))
+        known = np.flatnonzero(np.isfinite(values))
+        interval = np.floor(times[known] / self._interval)
+        order = np.lexsort((values[known], interval))
+        ends = np.flatnonzero(np.diff(interval[order]))
+        chosen = order[np.concatenate(([0], ends, ends + 1, [-1]))] if len(order) else order
+        kept = known[np.unique(chosen)]
+        self._times, self._values = times[kept].tolist(), values[kept].tolist()
+
+    def points(self) -> list[list[float | None]] | None:
+        """Return times [s] and values, None before a gap; None without values."""
+        if len(self._times) > _MOST:
+            self._thin()
+        values = np.array(self._values)
+        if not np.isfinite(values).any():
+            return None
+        steps = np.diff(np.array(self._times), prepend=self._times[0])
+        gaps = steps > _GAP * self._interval if self._interval else are_gaps(steps)
+        columns: list[list[float | None]] = [[], []]
+        for time, value, gap in zip(self._times, values.tolist(), gaps.tolist(), strict=True):
+            for one in (None, value) if gap else (value,):
+                columns[0].append(round(time, 6))
+                columns[1].append(None if one is None or one != one else one)
+        return columns
+
+
+#: Signals of each topic.
+_OF_TOPIC: Final = {
+    topic.name: [one for one in (*SIGNALS.values(), EFFORT) if one.topic == topic.name]
+    for topic in STREAMS
+}
 
 
 class ShownRecording:
@@ -87,6 +146,7 @@ class ShownRecording:
         period = 0.75 / RATE
         self._header = time == TIMES[0]
         self._readings: dict[str, _Kept[Reading]] = {}
+        self._curves = defaultdict[Signal, _Curve](_Curve)
         self._lines = {name: _Kept[FloatArray](period) for name in ('needle', 'path')}
         self._expected = _Kept[Any]()
         self._configurations = {name: _Kept[dict[str, Any]]() for name in CONFIGURED}
@@ -148,6 +208,8 @@ class ShownRecording:
             if self._header and reading.stamp:
                 time = self._time(reading.stamp)
             self._readings.setdefault(name, _Kept()).add(time, lambda: reading)
+            for signal in _OF_TOPIC[name]:
+                self._curves[signal].add(time, signal.of(reading))
         elif name == contract.NEEDLE_SHAPE.name:
             which, points = read_line(data)
             if which in self._lines:
@@ -184,21 +246,63 @@ class ShownRecording:
 
     def signals(self) -> dict[str, list[list[float | None]]]:
         """Return times [s] and values of each recorded signal; None between them is a gap."""
-        found: dict[str, list[list[float | None]]] = {}
-        for topic, readings in self._readings.items():
-            of = [name for name in SIGNALS if topic_of(name, self._readings) == topic]
-            rows = list[list[float | None]]()
-            for time, reading, after_gap in readings.items():
-                if after_gap:
-                    rows.append([round(time, 6), *[None] * len(SIGNALS)])
-                view = View()
-                view.reading(topic, reading, time)
-                rows.append([round(time, 6), *row(view.frame(time))[1:]])
-            times, *columns = map(list, zip(*rows, strict=True))
-            for name, values in zip(SIGNALS, columns, strict=True):
-                if name in of and any(value is not None for value in values):
-                    found[name] = [times, values]
-        return {name: found[name] for name in SIGNALS if name in found}
+        found = {name: self._curves[signal_of(name, self._readings)].points() for name in SIGNALS}
+        return {name: points for name, points in found.items() if points is not None}
+
+    def start_of_motion(self) -> float | None:
+        """Return the time of the first motion of the needle [s]; None without a motion."""
+        points = self._curves[SIGNALS['depth']].points()
+        known = [pair for pair in zip(*points or ([], []), strict=True) if pair[1] is not None]
+        return next((time for time, depth in known if abs(depth - known[0][1]) > _MOVED), None)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Another recording, by the time of the first: ``shift`` is added to its times [s]."""
+
+    recording: ShownRecording
+    shift: float
+    words: str  #: description of the shift
+
+    def needle(self, time: float) -> list[list[float]] | None:
+        """Return the needle as columns at a time of the first recording [s]; None outside."""
+        at = time - self.shift
+        if not 0.0 <= at <= self.recording.duration:
+            return None
+        needle: list[list[float]] | None = self.recording.view(at).frame(at)['needle']
+        return needle
+
+    def content(self) -> dict[str, Any]:
+        """Return name, words, first and last time, and signals, for JSON."""
+        signals = {
+            name: [[round(time + self.shift, 6) for time in times if time is not None], values]
+            for name, (times, values) in self.recording.signals().items()
+        }
+        return {
+            'name': self.recording.name,
+            'words': self.words,
+            'begin': self.shift,
+            'end': self.shift + self.recording.duration,
+            'signals': signals,
+        }
+
+
+def compare(
+    first: ShownRecording, other: ShownRecording, shift: float | None = None
+) -> Comparison:
+    """Align another recording by a shift of its times [s], or at the start of motion."""
+    if shift is not None:
+        return Comparison(other, shift, f'{other.name}: times shifted by {shift:+.3f} s')
+    here, there = first.start_of_motion(), other.start_of_motion()
+    if here is None or there is None:
+        still = first.name if here is None else other.name
+        return Comparison(other, 0.0, f'not aligned: the needle does not move in {still}')
+    shift = here - there
+    return Comparison(
+        other,
+        shift,
+        f'{other.name}: times shifted by {shift:+.3f} s, so that both move at {here:.3f} s',
+    )
 
 
 class PagePlayback:

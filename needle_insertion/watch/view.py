@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from math import isfinite, sqrt
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_insertion.watch.scene import scene
@@ -20,19 +20,6 @@ SPAN: Final = 20.0  #: duration of the history [s]
 _SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
 _NOTHING: Final = (None, None, None)  #: position, velocity and effort of a missing joint
 
-#: Signals of the charts, each with its topic and SI unit.
-SIGNALS: Final = {
-    'depth': (contract.JOINT_STATES.name, 'm'),
-    'reference': (contract.REFERENCE.name, 'm'),
-    'velocity': (contract.JOINT_STATES.name, 'm/s'),
-    'error': (contract.TRACKING_ERROR.name, 'm'),
-    'force': (contract.BASE_WRENCH.name, 'N'),
-    'tip_x': (contract.TIP_DEFLECTION.name, 'm'),
-    'tip_z': (contract.TIP_DEFLECTION.name, 'm'),
-    'guide_x': (contract.JOINT_STATES.name, 'm'),
-    'guide_z': (contract.JOINT_STATES.name, 'm'),
-}
-
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
 _NODES: Final = 64
@@ -43,6 +30,55 @@ _NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 def number(value: float | None) -> float | None:
     """Return a number rounded to 1e-7; None if missing or not finite."""
     return None if value is None or not isfinite(value) else round(float(value), 7)
+
+
+class Signal(NamedTuple):
+    """Signal of the charts: its topic, and its value in a reading of the topic, in SI units."""
+
+    topic: str
+    of: Callable[[Reading], float | None]
+
+
+def _joint(topic: contract.Topic, joint: str, part: int = 0) -> Signal:
+    """Return position, velocity or effort (part 0, 1 or 2) of a joint as a signal."""
+
+    def of(reading: Reading) -> float | None:
+        values = reading.values[part]
+        k = reading.names.index(joint) if joint in reading.names else len(values)
+        return number(values[k]) if k < len(values) else None
+
+    return Signal(topic.name, of)
+
+
+def _axis(topic: contract.Topic, axis: int) -> Signal:
+    """Return a number of a vector as a signal."""
+    return Signal(topic.name, lambda reading: number(reading.values[0][axis]))
+
+
+#: Signals of the charts by name.
+SIGNALS: Final = {
+    'depth': _joint(contract.JOINT_STATES, contract.INSERTION),
+    'reference': _joint(contract.REFERENCE, contract.INSERTION),
+    'velocity': _joint(contract.JOINT_STATES, contract.INSERTION, 1),
+    'error': _joint(contract.TRACKING_ERROR, contract.INSERTION),
+    'force': _axis(contract.BASE_WRENCH, 1),
+    'force_x': _axis(contract.BASE_WRENCH, 0),
+    'force_z': _axis(contract.BASE_WRENCH, 2),
+    'tip_x': _axis(contract.TIP_DEFLECTION, 0),
+    'tip_z': _axis(contract.TIP_DEFLECTION, 2),
+    'guide_x': _joint(contract.JOINT_STATES, contract.GUIDE_X),
+    'guide_z': _joint(contract.JOINT_STATES, contract.GUIDE_Z),
+    'roll': _joint(contract.JOINT_STATES, contract.ROLL),
+}
+
+#: Force without a sensor: the effort that the robot reports.
+EFFORT: Final = _joint(contract.JOINT_STATES, contract.INSERTION, 2)
+
+
+def signal_of(name: str, topics: Container[str]) -> Signal:
+    """Return a signal of `SIGNALS`; without a force sensor, the effort is the force."""
+    signal = SIGNALS[name]
+    return EFFORT if name == 'force' and signal.topic not in topics else signal
 
 
 def line(points: FloatArray) -> list[list[float]]:
@@ -141,6 +177,15 @@ class View:
             'invalid': self.invalid,
         }
 
+    def row(self, now: float) -> list[float | None]:
+        """Return a time [s] and the values of `SIGNALS`; None while a topic is silent."""
+        silent, values = self._silent(now), list[float | None]()
+        for name in SIGNALS:
+            signal = signal_of(name, self._readings)
+            known = signal.topic in self._readings and signal.topic not in silent
+            values.append(signal.of(self._readings[signal.topic][1]) if known else None)
+        return [round(now, 3), *values]
+
     def _joints(self, topic: str) -> dict[str, tuple[float | None, ...]]:
         """Return position, velocity and effort of each joint of a topic."""
         _, reading = self._readings.get(topic, (0.0, None))
@@ -234,24 +279,3 @@ def _progress(status: NodeStatus | None) -> dict[str, int]:
     if not isinstance(status, SteeringStatus) or not status.steps:
         return {}
     return {'step': status.step, 'steps': status.steps}
-
-
-def topic_of(signal: str, topics: Container[str]) -> str:
-    """Return the topic of a signal of `SIGNALS`; without a force sensor, efforts are the force."""
-    topic, _ = SIGNALS[signal]
-    sensed = signal != 'force' or topic in topics
-    return topic if sensed else contract.JOINT_STATES.name
-
-
-def row(frame: Mapping[str, Any]) -> list[float | None]:
-    """Return the time of a frame and its values of `SIGNALS`; None while a topic is silent."""
-    tip, guide = frame['tip'] or [None] * 3, frame['guide']
-    values = {**frame, 'tip_x': tip[0], 'tip_z': tip[2], 'guide_x': guide[0], 'guide_z': guide[1]}
-    topics = {contract.BASE_WRENCH.name} if frame['sensed'] else ()
-    return [
-        frame['time'],
-        *(
-            None if topic_of(signal, topics) in frame['silent'] else values[signal]
-            for signal in SIGNALS
-        ),
-    ]

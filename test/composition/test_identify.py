@@ -7,13 +7,15 @@ import re
 import shutil
 from typing import Any
 
-from needle_identification import TERMS
+from needle_identification import identify_friction, TERMS
 from needle_insertion.cli import main
+from needle_insertion.report.identify_figures import friction_data, friction_each
 import numpy as np
 import pytest
 from reproduction.protocol import SHIPPED_BAGS
 from support.pages import look_at
 from support.presses import STIFFNESS, write_presses
+from support.samples import simulated
 import yaml
 
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))][:4]
@@ -316,6 +318,18 @@ def test_plane_of_the_presses_can_be_selected(
     assert '--axes must name two axes' in err
 
 
+def test_friction_figures_draw_excluded_samples() -> None:
+    """Each sample is drawn against velocity, those without a part in the fit by their name."""
+    estimate = identify_friction(simulated())
+    fit = estimate.fit
+    for figure in (friction_data(estimate), friction_each([estimate], ['one'])):
+        against = figure.axes[-1]
+        lines = {str(line.get_label()): line for line in against.get_lines()}
+        speeds = np.asarray(lines['excluded from the fit'].get_xdata())
+        assert np.isin(speeds, 1e3 * fit.velocity[~fit.used]).all()
+        assert len(speeds) >= min(300, int(np.count_nonzero(~fit.used)))
+
+
 def test_stiffness_page_shows_the_results(
     capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
 ) -> None:
@@ -323,7 +337,14 @@ def test_stiffness_page_shows_the_results(
     folder = tmp_path / 'report'
     identify(capsys, 'stiffness', *places, '--report', str(folder))
     seen = look_at(folder / 'stiffness.html')
-    for words in ('ka', 'Table 2', '1260 (80)', 'Is it a spring?', 'principal', *places):
+    for words in (
+        'ka',
+        'Table 2',
+        '1260 (80)',
+        'Symmetric stiffness matrices',
+        'principal',
+        *places,
+    ):
         assert words in seen.text
     assert len(seen.images) == 4
     assert all(alt and width > 500 for alt, width in seen.images)

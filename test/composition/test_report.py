@@ -22,9 +22,9 @@ from needle_insertion.report.page import TEMPLATES, write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 import pytest
 from reproduction.insertions.aiming import animate_aiming
-from support.browser import browser
-from support.pages import BROWSER, look_at
+from support.pages import look_at
 from support.watched import TARGET, write_watched
+from tools.browser import BROWSER, browser
 
 #: The blocks of pages, by name.
 BLOCKS: Any = TEMPLATES.get_template('blocks.html').module
@@ -254,6 +254,37 @@ def test_pages_fit_a_phone_screen(tmp_path: Path) -> None:
     assert [alt for alt, width in seen.images if width > 0] == ['a line that "rises"']
     assert seen.requests == []
     assert seen.overflow == 0
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
+def test_nothing_is_cut_on_a_phone(tmp_path: Path) -> None:
+    """Wide tables become cards, and long lines and narrow pictures fit: nothing scrolls."""
+    path = tmp_path / 'page.html'
+    drawn = picture().figure
+    drawn.set_size_inches(4.8, 3.0)
+    blocks = [
+        BLOCKS.grid([['one', *['0.5604 ± 0.0011'] * 12]], ['mu_s [N]'] * 13, 'numbers'),
+        BLOCKS.grid([['file', 'ab' * 32]], ['file', 'SHA-256'], 'checksums'),
+        BLOCKS.code('ros2 param set /plant model.coulomb_friction 0.559888'),
+    ]
+    show(path, blocks, [Picture('plot', 'a plot', drawn)])
+
+    async def look() -> None:
+        async with browser() as tab:
+            await tab.size(400, 900)
+            await tab.open(path.as_uri())
+            await tab.wait("document.querySelector('img').naturalWidth", 'the picture')
+            cut = (
+                "[...document.querySelectorAll('.wide, figure, pre')]"
+                '.filter((one) => one.scrollWidth > one.clientWidth).map((one) => one.innerText)'
+            )
+            assert await tab.run(cut) == []
+            # Each number has its head.
+            assert await tab.run(
+                "getComputedStyle(document.querySelector('.cards td'), '::before').content"
+            ) == '"mu_s [N]"'  # fmt: skip
+
+    asyncio.run(look())
 
 
 def test_external_requests_are_detected(tmp_path: Path) -> None:

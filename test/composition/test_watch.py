@@ -28,7 +28,7 @@ from needle_insertion.watch.live import Live, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.scene import parameters_of, scene
 from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
-from needle_insertion.watch.view import row, SIGNALS, View
+from needle_insertion.watch.view import SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import JobError, MessageError, ParameterError
 from needle_ros.status import ControllerStatus, SteeringStatus
@@ -89,9 +89,10 @@ def test_frame_contains_received_measurements() -> None:
         'reference': 0.051, 'error': 0.001, 'tip': [3e-3, 0.05, -1e-3], 'guide': [1e-3, 2e-3],
         'roll': None, 'target': None, 'expected': None, 'silent': {}, 'nodes': [],
     }.items() <= seen.items()  # fmt: skip
-    assert dict(zip(['time', *SIGNALS], row(seen), strict=True)) == {
+    assert dict(zip(['time', *SIGNALS], view.row(1.25), strict=True)) == {
         'time': 1.25, 'depth': 0.05, 'reference': 0.051, 'velocity': 0.01, 'error': 0.001,
-        'force': 2.5, 'tip_x': 3e-3, 'tip_z': -1e-3, 'guide_x': 1e-3, 'guide_z': 2e-3,
+        'force': 2.5, 'force_x': 0.1, 'force_z': 0.2, 'roll': None,
+        'tip_x': 3e-3, 'tip_z': -1e-3, 'guide_x': 1e-3, 'guide_z': 2e-3,
     }  # fmt: skip
 
 
@@ -346,8 +347,8 @@ def test_row_of_a_silent_topic_is_a_gap() -> None:
     view = View()
     view.reading('joint_states', joints(('insertion',), (0.02,), (), ()), 0.0)
     column = 1 + [*SIGNALS].index('depth')
-    assert row(view.frame(0.9))[column] == 0.02
-    assert row(view.frame(1.1))[column] is None
+    assert view.row(0.9)[column] == 0.02
+    assert view.row(1.1)[column] is None
 
 
 def test_bag_of_robot_has_straight_shape(tmp_path: Path) -> None:
@@ -889,3 +890,5 @@ def test_exclusive_options_are_rejected(watched: Path, capsys: pytest.CaptureFix
     """A recording has no control."""
     assert cli.main(['watch', str(watched), '--control']) == 2
     assert 'error: --control needs a live insertion' in capsys.readouterr().err
+    assert cli.main(['watch', str(watched), '--shift', '2s']) == 2
+    assert 'error: --shift needs two recordings' in capsys.readouterr().err

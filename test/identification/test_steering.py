@@ -8,9 +8,11 @@ from dataclasses import replace
 import json
 from math import pi, sqrt
 from pathlib import Path
+from typing import Final
 
 from benchmarks.steering_fit import FitTruth, insertion, NOISE
 from needle_dynamics import bending_length
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_identification import (
@@ -353,6 +355,80 @@ def test_a_foreign_table_is_read_without_options(tmp_path: Path) -> None:
         assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-10)
     assert 'rows in which Base sec or Base nanosec changes: 20' in found.losses
     assert any('depth=-Base y[mm], guide_x=Base x[mm]' in words for words in found.losses)
+
+
+def written(path: Path, names: str, columns: FloatArray) -> Path:
+    np.savetxt(path, columns, delimiter=',', header=names, comments='')
+    return path
+
+
+LAYOUTS: Final = {
+    # Names, and factors of depth, guide x and z, tip x, y and z [1/m].
+    'one stage and tracker in mm': (
+        'Base y,Base x,Base z,Tip x,Tip y,Tip z', (-1e3, 1e3, 1e3, 1e3, -1e3, 1e3)
+    ),
+    'depth in mm, tip in m': ('depth,guide_x,guide_z,tip_x,tip_y,tip_z', (1e3, 1, 1, 1, 1, 1)),
+    'depth in m, tip in mm': (
+        'insertion,xguide,zguide,tip_x,tip_y,tip_z', (1, 1, 1, 1e3, 1e3, 1e3)
+    ),
+    'tip in cm by its motion along the needle': (
+        'depth_mm,guide_x_mm,guide_z_mm,Tip x,Tip y,Tip z', (1e3, 1e3, 1e3, 1e2, 1e2, 1e2)
+    ),
+    'unit of one column of a body': (
+        'Base y [cm],Base x,Base z,tip_x_mm,tip_y_mm,tip_z', (1e2, 1e2, 1e2, 1e3, 1e3, 1e3)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('layout', LAYOUTS)
+def test_each_body_has_its_own_unit(tmp_path: Path, layout: str) -> None:
+    """A column above 1 does not decide the unit of another body."""
+    rng = np.random.default_rng(5)
+    depth = np.linspace(0.0, 0.1, 21)
+    guide, tip = 4e-3 * rng.normal(size=(2, 21, 2))
+    along = 0.97 * depth + 0.01
+    rows = np.column_stack([depth, guide, tip[:, 0], along, tip[:, 1]])
+    names, factors = LAYOUTS[layout]
+    found = read_steering_recording(written(tmp_path / 'run.csv', names, rows * factors))
+    # 18 digits in the file.
+    assert_allclose(found.depth, depth, atol=1e-12)
+    assert_allclose(found.guide, guide, atol=1e-12)
+    assert_allclose(found.tip, tip, atol=1e-12)
+
+
+def test_a_depth_in_mm_or_cm_needs_its_unit(tmp_path: Path) -> None:
+    rows = np.column_stack([np.linspace(0.0, 10.0, 11), *np.full((4, 11), 0.001)])
+    rows[:, 3] += np.linspace(0.0, 0.002, 11)
+    path = written(tmp_path / 'run.csv', 'depth,guide_x,guide_z,tip_x,tip_z', rows)
+    with pytest.raises(RecordingError, match=r'depth spans 10 without a unit, mm or cm: use'):
+        read_steering_recording(path)
+    found = read_steering_recording(path, columns={'depth': 'depth[cm]'})
+    assert found.depth.max() == pytest.approx(0.1)
+
+
+def test_roll_in_degrees_is_recognized(tmp_path: Path) -> None:
+    """Two turns have 12.6 rad; a rotation beyond is in degrees."""
+    for turn, unit in ((90.0, pi / 180.0), (6.0, 1.0)):
+        rows = np.column_stack([np.linspace(0.0, 0.1, 11), *np.full((4, 11), 0.001)])
+        rows[:, 3] += np.linspace(0.0, 0.002, 11)
+        rows = np.column_stack([rows, np.linspace(0.0, turn, 11)])
+        names = 'depth,guide_x,guide_z,tip_x,tip_z,roll'
+        found = read_steering_recording(written(tmp_path / 'run.csv', names, rows))
+        assert found.roll[-1] == pytest.approx(turn * unit)
+
+
+def test_a_named_column_keeps_the_selection_of_rows(tmp_path: Path) -> None:
+    steps = np.repeat(np.arange(6.0), 3)
+    rows = np.column_stack(
+        [2.0 + 0.0 * steps, -10.0 * steps, 0.0 * steps, 1e9 + steps, steps, steps, 0.0 * steps]
+    )
+    names = 'Base x,Base y,Base z,Base sec,Base nanosec,tip_x_mm,tip_z_mm'
+    path = written(tmp_path / 'run.csv', names, rows)
+    plain = read_steering_recording(path)
+    named = read_steering_recording(path, columns={'tip_x': 'tip_x_mm', 'depth': '-Base y[mm]'})
+    assert len(plain.depth) == 6
+    assert_allclose(named.depth, plain.depth)
+    assert_allclose(named.guide, plain.guide)
 
 
 def test_columns_may_be_delayed_by_rows(tmp_path: Path) -> None:

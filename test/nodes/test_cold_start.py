@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 import re
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.srv import GetState
 from needle_controller import LAWS
 from needle_controller.reference.generator import REFERENCES
+from needle_controller.steering.law import DEFAULT_LAW, STEERING_LAWS
 from needle_dynamics.compiled.store import SUFFIX
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR
@@ -183,11 +186,34 @@ def test_plant_preloads_mode_robot(rig: Callable[..., Rig], plant: dict[str, Any
     one.done(one.operator.set('plant', 'model.coulomb_friction', 0.6))
 
 
-@pytest.mark.parametrize('options', [{}, {'continuous': True}, {'turns': 1}], ids=str)
-@pytest.mark.parametrize('mode', ['robot', 'simulation'])
+def test_plant_preloads_mode_indenter(rig: Callable[..., Rig]) -> None:
+    """The end-effector presses in both directions."""
+    one = rig(plant={'mode': 'indenter', **RATE})
+    poses = one.graph.latest(one.user, PoseStamped, 'end_effector_pose', SENSOR)
+    point = JointTrajectoryPoint(effort=[0.6, -1.2])
+    point.time_from_start.nanosec = 500_000_000
+    one.until(lambda: one.course.get_subscription_count() and poses.message, 'the plant')
+    one.course.publish(JointTrajectory(joint_names=['x', 'z'], points=[point]))
+    one.until(lambda: poses.message.pose.position.z < -9e-4, 'the press')
+
+
+#: Options of each strategy and, besides the default, each law. The laws do not depend on the mode.
+OPTIONS: list[dict[str, Any]] = [{}, {'continuous': True}, {'turns': 1}]
+OTHER_LAWS = [{'law': law} for law in STEERING_LAWS if law != DEFAULT_LAW]
+
+
+@pytest.mark.parametrize(
+    ('options', 'mode'),
+    [
+        *product(OPTIONS, ('robot', 'simulation')),
+        *(({'turns': int('roll' in one['law']), **one}, 'robot') for one in OTHER_LAWS),
+    ],
+    ids=str,
+)
 def test_steering_preloads_an_insertion(
     rig: Callable[..., Rig], options: dict[str, Any], mode: str
 ) -> None:
+    """With each strategy and each law."""
     nodes = {'plant': {'mode': mode, **STEERED}, 'steering': {**STEERING, **options}}
     if mode == 'simulation':
         nodes['controller'] = {

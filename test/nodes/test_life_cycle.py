@@ -4,15 +4,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from needle_controller.controller_node import ControllerNode
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
+from needle_identification.identification_node import IdentificationNode
+from needle_identification.player_node import PlayerNode
+from needle_identification.recorder_node import RecorderNode
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import BaseNode
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
+from reproduction.protocol import SHIPPED_BAGS
 from support.ros_graph import RosGraph
 
 DONE = TransitionCallbackReturn.SUCCESS
@@ -38,18 +45,23 @@ def entities(node: BaseNode) -> Counter[str]:
         (ControllerNode, 'publisher /wrench_command'),
         (SteeringNode, 'publisher /joint_trajectory'),
         (SlicerNode, 'publisher /target'),
+        (RecorderNode, 'publisher /joint_states/_recorded'),
+        (PlayerNode, 'publisher /joint_states'),
+        (IdentificationNode, 'publisher /friction'),
     ],
 )
 @pytest.mark.parametrize('end', ['cleanup', 'shutdown', 'shutdown while active'])
 def test_cleanup_and_shutdown_destroy_what_was_created(
-    ros_graph: RosGraph, kind: Any, topic: str, end: str
+    ros_graph: RosGraph, tmp_path: Path, kind: Any, topic: str, end: str
 ) -> None:
-    """Requests of a user are answered in every state."""
-    node = ros_graph.add(kind, start=False)
+    """Requests of a user to stop the system are answered in every state."""
+    paths = {RecorderNode: tmp_path / 'bag', PlayerNode: SHIPPED_BAGS / 'friction_01'}
+    parameters = {'path': str(paths[kind])} if kind in paths else {}
+    node = ros_graph.add(kind, start=False, parameters=parameters)
     before = entities(node)
     assert not before[topic]
-    if kind is not SlicerNode:
-        assert before[f'service /{node.get_name()}/stop']
+    stops = before[f'service /{node.get_name()}/stop']
+    assert stops == (kind in (PlantNode, ControllerNode, SteeringNode))
     for _ in range(2):
         assert node.start(), node.failure
         assert entities(node)[topic] == 1
@@ -97,3 +109,60 @@ def test_only_a_configured_controller_counts_as_commander(ros_graph: RosGraph) -
         count(2)
         assert end() == DONE
         count(1)
+
+
+BAG = str(Path(__file__).resolve().parents[2] / 'bags' / 'friction_01')
+
+
+@pytest.mark.requirement('S-276')
+@pytest.mark.parametrize(
+    ('kind', 'parameters'),
+    [
+        (PlantNode, {}),
+        (ControllerNode, {}),
+        (SteeringNode, {}),
+        (RecorderNode, {}),
+        (PlayerNode, {'path': BAG}),
+        (IdentificationNode, {'live': True}),
+        (SlicerNode, {}),
+    ],
+)
+def test_invalid_transitions_are_refused_in_one_line(
+    ros_graph: RosGraph,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    kind: Any,
+    parameters: dict[str, object],
+) -> None:
+    """In each state of each node, which stays in this state and makes valid transitions."""
+    if kind is RecorderNode:
+        parameters = {'path': str(tmp_path / 'bag')}
+    node = ros_graph.add(kind, start=False, parameters=parameters)
+    user = ros_graph.node('user')
+    change = user.create_client(ChangeState, f'{node.get_name()}/change_state')
+    ros_graph.spin_until(change.service_is_ready, 'the service')
+
+    def succeeds(number: int, label: str = '') -> bool:
+        request = ChangeState.Request(transition=Transition(id=number, label=label))
+        answer = change.call_async(request)
+        # A machine that compiles for the first time.
+        ros_graph.spin_until(answer.done, 'the answer', 300.0)
+        return bool(answer.result().success)
+
+    states = []
+    for step in ('', 'configure', 'activate', 'deactivate', 'shutdown'):
+        assert not step or succeeds(0, step), node.failure
+        machine = node._state_machine
+        states.append(machine.current_state[1])
+        valid = {number for number, *_ in machine.available_transitions}
+        # All numbers of transitions, also those within a transition of the node.
+        invalid = [*({*range(100)} - valid)]
+        capfd.readouterr()
+        assert not any(succeeds(number) for number in invalid)
+        assert not succeeds(0, 'dance')
+        assert machine.current_state[1] == states[-1]
+        log = capfd.readouterr().err
+        lines = [line for line in log.splitlines() if f'not valid in state {states[-1]};' in line]
+        assert len(lines) == len(invalid) + 1
+        assert 'Traceback' not in log
+    assert states == ['unconfigured', 'inactive', 'active', 'inactive', 'finalized']

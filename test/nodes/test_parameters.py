@@ -55,9 +55,12 @@ def test_unchanged_values_may_be_set_while_configured(ros_graph: RosGraph) -> No
 
 
 def test_numeric_text_is_parsed_as_a_number(ros_graph: RosGraph) -> None:
-    """PyYAML parses 1e-3 as text, and `ros2 param load` sends it as text."""
-    node = ros_graph.add(PlantNode, parameters={'model.tissue_damping': '1e1'})
+    """PyYAML parses 1e-3 and 5mm as text, and `ros2 param load` sends it as text."""
+    texts = {'model.tissue_damping': '1e1', 'rate': '200Hz', 'depth': '20mm'}
+    node = ros_graph.add(PlantNode, parameters=texts)
     assert node.is_active
+    assert '200 Hz' in node.about()
+    assert node.values()['depth'] == 0.02
     node = ros_graph.add(PlantNode, parameters={'model.length': 'long'}, start=False)
     assert not node.start()
     assert "model.length must be a number, got 'long'" in str(node.failure)

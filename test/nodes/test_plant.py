@@ -503,6 +503,28 @@ def test_trajectory_before_activation_starts_with_it(ros_graph: RosGraph) -> Non
     assert runs[0] == runs[1]
 
 
+@pytest.mark.requirement('S-275')
+def test_inactive_plant_rejects_a_trajectory_with_a_stamp(ros_graph: RosGraph) -> None:
+    """It rests after its activation."""
+    probe = ros_graph.node('probe')
+    states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
+    course = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+    parameters = {**RATE, 'mode': 'robot', 'depth': 0.1}
+    plant = ros_graph.add(PlantNode, parameters=parameters, start=False)
+    plant.trigger_configure()
+    ros_graph.spin_until(course.get_subscription_count, 'the subscription')
+    message = trajectory(['insertion'], (0.5, [0.102], []))
+    message.header.stamp = probe.get_clock().now().to_msg()
+    course.publish(message)
+    ros_graph.spin_until(lambda: plant.diagnose().status.requests.answers, 'the answer')
+    (answer,) = plant.diagnose().status.requests.answers
+    assert (answer.verdict, answer.reason) == (Verdict.REJECTED, 'the plant is not active')
+    plant.trigger_activate()
+    # Two seconds of samples, more than the trajectory.
+    ros_graph.spin_until(lambda: len(states) > 2 * RATE['rate'], 'samples')
+    assert {state.position[0] for state in states} == {0.1}
+
+
 def test_encoder_resolution_of_a_micrometer(ros_graph: RosGraph) -> None:
     """In mode robot the joint position is rounded to the encoder resolution."""
     bench = Bench(ros_graph, mode='robot', depth=0.1, **{'base.encoder_resolution': 1e-4})

@@ -23,6 +23,7 @@ from needle_ros.status import RecorderStatus
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.duration import Duration
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
@@ -208,6 +209,21 @@ def test_services_stop_and_start_recordings(
     assert call(ros_graph, 'recorder/start') == (True, f'recording to {again}')
     assert call(ros_graph, 'recorder/stop')[0]
     assert (again / 'metadata.yaml').exists()
+
+
+def test_bag_is_complete_after_an_error_of_the_node(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
+    """An error of a transition ends the configuration, and its recording with it."""
+    node = record(tmp_path / 'bag')
+
+    def fail() -> None:
+        raise ValueError('an error')
+
+    node.deactivate = fail
+    assert node.trigger_deactivate() == TransitionCallbackReturn.ERROR
+    assert node.diagnose().message == 'not recording'
+    assert (tmp_path / 'bag' / 'metadata.yaml').exists()
 
 
 @pytest.mark.parametrize(

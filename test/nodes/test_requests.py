@@ -3,16 +3,24 @@
 
 from __future__ import annotations
 
+from time import monotonic
 from typing import Any
 
+from builtin_interfaces.msg import Duration as DurationMessage
+from geometry_msgs.msg import PointStamped
 from needle_controller.controller_node import ControllerNode
+from needle_controller.steering_node import SteeringNode
+from needle_dynamics.plant_node import PlantNode
 from needle_insertion.live.operator import Operator
+from needle_ros.base_node import BaseNode, COMMAND
 from needle_ros.calls_node import Calls
-from needle_ros.requests import CALL_TIMEOUT
+from needle_ros.requests import CALL_TIMEOUT, RequestLog
 import pytest
+from rclpy.duration import Duration
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 from support.ros_graph import RosGraph
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 
 def serve(node: Node, name: str) -> Node:
@@ -91,3 +99,67 @@ def test_rejected_target_is_never_reported_as_active(
     with pytest.raises(AssertionError, match=line):
         raise AssertionError(said)
     assert controller.diagnose().status.target is None
+
+
+#: A trajectory with a point before its start.
+BACKWARD = JointTrajectory(
+    joint_names=['insertion'],
+    points=[JointTrajectoryPoint(positions=[0.03], time_from_start=DurationMessage(sec=-1))],
+)
+
+
+@pytest.mark.requirement('S-277')
+@pytest.mark.parametrize(
+    ('kind', 'parameters', 'message'),
+    [
+        (PlantNode, {'mode': 'robot'}, BACKWARD),
+        (ControllerNode, {}, BACKWARD),
+        (SteeringNode, {}, PointStamped()),
+    ],
+)
+def test_rejection_is_published_within_200_ms(
+    ros_graph: RosGraph,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: Any,
+    parameters: dict[str, object],
+    message: Any,
+) -> None:
+    """After its receipt, also for requests that arrive faster than the status is published."""
+    received: dict[int, float] = {}
+    published: dict[int, float] = {}
+    check, publish = RequestLog.check, BaseNode.publish_diagnostics
+
+    def on_check(log: RequestLog, topic: Any, stamp: int, *rest: Any, **more: Any) -> Any:
+        received.setdefault(stamp, monotonic())
+        return check(log, topic, stamp, *rest, **more)
+
+    def on_publish(node: BaseNode) -> None:
+        publish(node)
+        if isinstance(node, kind):
+            for one in node.diagnose().status.requests.answers:
+                if one.refused:
+                    published.setdefault(one.stamp, monotonic())
+
+    monkeypatch.setattr(RequestLog, 'check', on_check)
+    monkeypatch.setattr(BaseNode, 'publish_diagnostics', on_publish)
+    user = ros_graph.node('user')
+    topic = 'target' if kind is SteeringNode else 'joint_trajectory'
+    sender = user.create_publisher(type(message), topic, COMMAND)
+    ros_graph.add(kind, parameters=parameters)
+    ros_graph.spin_until(sender.get_subscription_count, 'the receiver')
+    longest = []
+    # Five bursts: the load of other tests may delay one of them.
+    for _ in range(5):
+        received.clear()
+        published.clear()
+        for _ in range(5):
+            message.header.frame_id = 'world'
+            message.header.stamp = user.get_clock().now().to_msg()
+            sender.publish(message)
+            assert sender.wait_for_all_acked(Duration(seconds=10))
+            ros_graph.executor.spin_once(timeout_sec=0.02)
+        ros_graph.spin_until(
+            lambda: received and received.keys() <= published.keys(), 'the rejections'
+        )
+        longest.append(max(published[stamp] - at for stamp, at in received.items()))
+    assert min(longest) < 0.2

@@ -7,14 +7,21 @@ from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
+from needle_controller.steering.settings import JOINTS
 from needle_controller.steering_node import SteeringNode
+from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase
 from needle_ros.trajectory_goals import ErrorCode
 from nodes.test_steering import Bench, STEERING
 import pytest
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse
+from std_srvs.srv import Trigger
 from support.generated_messages import importable
 from support.ros_graph import RosGraph
+from trajectory_msgs.msg import JointTrajectory
+
+#: Action of a robot.
+ACTION = 'arm/follow_joint_trajectory'
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -36,7 +43,7 @@ def test_missing_action_stops_the_insertion(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, trajectory_action='arm/follow_joint_trajectory')
     bench.aim()
     assert bench.end() is SteeringPhase.STOPPED
-    assert 'no answer of arm/follow_joint_trajectory' in bench.said
+    assert 'sent 4 times, no answer of arm/follow_joint_trajectory' in bench.said
     assert not bench.moves
 
 
@@ -69,6 +76,82 @@ def test_refused_goal_stops_the_insertion_with_its_reason(
     server.destroy()
 
 
+class WholeGoals:
+    """
+    Action of a robot that refuses partial goals and goals that end in motion.
+
+    These are the defaults of joint_trajectory_controller. The plant moves by the accepted goals.
+    """
+
+    def __init__(self, bench: Bench) -> None:
+        kind = import_module('control_msgs.action').FollowJointTrajectory
+        self.refused: list[JointTrajectory] = []
+        self.refuses = False
+        robot = bench.user.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+
+        def judge(goal: Any) -> GoalResponse:
+            path = goal.trajectory
+            whole = [*path.joint_names] == [*JOINTS[:3]] and not any(path.points[-1].velocities)
+            if whole and not self.refuses:
+                return GoalResponse.ACCEPT
+            self.refused.append(path)
+            return GoalResponse.REJECT
+
+        def execute(handle: Any) -> Any:
+            robot.publish(handle.request.trajectory)
+            handle.succeed()
+            return kind.Result()
+
+        self._server = ActionServer(bench.user, kind, ACTION, execute, goal_callback=judge)
+        bench.until(bench.steering._client._client.server_is_ready, 'the action')
+
+    def destroy(self) -> None:
+        self._server.destroy()
+
+
+def inserted(graph: RosGraph) -> tuple[Bench, WholeGoals]:
+    """Return nodes during an insertion beyond 20 mm, with the guide aside."""
+    bench = Bench(graph, trajectory_action=ACTION, retract_depth=0.005)
+    robot = WholeGoals(bench)
+    bench.aim()
+    bench.until(lambda: bench.at('insertion') > 0.02, 'the insertion')
+    assert not robot.refused, bench.said
+    return bench, robot
+
+
+def retract(bench: Bench) -> None:
+    """Request the retraction."""
+    client = bench.user.create_client(Trigger, 'steering/retract')
+    bench.until(client.service_is_ready, 'the service')
+    answer = client.call_async(Trigger.Request())
+    bench.until(answer.done, 'the answer')
+    assert answer.result().success
+
+
+@pytest.mark.requirement('S-265')
+def test_retraction_by_an_action_that_refuses_partial_goals(ros_graph: RosGraph) -> None:
+    """Beyond the depth to which the plant withdraws the needle by itself."""
+    bench, robot = inserted(ros_graph)
+    retract(bench)
+    bench.until(lambda: bench.status.phase is SteeringPhase.IDLE, 'the end')
+    assert bench.said == 'waits for a target'
+    assert not robot.refused
+    assert bench.at('insertion') == pytest.approx(0.005, abs=3e-4)
+    assert abs(bench.at('guide_x')) + abs(bench.at('guide_z')) < 3e-4
+    robot.destroy()
+
+
+@pytest.mark.requirement('S-266')
+def test_refused_retraction_names_the_action(ros_graph: RosGraph) -> None:
+    bench, robot = inserted(ros_graph)
+    robot.refuses = True
+    retract(bench)
+    bench.until(lambda: bench.status.phase is SteeringPhase.IDLE, 'the end')
+    failed = f'the retraction has failed: {ACTION} rejected the motion: the goal was rejected'
+    assert bench.said == failed
+    robot.destroy()
+
+
 def test_action_without_its_package_is_an_error(
     ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -77,3 +160,10 @@ def test_action_without_its_package_is_an_error(
     steering = ros_graph.add(SteeringNode, parameters=parameters, start=False)
     assert not steering.start()
     assert 'needs control_msgs: install it' in steering.failure
+
+
+def test_action_with_continuous_is_an_error(ros_graph: RosGraph) -> None:
+    parameters = {**STEERING, 'trajectory_action': ACTION, 'continuous': True}
+    steering = ros_graph.add(SteeringNode, parameters=parameters, start=False)
+    assert not steering.start()
+    assert 'continuous must be false with trajectory_action' in steering.failure

@@ -10,10 +10,12 @@ from needle_controller.steering.motion_control import STILL
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND
+from needle_ros.status import SteeringPhase
 from needle_ros.system_state import Mode
-from nodes.test_steering import Bench
+from nodes.test_steering import Bench, STEERING
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
@@ -110,6 +112,32 @@ def test_requests_hold_for_the_whole_system(ros_graph: RosGraph, asked: str) -> 
     assert system.call(f'{other}/retract').success
     system.until(lambda: abs(system.at('insertion') - 0.01) < 5e-4, 'the retract depth')
     system.until(lambda: abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4, 'the guide')
+
+
+@pytest.mark.requirement('S-268', 'S-270')
+@pytest.mark.parametrize('restarts', [False, True])
+def test_retraction_ends_at_the_depth_of_the_controller(
+    ros_graph: RosGraph, restarts: bool
+) -> None:
+    """Deeper than `retract_depth` of `steering`, which may start during the retraction."""
+    system = System(ros_graph)
+    depth = Parameter('retract_depth', value=0.02)
+    assert system.controller.set_parameters([depth])[0].successful
+    system.aim()
+    system.until(lambda: system.at('insertion') > 0.031, 'the insertion')
+    if restarts:
+        system.steering.stop()
+        assert system.call('controller/retract').success
+        system.until(lambda: system.at('insertion') < 0.03, 'the withdrawal')
+        parameters = {**STEERING, 'use_sim_time': True}
+        system.steering = system.graph.add(SteeringNode, parameters=parameters)
+    else:
+        assert system.call('steering/retract').success
+    for phase in (SteeringPhase.RETRACTING, SteeringPhase.IDLE):
+        system.until(lambda: system.status.phase is phase, f'the phase {phase}')  # noqa: B023
+    assert system.said.startswith('waits for a target')
+    assert system.at('insertion') == pytest.approx(0.02, abs=5e-4)
+    assert abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4
 
 
 @pytest.mark.requirement('S-004')

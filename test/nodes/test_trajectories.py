@@ -78,3 +78,21 @@ def test_empty_trajectory_stops_and_holds(ros_graph: RosGraph, mode: str) -> Non
     assert abs(bench.depth - rest) < 1e-4
     assert bench.send(0, (1.0, rest + 2e-3)) == 0
     bench.until(lambda: bench.depth > rest + 1e-3, 'the next motion')
+
+
+@KINDS
+@pytest.mark.requirement('S-274')
+@pytest.mark.parametrize('services', [('stop', 'clear_stop'), ('retract',)], ids=' '.join)
+def test_stop_and_retraction_supersede_earlier_trajectories(
+    ros_graph: RosGraph, mode: str, services: tuple[str, ...]
+) -> None:
+    """Also one that arrives after the clearance, with points ahead."""
+    bench = Bench(ros_graph, mode)
+    stamp = bench.time - PERIOD
+    for service in services:
+        bench.call(service)
+    bench.send(stamp, (4.5, DEPTH + 5e-3))
+    assert bench.answer(stamp) == (Verdict.SUPERSEDED, 'a newer request has priority')
+    end = bench.time + SECOND
+    bench.until(lambda: bench.time > end, 'a second')
+    assert bench.depth < DEPTH + 1e-4

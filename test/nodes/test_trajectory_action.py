@@ -62,7 +62,8 @@ class Client:
         """
         Return a goal: tolerances as ``path`` or ``goal`` (joint, position, velocity).
 
-        ``late`` is the goal_time_tolerance [s], ``others`` are other fields.
+        ``late`` is the goal_time_tolerance [s]; ``component`` are the fields, path or goal, with a
+        tolerance of a multi-DOF joint.
         """
         kind = import_module('control_msgs.msg').JointTolerance
         goal = self.kind.Goal(trajectory=message)
@@ -70,6 +71,9 @@ class Client:
             for name, position, *velocity in tolerances.get(field, ()):
                 one = kind(name=name, position=position, velocity=sum(velocity, 0.0))
                 getattr(goal, f'{field}_tolerance').append(one)
+        kind = import_module('control_msgs.msg').JointComponentTolerance
+        for field in tolerances.get('component', ()):
+            getattr(goal, f'component_{field}_tolerance').append(kind(joint_name='base'))
         late = divmod(round(tolerances.get('late', 0.0) * SECOND), SECOND)
         goal.goal_time_tolerance.sec, goal.goal_time_tolerance.nanosec = late
         return goal
@@ -160,7 +164,10 @@ def test_policy_names_the_action(ros_graph: RosGraph, actions: str, mode: str) -
 def test_goal_succeeds_within_tolerance(ros_graph: RosGraph, actions: str, mode: str) -> None:
     bench, near = ActionBench(ros_graph, mode), 5e-5
     end = DEPTH + 3e-3
-    sent = bench.run((1.0, end), path=[('insertion', 1e-3)], goal=[('insertion', near, 1e-3)])
+    # MoveIt sends the frame of its model.
+    message = trajectory(0, [(1.0, [end])])
+    message.header.frame_id = 'world'
+    sent = bench.client.send(message, path=[('insertion', 1e-3)], goal=[('insertion', near, 1e-3)])
     assert bench.client.end(sent) == (GoalStatus.STATUS_SUCCEEDED, ErrorCode.SUCCESSFUL, '')
     last = sent.feedback[-1]
     assert abs(last.desired.positions[0] - end) < 1e-9
@@ -228,7 +235,8 @@ def test_violated_tolerance_aborts_and_holds(
     bench = ActionBench(ros_graph, mode)
     tight: dict[str, Any] = {kind: [('insertion', 1e-12, 1e-12)]}
     points = LONG if kind == 'path' else ((0.2, DEPTH + 1e-3),)
-    sent = bench.run(*points, late=1e-6, **tight)
+    # The base of the plant arrives within two samples, the reference of a controller later.
+    sent = bench.run(*points, late=1e-6 if mode == 'robot' else 0.5, **tight)
     status, code, reason = bench.client.end(sent)
     assert (status, code.name) == (ABORTED, f'{kind.upper()}_TOLERANCE_VIOLATED')
     assert 'of insertion is' in reason
@@ -246,6 +254,8 @@ def test_violated_tolerance_aborts_and_holds(
         ({'joints': ['insertion'] * 2}, 'INVALID_JOINTS', 'got insertion, insertion'),
         ({'path': [('elbow', 1.0)]}, 'INVALID_JOINTS', 'path_tolerance must be some of'),
         ({'goal': [('insertion', -2.0)]}, 'INVALID_GOAL', 'goal_tolerance of insertion must be'),
+        ({'component': ['path']}, 'INVALID_GOAL', 'component_path_tolerance must be empty'),
+        ({'component': ['goal']}, 'INVALID_GOAL', 'must be empty, got base'),
         ({'points': []}, 'INVALID_GOAL', 'trajectory has no points'),
         ({'points': [(1.0, [9.0])]}, 'INVALID_GOAL', 'must'),
         ({'points': [(1.0, [0.03]), (0.5, [0.03])]}, 'INVALID_GOAL', 'increasing'),
@@ -282,6 +292,23 @@ def test_cancel_holds(ros_graph: RosGraph, actions: str, mode: str) -> None:
     bench.rests()
     again = bench.run((0.5, bench.depth + 1e-3))
     assert bench.client.end(again)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
+@KINDS
+@pytest.mark.requirement('S-245')
+def test_cancel_of_a_waiting_goal_moves_nothing(
+    ros_graph: RosGraph, actions: str, mode: str
+) -> None:
+    """The goal in execution ends at its own end."""
+    bench, end = ActionBench(ros_graph, mode), DEPTH + 4e-3
+    first = bench.run((2.0, end), goal=[('insertion', 1e-4)])
+    bench.moved()
+    waiting = bench.run(*LONG, stamp=bench.time + 4 * SECOND)
+    waiting.handle.cancel_goal_async()
+    assert bench.client.end(waiting)[0] == GoalStatus.STATUS_CANCELED
+    assert bench.client.end(first)[0] == GoalStatus.STATUS_SUCCEEDED
+    assert abs(bench.depth - end) < 1e-3
+    bench.rests()
 
 
 @KINDS
@@ -323,6 +350,13 @@ def test_newer_trajectories_supersede_a_goal(ros_graph: RosGraph, actions: str, 
     assert bench.client.end(third) == superseded
     assert bench.client.end(second) == superseded
     assert bench.client.end(fourth)[0] == GoalStatus.STATUS_SUCCEEDED
+    # The reference of a superseded goal is not followed: 1 mm, with the error of the control law.
+    assert abs(bench.depth - end) < 2e-4
+    fifth = bench.start()
+    begin = bench.depth
+    bench.send(0, (1.0, begin + 4e-3))
+    assert bench.client.end(fifth) == superseded
+    bench.until(lambda: abs(bench.depth - begin - 4e-3) < 2e-4, 'the newer trajectory')
 
 
 @pytest.mark.requirement('S-246', 'S-244')
@@ -413,10 +447,13 @@ def test_every_end_of_the_motion_ends_the_goal(
 def test_reset_and_joint_commands_end_a_goal(ros_graph: RosGraph, actions: str) -> None:
     bench = ActionBench(ros_graph, 'robot')
     sent = bench.start()
+    bench.until(lambda: bench.depth > DEPTH + 5e-3, 'a motion of 5 mm')
     _by_service('reset', bench)
     assert bench.client.end(sent) == (ABORTED, ErrorCode.INVALID_GOAL, 'the plant was reset')
-    bench.rests()
+    bench.until(lambda: abs(bench.depth - DEPTH) < 1e-4, 'the start')
+    bench.rests(1e-4)
     sent = bench.start()
+    waiting = bench.run(*LONG, stamp=bench.time + 4 * SECOND)
     command = bench.user.create_publisher(JointState, 'joint_commands', COMMAND)
     bench.until(command.get_subscription_count, 'the plant')
     message = JointState(name=['insertion'], position=[bench.depth])
@@ -427,7 +464,13 @@ def test_reset_and_joint_commands_end_a_goal(ros_graph: RosGraph, actions: str) 
         return sent.result is not None
 
     bench.until(commanded, 'the result')
-    assert bench.client.end(sent)[1:] == (ErrorCode.INVALID_GOAL, 'joint_commands are followed')
+    for one in (sent, waiting):
+        reason = bench.client.end(one)[1:]
+        assert reason == (ErrorCode.INVALID_GOAL, 'joint_commands are followed')
+    # Not executed at its start.
+    start = bench.time + 4 * SECOND
+    bench.until(lambda: bench.time > start, 'the start of the goal that waited')
+    assert bench.node.diagnose().status.requests.answers[-1].verdict is Verdict.SUPERSEDED
 
 
 @pytest.mark.requirement('S-247')
@@ -435,9 +478,14 @@ def test_error_of_the_plant_ends_a_goal(ros_graph: RosGraph, actions: str) -> No
     """A pull leaves the range of the needle."""
     bench = ActionBench(ros_graph, 'robot')
     push = trajectory(0, [(0.1, [-10.0]), (9.0, [-10.0])], field='effort')
-    status, code, reason = bench.client.end(bench.client.send(push))
-    assert (status, code) == (ABORTED, ErrorCode.INVALID_GOAL)
-    assert reason.endswith('the plant has stopped')
+    # The second goal arrives at a plant that takes no samples.
+    for _ in range(2):
+        status, code, reason = bench.client.end(bench.client.send(push))
+        assert (status, code) == (ABORTED, ErrorCode.INVALID_GOAL)
+        assert reason.endswith('the plant has stopped')
+    _by_service('reset', bench)
+    sent = bench.run((0.5, DEPTH + 1e-3))
+    assert bench.client.end(sent)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
 @pytest.mark.requirement('S-247')
@@ -483,7 +531,10 @@ def test_indenter_takes_goals_of_efforts(ros_graph: RosGraph, actions: str) -> N
     user = ros_graph.node('user')
     ros_graph.add(PlantNode, parameters={'mode': 'indenter', 'rate': 200.0})
     client = Client(ros_graph, user, 'plant')
+    first = client.send(trajectory(0, [(9.0, [2.0, 1.0])], ('x', 'z'), 'effort'))
+    client.until(lambda: first.feedback, 'feedback')
     sent = client.send(trajectory(0, [(0.5, [1.0, 0.5])], ('x', 'z'), 'effort'))
+    assert client.end(first)[0] == ABORTED
     assert client.end(sent)[0] == GoalStatus.STATUS_SUCCEEDED
     assert sent.feedback[-1].desired.effort.tolist() == pytest.approx([1.0, 0.5])
     # The noise of the sensor.

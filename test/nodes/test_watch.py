@@ -17,11 +17,10 @@ from aiohttp import ClientSession, ClientWebSocketResponse
 from needle_insertion.watch.view import View
 from needle_insertion.watch.watch_node import WatchNode
 import pytest
-from support.browser import browser, Tab
 from support.installed import ROOT
-from support.pages import BROWSER
 from support.ros_graph import RosGraph
 from support.watched import write_watched
+from tools.browser import BROWSER, browser, Tab
 
 #: A needle moved by a controller; low rate for a busy machine.
 PLANT = {'needle': 'bending_35mm', 'steered': True, 'rate': 100.0, 'depth': 0.02}
@@ -375,3 +374,43 @@ def test_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
 
     with watching(dict(os.environ), str(tmp_path / 'bag')) as (running, url):
         asyncio.run(look(running, url))
+
+
+@needs_browser
+def test_browser_compares_two_recordings(tmp_path: Path) -> None:
+    """Both have values at the cursor, lines of their own, and columns in the table."""
+    for name in ('one', 'two'):
+        write_watched(tmp_path / name)
+
+    async def look(url: str) -> None:
+        async with browser() as tab:
+            seen = await shown(tab, url, 400, tmp_path / 'page.png')
+            assert seen['overflow'] == 0
+            assert 'Compared with two: times shifted by +0.500 s.' in seen['text']
+            assert 'needle of the other recording' in seen['text']
+            # The range has both recordings.
+            assert await tab.run('charts.range()') == [0.0, 4.5]
+            await tab.run('charts.cursor = 3, later()')
+            texts = (
+                "[...document.querySelectorAll('figcaption span')].map((one) => one.textContent)"
+            )
+            await tab.wait(f"{texts}.includes('measured 60.00')", 'the cursor')
+            # At 20 mm/s half a second later.
+            assert 'measured, other 50.00' in await tab.run(texts)
+            # After the end of the second recording it has no value.
+            await tab.run('charts.cursor = 1e3, later()')
+            await tab.wait(f"{texts}.includes('measured, other –')", 'no value')
+            lines = (await tab.run('charts.csv()')).splitlines()
+            heads = lines[0].split(',')
+            assert heads[1:5] == [
+                'depth [m]', 'reference [m]', 'other_depth [m]', 'other_reference [m]',
+            ]  # fmt: skip
+            (row,) = [line.split(',') for line in lines if line.startswith('3,')]
+            assert [float(row[1]), float(row[3])] == [0.06, 0.05]
+            dashes = 'charts.series(charts.constructor.all[0]).map((one) => String(one.line))'
+            assert len({*await tab.run(dashes)}) == 4
+            assert tab.faults == []
+
+    words = [str(tmp_path / 'one'), str(tmp_path / 'two'), '--shift', '0.5s']
+    with watching(dict(os.environ), *words) as (_, url):
+        asyncio.run(look(url))

@@ -19,6 +19,7 @@ from needle_ros.status import (
     ControllerPhase,
     ControllerStatus,
     InputStatus,
+    node_of,
     NodeStatus,
     PlantStatus,
     read_status,
@@ -37,7 +38,9 @@ REQUESTS = st.builds(
     RequestStatus,
     st.dictionaries(NAMES, st.lists(NAMES, max_size=3).map(tuple), max_size=2),
     st.lists(
-        st.builds(Acknowledgement, NAMES, st.integers(0), st.sampled_from(Verdict), st.text()),
+        st.builds(
+            Acknowledgement, NAMES, st.integers(0, 2**63 - 1), st.sampled_from(Verdict), st.text()
+        ),
         max_size=3,
         unique_by=lambda one: (one.topic, one.stamp),
     ).map(tuple),
@@ -184,3 +187,10 @@ def test_readers_use_the_dataclasses() -> None:
         if key in keys and path != Path(__file__).resolve()
     ]
     assert not broken, '\n'.join(broken)
+
+
+def test_statuses_of_other_nodes_keep_their_task() -> None:
+    """A node may report several tasks; an error of one must not hide behind another."""
+    names = ['/plant', '/plant: state', 'manager: activity', 'manager: hardware', 'a: b: state']
+    nodes = ['/plant', '/plant', 'manager: activity', 'manager: hardware', 'a: b']
+    assert [*map(node_of, names)] == nodes

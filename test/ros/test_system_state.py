@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import partial
+from time import time_ns
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -121,6 +122,58 @@ def test_any_values_are_read(values: dict[str, str]) -> None:
     )
     assert found.mode is not None
     assert '/x' not in found.cleared
+
+
+#: Times of a message: also such as no clock has, and with more digits than Python reads.
+numbers = st.one_of(
+    st.integers(0, 10**20).map(str), st.sampled_from([1, 18, 19, 20, 4300, 4301]).map('9'.__mul__)
+)
+#: Values of a `system_state`, valid and invalid.
+foreign = st.dictionaries(
+    st.sampled_from(
+        ['motion', *(f'{word} {node}' for word in ('stop', 'cleared') for node in NODES)]
+    ),
+    st.builds(' '.join, st.tuples(numbers, st.sampled_from(['', 'paused', 'retracting'])))
+    | numbers,
+)
+
+
+@pytest.mark.requirement('S-273')
+@given(received=st.lists(foreign, max_size=4), at=st.integers(0, 2))
+def test_no_message_prevents_a_later_stop(received: list[dict[str, str]], at: int) -> None:
+    """Whatever one node has received: its stop, as text, stops the others until it is cleared."""
+    nodes = [Authority(node) for node in NODES]
+
+    def publish(sender: Authority) -> None:
+        for node in nodes:
+            node.receive(SystemState.from_values(sender.state.to_values()))
+
+    for values in received:
+        nodes[at].receive(SystemState.from_values(values))
+    nodes[at].request(CLEAR_STOP)
+    publish(nodes[at])
+    nodes[at].stop('emergency')
+    publish(nodes[at])
+    assert all('emergency' in node.reason for node in nodes)
+    nodes[at - 1].request(CLEAR_STOP)
+    publish(nodes[at - 1])
+    assert {node.mode for node in nodes} == {Mode.RUNNING}
+
+
+@pytest.mark.requirement('S-273')
+@pytest.mark.parametrize('word', ['stop', 'cleared'])
+def test_entries_of_other_nodes_are_bounded_and_keep_a_stop(word: str) -> None:
+    """A state stays small, and a stop in effect in it, however many nodes publish."""
+    node = Authority('/controller')
+    node.stop('emergency')
+    for k in range(1000):
+        state = SystemState.from_values({f'{word} /node{k}': f'{time_ns()} {word}'})
+        node.receive(state)
+    assert len(node.state.to_values()) <= 2 * 64 + 2
+    assert node.mode is Mode.STOPPED
+    assert word == 'stop' or node.reason == 'emergency'
+    many = {f'stop /node{k}': f'{k} stop' for k in range(10**5)}
+    assert len(SystemState.from_values(many).stops) <= 2 * 64 + 2
 
 
 @pytest.mark.requirement('S-011', 'S-058')

@@ -8,7 +8,14 @@ from collections.abc import Collection
 from needle_ros.contract import JOINT_TRAJECTORY, REQUEST_AGE
 from needle_ros.errors import ParameterError
 from needle_ros.requests import Acknowledgement, RequestLog, Verdict
-from needle_ros.trajectories import JointPath, LateTrajectoryError, MOST_POINTS
+from needle_ros.trajectories import (
+    FollowedJoint,
+    JointPath,
+    JointReference,
+    LateTrajectoryError,
+    MOST_POINTS,
+)
+from needle_ros.trajectory_goals import ErrorCode, outcome_of, Tolerance, TrajectoryGoal
 from needle_ros.waiting_requests import WaitingRequests
 import pytest
 
@@ -128,3 +135,46 @@ def test_watched_requests_report_each_end_once() -> None:
     log.unwatch(topic, silent)
     log.answer(topic, silent, Verdict.REJECTED)
     assert len(told) == 3
+
+
+@pytest.mark.parametrize('arrived', [False, True])
+def test_goal_ends_at_its_time_limit(arrived: bool) -> None:
+    """The limit counts from the last point, also for a reference that waits."""
+    near = {'insertion': Tolerance(1e-3, 0.0)}
+    goal = TrajectoryGoal(PATH, {}, near, SECOND // 2, stamp=SECOND)
+    joint = FollowedJoint(JointReference(0.3, 0.0, 0.0, arrived), (0.2, 0.0, 0.0))
+    end = SECOND + 2 * SECOND + SECOND // 2
+    assert goal.check(end, {'insertion': joint}) is None
+    outcome = goal.check(end + 1, {'insertion': joint})
+    assert outcome is not None
+    assert outcome.code is ErrorCode.GOAL_TOLERANCE_VIOLATED
+    assert outcome.reason.endswith('0.500 s after the last point')
+    assert ('has not arrived' in outcome.reason) is not arrived
+
+
+@pytest.mark.parametrize('verdict', [Verdict.REJECTED, Verdict.SUPERSEDED])
+def test_only_a_rejected_goal_has_an_old_stamp(verdict: Verdict) -> None:
+    """A goal that is superseded after a long motion has begun in time."""
+    answer = Acknowledgement('joint_trajectory', SECOND, verdict, 'reason')
+    now = SECOND + round((REQUEST_AGE + 1.0) * SECOND)
+    old = outcome_of(answer, now).code is ErrorCode.OLD_HEADER_TIMESTAMP
+    assert old is (verdict is Verdict.REJECTED)
+
+
+def test_report_of_an_end_may_end_other_requests() -> None:
+    log, told = RequestLog({JOINT_TRAJECTORY: ['insertion']}), []
+
+    def end_all(answer: Acknowledgement, _moved: Collection[str]) -> None:
+        told.append(answer.stamp)
+        log.end('all')
+
+    for stamp in (1, 2):
+        log.watch(JOINT_TRAJECTORY, stamp, ['insertion'], end_all)
+    log.end('the first')
+    assert sorted(told) == [1, 2]
+
+
+def test_watched_requests_have_unique_stamps() -> None:
+    log = RequestLog({JOINT_TRAJECTORY: ['insertion']})
+    stamps = [log.watch(JOINT_TRAJECTORY, 7, ['insertion'], lambda *_: None) for _ in range(3)]
+    assert len({*stamps}) == 3

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import ExecutiveSettings, ReferenceLimits, SteeringPrior
 from needle_controller.reference.path import Path
+from needle_controller.steering.law import NORMAL, TipEstimate
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
 from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics import ParameterError
@@ -91,7 +92,35 @@ def test_miss_in_depth_is_a_warning() -> None:
     assert robot.loop.phase is Phase.DONE
     assert severity is Severity.WARNING
     # A bent needle is 0.1 mm less deep than its insertion depth.
-    assert re.search(r'y = (57\.[89]|58\.0)\d ± .* 2\.\d\d mm from the target', line)
+    assert re.search(
+        r'y = (57\.[89]|58\.0)\d ± .* 2\.\d\d mm from the target, at most 2.\d\d mm$', line
+    )
+
+
+@pytest.mark.requirement('S-271')
+@pytest.mark.parametrize(
+    ('off', 'half', 'severity'),
+    [
+        (0.2, 0.1, Severity.INFO),
+        (0.9, 2.0, Severity.WARNING),
+        (0.0, 2.0, Severity.WARNING),
+        (0.9, 0.2, Severity.WARNING),
+        (1.2, 0.1, Severity.WARNING),
+    ],
+)
+def test_uncertain_hit_is_a_warning(off: float, half: float, severity: Severity) -> None:
+    """Distance from the target and half width of the interval [mm] are at most 1 mm together."""
+    robot = Robot()
+    robot.steer()
+    law = robot.loop._insertion.law
+    deviation = 1e-3 * half / NORMAL
+    law.expected = TipEstimate(
+        np.array(TARGET)[[0, 2]] + (1e-3 * off, 0.0), deviation**2 * np.eye(2)
+    )
+    line, found = law.outcome()
+    assert found is severity
+    assert f'± {half:.2f} mm, y' in line
+    assert ('at most' in line) == (severity is Severity.WARNING)
 
 
 @pytest.mark.requirement('S-124')

@@ -441,7 +441,7 @@ def test_stale_request_is_rejected(age: float, frame: str, reason: str) -> None:
 @given(
     answers=st.lists(
         st.tuples(
-            st.integers(1, 10**19), st.sampled_from(Verdict), st.text('ab: ,/=', max_size=20)
+            st.integers(1, 10**19 - 1), st.sampled_from(Verdict), st.text('ab: ,/=', max_size=20)
         ),
         max_size=20,
         unique_by=lambda one: one[0],
@@ -459,6 +459,14 @@ def test_status_values_round_trip(answers: list[tuple[int, Verdict, str]]) -> No
     assert len(status.answers) == min(len(answers), 8)
     for stamp, verdict, _ in answers[-8:]:
         assert status.answer_to('joint_trajectory', stamp).verdict is verdict
+
+
+@pytest.mark.requirement('S-273')
+@pytest.mark.parametrize('digits', [19, 20, 4300, 4301, 10**5])
+def test_answers_with_any_number_of_digits_are_read(digits: int) -> None:
+    """Python raises an error from 4301 digits on; a stamp of 64 bits has at most 19."""
+    status = RequestStatus.from_values({f'request target {"9" * digits}': 'accepted'})
+    assert len(status.answers) == (digits <= 19)
 
 
 def test_status_rate_is_limited_for_many_requests() -> None:

@@ -4,7 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
+from needle_controller.steering.motion import JointMotion
+from needle_ros.contract import JOINT_TRAJECTORY
+from needle_ros.event_log import Severity
+from needle_ros.requests import RequestLog, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 import numpy as np
@@ -27,6 +32,50 @@ def inserted(continuous: bool, depth: float) -> Robot:
         robot.tick()
         assert robot.loop.steers
     return robot
+
+
+def own_withdrawal(robot: Robot, depth: float) -> None:
+    """Withdraw the needle by the controller, to a depth [m] at 10 mm/s, other than asked."""
+    execute = robot.execute
+
+    def withdraw(name: str, log: RequestLog, move: JointMotion) -> None:
+        retracts = robot.loop.phase is Phase.RETRACTING
+        if name == 'plant' or not retracts:
+            execute(name, log, move)
+        elif 'insertion' in move.joints:
+            why = 'the needle is retracted'
+            log.answer(JOINT_TRAJECTORY, move.stamp, Verdict.SUPERSEDED, why)
+            robot.report()
+
+    begin = float(robot.at[0])
+    times = robot.now + np.array([0.0, max(1e11 * (begin - depth), 1.0)])
+    robot.ways[0] = times, np.array([begin, min(depth, begin)])
+    setattr(robot, 'execute', withdraw)  # noqa: B010
+
+
+def withdrawals(robot: Robot, lost: int) -> dict[int, JointMotion]:
+    """Collect the motions of a retraction by stamp; a number of the first are lost."""
+    moves: dict[int, JointMotion] = {}
+    execute = robot.execute
+
+    def keep(name: str, log: RequestLog, move: JointMotion) -> None:
+        # The brake before is not of the retraction.
+        if move.positions[-1][0] <= 0.01:
+            moves[move.stamp] = move
+        if move.stamp not in [*moves][:lost]:
+            execute(name, log, move)
+
+    setattr(robot, 'execute', keep)  # noqa: B010
+    return moves
+
+
+def assert_rests(robot: Robot) -> None:
+    """Check that the retraction has ended without a failure, and moves nothing any more."""
+    assert robot.loop.phase is Phase.IDLE
+    assert robot.loop.diagnose(robot.now)[0] is Severity.INFO
+    before = robot.at.copy()
+    robot.tick(200)
+    assert_allclose(robot.at, before, atol=1e-12)
 
 
 def positions(robot: Robot, ticks: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -64,35 +113,210 @@ def test_deviation_during_a_retraction_does_not_stop_it(continuous: bool) -> Non
     """The controller withdraws the needle by itself, other than the motions of the node."""
     robot = inserted(continuous, 0.03)
     begin = robot.at.copy()
-    robot.rejects = lambda name, _move: 'the needle is retracted' if name == 'controller' else ''
-    robot.ways[0] = robot.now + np.array([0.0, 2e9]), np.array([begin[0], 0.0])
+    own_withdrawal(robot, 0.0)
     assert robot.request(RETRACT)
     path = positions(robot, 600)
     assert path[:, 0].max() <= begin[0] + 1e-9
     assert robot.loop.authority.reason == ''
     assert np.abs(path[-1, 1:]).max() <= SETTINGS.guide_tolerance
+    assert_rests(robot)
 
 
-@pytest.mark.requirement('S-009')
+@pytest.mark.requirement('S-268')
 @STRATEGIES
-@pytest.mark.parametrize('lost', [1, 2])
-def test_lost_withdrawal_is_repeated(continuous: bool, lost: int) -> None:
+@pytest.mark.parametrize('depth', [0.0, 0.01, 0.02, 0.03])
+def test_retraction_ends_where_the_controller_ends_it(continuous: bool, depth: float) -> None:
+    """The guide follows the measured depth; the retract depth of the node is 10 mm."""
     robot = inserted(continuous, 0.03)
-    execute, seen = robot.execute, 0
+    begin = robot.at.copy()
+    own_withdrawal(robot, depth)
+    assert robot.request(RETRACT)
+    path = positions(robot, 800)
+    assert path[-1] == pytest.approx([depth, 0.0, 0.0], abs=SETTINGS.depth_tolerance)
+    assert_rests(robot)
+    # While the needle is withdrawn, with the delay of a command and its answer.
+    part = np.clip((path[:, 0] - 0.01) / (begin[0] - 0.01), 0.0, 1.0)
+    far = np.abs(path[:, 1:] - np.outer(part, begin[1:]))[path[:, 0] > depth + 1e-6]
+    assert far.size == 0 or far.max() <= 0.15 * np.abs(begin[1:]).max() + 1e-4
 
-    def deaf(name: str, log: object, move: object) -> None:
-        nonlocal seen
-        if name == 'controller' and robot.loop.phase is Phase.RETRACTING:
-            seen += 1
-            if seen <= lost:
-                return
-        execute(name, log, move)  # type: ignore[arg-type]
 
-    setattr(robot, 'execute', deaf)  # noqa: B010
+@pytest.mark.requirement('S-009', 'S-265')
+@STRATEGIES
+@pytest.mark.parametrize('lost', [1, 3])
+def test_lost_retraction_is_repeated(continuous: bool, lost: int) -> None:
+    """Each motion has all joints and ends at rest; needle and guide stay in proportion."""
+    robot = inserted(continuous, 0.03)
+    begin, moves = robot.at.copy(), withdrawals(robot, lost)
+    assert robot.request(RETRACT)
+    path = positions(robot, 1500)
+    assert len(moves) == lost + 1
+    for move in moves.values():
+        assert move.joints == SETTINGS.joints
+        assert not move.velocities[-1].any()
+    assert path[-1] == pytest.approx([0.01, 0.0, 0.0], abs=SETTINGS.depth_tolerance)
+    assert_rests(robot)
+    path = path[path[:, 0] < begin[0]]
+    part = (path[:, 0] - 0.01) / (path[0, 0] - 0.01)
+    assert_allclose(path[:, 1:], np.outer(part, path[0, 1:]), atol=1e-9)
+
+
+@pytest.mark.requirement('S-266')
+@STRATEGIES
+def test_retraction_that_does_not_begin_is_reported(continuous: bool) -> None:
+    """Sent four times within five seconds, then one line that names the node."""
+    robot = inserted(continuous, 0.03)
+    moves = withdrawals(robot, 9)
+    robot.loop.events.take()
+    assert robot.request(RETRACT)
+    robot.tick(500)
+    assert len(moves) == 4
+    errors = [line for severity, line in robot.loop.events.take() if severity is Severity.ERROR]
+    (line,) = errors
+    assert line.startswith('the retraction has failed: insertion is at 3')
+    assert 'not at 10.000 mm' in line
+    assert 'joint_trajectory sent 4 times, no answer of controller and plant' in line
+    assert robot.loop.diagnose(robot.now)[:2] == (Severity.ERROR, line)
+    assert robot.loop.authority.reason == ''
+    # A user may request it again.
+    del robot.execute
     assert robot.request(RETRACT)
     robot.tick(1500)
-    assert seen > lost
-    assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=SETTINGS.depth_tolerance)
+    assert_rests(robot)
+
+
+@pytest.mark.requirement('S-266')
+@STRATEGIES
+@pytest.mark.parametrize('node', ['controller', 'plant'])
+def test_rejected_retraction_is_reported_with_its_reason(continuous: bool, node: str) -> None:
+    robot = inserted(continuous, 0.03)
+    retracting = lambda: robot.loop.phase is Phase.RETRACTING  # noqa: E731
+    robot.rejects = lambda name, _: 'partial goal' if name == node and retracting() else ''
+    robot.loop.events.take()
+    assert robot.request(RETRACT)
+    robot.tick(300)
+    errors = [line for severity, line in robot.loop.events.take() if severity is Severity.ERROR]
+    assert errors == [f'the retraction has failed: {node} rejected the motion: partial goal']
+    assert robot.loop.diagnose(robot.now)[:2] == (Severity.ERROR, errors[0])
+
+
+@pytest.mark.requirement('S-266')
+def test_retraction_that_does_not_arrive_is_reported() -> None:
+    """The needle is blocked at 20 mm, or the guide at half of its offset."""
+    for joint in (0, 2):
+        robot = inserted(False, 0.03)
+        least = 0.02 if joint == 0 else 0.5 * robot.at[joint]
+        sign = np.sign(least)
+
+        def moves(
+            wanted: Any, joint: int = joint, least: float = least, sign: float = sign
+        ) -> Any:
+            wanted[joint] = sign * max(sign * wanted[joint], sign * least)
+            return wanted
+
+        robot.moves = moves
+        assert robot.request(RETRACT)
+        robot.tick(6000)
+        name = SETTINGS.joints[joint]
+        assert f'failed: {name} is at {1e3 * least:.3f}' in robot.loop.diagnose(robot.now)[1]
+
+
+@pytest.mark.requirement('S-267')
+def test_lost_joint_states_during_a_retraction_are_reported() -> None:
+    """After 0.5 s; the motion under way is withdrawal only, and ends at rest."""
+    robot = inserted(False, 0.04)
+    assert robot.request(RETRACT)
+    robot.tick(50)
+    begin = robot.at.copy()
+    robot.says = lambda _at: None
+    path = positions(robot, 60)
+    severity, line, _ = robot.loop.diagnose(robot.now)
+    assert severity is Severity.ERROR
+    assert line.startswith('the retraction has failed: no joint_states received within 0.5')
+    assert robot.loop.authority.reason == ''
+    path = np.vstack([path, positions(robot, 1000)])
+    assert (np.diff(path[:, 0]) <= 1e-12).all()
+    assert path[:, 0].max() <= begin[0]
+    assert_allclose(path[-1], path[-2], atol=1e-12)
+
+
+@pytest.mark.requirement('S-270')
+@STRATEGIES
+@pytest.mark.parametrize('early', [False, True])
+def test_executive_that_starts_during_a_retraction_returns_the_guide(
+    continuous: bool, early: bool
+) -> None:
+    """Before or after it gets the first positions."""
+    robot = inserted(continuous, 0.03)
+    begin = robot.at.copy()
+    assert robot.request(RETRACT)
+    robot.tick(100)
+    state = robot.loop.authority.state
+    robot.loop = Robot(robot.loop.settings).loop
+    own_withdrawal(robot, 0.01)
+    if not early:
+        robot.tick(5)
+    robot.loop.authority.receive(state)
+    robot.follow(robot.loop.obey(robot.now))
+    assert robot.loop.phase is Phase.RETRACTING
+    path = positions(robot, 1500)
+    assert path[:, 0].max() <= begin[0]
+    assert path[-1] == pytest.approx([0.01, 0.0, 0.0], abs=SETTINGS.depth_tolerance)
+    assert_rests(robot)
+
+
+@pytest.mark.requirement('S-270')
+def test_retraction_continues_after_a_deactivation() -> None:
+    robot = inserted(False, 0.04)
+    assert robot.request(RETRACT)
+    robot.tick(50)
+    robot.follow(robot.loop.halt('the node was deactivated', robot.now))
+    robot.tick(1500)
+    assert robot.at == pytest.approx([0.01, 0.0, 0.0], abs=SETTINGS.depth_tolerance)
+    assert_rests(robot)
+
+
+@pytest.mark.requirement('S-272')
+def test_motion_of_a_user_ends_the_retraction() -> None:
+    """A trajectory of the controller, which reports that the system runs again."""
+    robot, other = inserted(False, 0.04), Authority('/controller')
+    assert robot.request(RETRACT)
+    robot.tick(50)
+    other.receive(robot.loop.authority.state)
+    other.run()
+    robot.loop.authority.receive(other.state)
+    robot.follow(robot.loop.obey(robot.now))
+    count = len(robot.begun)
+    robot.tick(800)
+    assert len(robot.begun) == count
+    assert robot.loop.phase is Phase.IDLE
+
+
+@pytest.mark.requirement('S-269')
+@STRATEGIES
+@pytest.mark.parametrize('later', [0.0, 2e-3])
+def test_repeated_stop_is_never_deeper_than_the_needle(continuous: bool, later: float) -> None:
+    """A person withdraws the needle after the stop; then it may advance by a little."""
+    robot = inserted(continuous, 0.03)
+    assert robot.request(STOP)
+    robot.tick(20)
+    depth, follow, sent = float(robot.at[0]), robot.follow, []
+
+    def keep(move: JointMotion | None) -> None:
+        if move is not None:
+            sent.append(move)
+            assert move.positions[:, 0].max() <= robot.at[0]
+        follow(move)
+
+    setattr(robot, 'follow', keep)  # noqa: B010
+    for pulled in np.linspace(0.0, 0.015, 200):
+        robot.ways[0] = np.zeros(1), np.array([depth - pulled])
+        robot.tick()
+    assert not sent
+    for pushed in np.linspace(0.0, later, 100):
+        robot.ways[0] = np.zeros(1), np.array([depth - 0.015 + pushed])
+        robot.tick()
+    robot.tick(200)
+    assert bool(sent) == bool(later)
 
 
 @pytest.mark.requirement('S-006', 'S-007', 'S-016')
@@ -208,9 +432,11 @@ def test_stop_of_a_retraction_ends_it() -> None:
     robot = inserted(False, 0.04)
     assert robot.request(RETRACT)
     robot.tick(50)
+    begin = robot.at.copy()
     assert robot.request(STOP)
     robot.tick(100)
     held = robot.at.copy()
+    assert held == pytest.approx(begin, abs=BRAKED)
     robot.tick(300)
     assert_allclose(robot.at, held, atol=1e-9)
     assert robot.loop.phase is Phase.STOPPED

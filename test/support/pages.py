@@ -18,9 +18,7 @@ import subprocess
 import tempfile
 from threading import Thread
 
-BROWSER = next(
-    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
-)
+from tools.browser import BROWSER, HEADLESS
 
 #: Loads the page in a frame with the width of a telephone, and extracts its content. The page
 #: itself has no script.
@@ -85,12 +83,7 @@ def _in_browser(page: Path, browser: str) -> Seen:
             ended = subprocess.run(
                 [
                     browser,
-                    '--headless',
-                    '--no-sandbox',
-                    '--disable-gpu',
-                    '--disable-dev-shm-usage',
-                    '--no-first-run',
-                    '--disable-background-networking',
+                    *HEADLESS,
                     f'--user-data-dir={scratch}/profile',
                     '--dump-dom',
                     f'{address}/wrapper.html',

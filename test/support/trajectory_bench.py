@@ -11,6 +11,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.requests import Verdict
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -90,6 +91,14 @@ class Bench:
 
         self.until(answered, 'the answer')
         return found[0].verdict, found[0].reason
+
+    def call(self, service: str) -> None:
+        """Call a service of the node that follows `insertion`."""
+        client = self.user.create_client(Trigger, f'{self.node.get_name()}/{service}')
+        self.until(client.service_is_ready, service)
+        answer = client.call_async(Trigger.Request())
+        self.until(answer.done, f'the answer of {service}')
+        assert answer.result().success, answer.result()
 
     def moved(self) -> int:
         """Return the stamp of the first sample away from the start [ns]."""

@@ -11,7 +11,7 @@ const needleDrawing = (() => {
   const COLORS = {
     ink: '#1c2128', faint: '#5b6570', grid: '#d5dae0', paper: '#ffffff',
     tissue: ['#f8e8de', '#efd2c2'], entry: '#8a4a33', membrane: '#5d4632',
-    needle: '#0b4f8a', earlier: '#8fb3d3', path: '#1c2128', target: '#b93a00',
+    needle: '#0b4f8a', path: '#1c2128', target: '#b93a00',
     expected: '#00694f', tip: '#7a1f6b',
   };
   const FONT = '12px system-ui, sans-serif';
@@ -104,6 +104,7 @@ const needleDrawing = (() => {
       };
       line(frame.needle);
       line(frame.path);
+      line(frame.other);
       for (const at of [frame.target, frame.expected && frame.expected.at]) {
         if (!at) continue;
         if (at[1] !== null) depths.push(mm(at[1]));
@@ -215,9 +216,8 @@ const needleDrawing = (() => {
       const {axis, middle, half, across, up} = plane;
       const points = (line) => line[1].map((y, k) => [across(y), up(line[axis][k])]);
       const target = frame.target, expected = frame.expected;
-      for (const earlier of frame.earlier || []) {
-        stroke(pen, COLORS.earlier, 1.2, [], points(earlier));
-      }
+      /* Needle of another recording. */
+      if (frame.other) stroke(pen, COLORS.tip, 2.5, [2, 5], points(frame.other));
       if (frame.needle && frame.needle.length) {
         const line = points(frame.needle);
         stroke(pen, COLORS.paper, 5.5, [], line);

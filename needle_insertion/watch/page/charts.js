@@ -7,6 +7,8 @@
 const needleCharts = (() => {
   const {prepared, stroke, label, COLORS} = needleDrawing;
   const SOLID = [COLORS.needle, []], DASHED = [COLORS.target, [6, 4]];
+  /* Lines of another recording, for each of the above. */
+  const OTHER = new Map([[COLORS.needle, [COLORS.tip, [2, 4]]], [COLORS.target, [COLORS.expected, [9, 4, 2, 4]]]]);
   const HEIGHT = 150, LEFT = 44, RIGHT = 8, TOP = 6, BOTTOM = 20;
   /* Duration of a live chart, and shortest duration [s]; zoom factor; a drag [pixels]. */
   const SPAN = 20, SHORTEST = 0.02, ZOOM = 1.5, DRAG = 4;
@@ -22,9 +24,12 @@ const needleCharts = (() => {
       signals: {guide_x: ['x', ...SOLID], guide_z: ['z', ...DASHED]}},
     {name: 'Velocity', unit: 'mm/s', si: 'm/s', factor: 1e3, least: 1, digits: 1, off: true, signals: {velocity: ['measured', ...SOLID]}},
     {name: 'Tracking error', unit: 'mm', si: 'm', factor: 1e3, least: 0.1, digits: 3, off: true, signals: {error: ['along', ...SOLID]}},
+    {name: 'Lateral force', unit: 'N', si: 'N', factor: 1, least: 0.2, digits: 2, off: true,
+      signals: {force_x: ['x', ...SOLID], force_z: ['z', ...DASHED]}},
+    {name: 'Roll', unit: '°', si: 'rad', factor: 180 / Math.PI, least: 10, digits: 1, off: true, signals: {roll: ['about y', ...SOLID]}},
   ];
   /* Columns of a row of a live frame, after the time. */
-  const ROW = ['depth', 'reference', 'velocity', 'error', 'force', 'tip_x', 'tip_z', 'guide_x', 'guide_z'];
+  const ROW = ['depth', 'reference', 'velocity', 'error', 'force', 'force_x', 'force_z', 'tip_x', 'tip_z', 'guide_x', 'guide_z', 'roll'];
 
   const fixed = (value, digits) =>
     (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
@@ -64,7 +69,9 @@ const needleCharts = (() => {
       this.seek = seek;
       this.data = {};
       this.now = 0;
-      this.duration = null;
+      this.other = {};
+      /* First and last time of a recording; null: live. */
+      this.ends = null;
       this.span = SPAN;
       this.from = 0;
       this.cursor = null;
@@ -82,10 +89,12 @@ const needleCharts = (() => {
       chart.values = {};
       chart.chosen = {};
       for (const [name, [words, , dash]] of Object.entries(chart.signals)) {
-        const value = document.createElement('span');
-        value.className = dash.length ? 'dashed' : 'solid';
-        caption.append(value);
-        chart.values[name] = value;
+        chart.values[name] = ['', 'other '].map((whose) => {
+          const value = document.createElement('span');
+          value.className = whose + (dash.length ? 'dashed' : 'solid');
+          caption.append(value);
+          return value;
+        });
         const choice = document.createElement('label'), tick = document.createElement('input');
         tick.type = 'checkbox';
         tick.name = name;
@@ -102,17 +111,19 @@ const needleCharts = (() => {
 
     /* Data. */
 
-    /* Show a recording of a duration with all its signals, {name: [times, values]}. */
-    record(signals, duration) {
+    /* Show a recording of a duration with its signals, {name: [times, values]}, and another. */
+    record(signals, duration, other) {
       this.data = signals;
-      this.duration = duration;
+      this.other = other ? other.signals : {};
+      this.last = other ? other.end : duration;
+      this.ends = other ? [Math.min(0, other.begin), Math.max(duration, other.end)] : [0, duration];
       this.whole();
     }
 
     /* Show live rows, which replace all earlier ones. */
     live(rows) {
       this.data = Object.fromEntries(ROW.map((name) => [name, [[], []]]));
-      this.duration = null;
+      this.ends = null;
       rows.forEach((row) => this.push(row));
     }
 
@@ -129,8 +140,7 @@ const needleCharts = (() => {
     }
 
     /* Value of a signal at a time: its newest one, null in a gap. */
-    at(name, time) {
-      const [times, values] = this.data[name] || [[], []];
+    at([times, values], time) {
       const k = upTo(times, time) - 1;
       return k < 0 ? null : values[k];
     }
@@ -138,24 +148,25 @@ const needleCharts = (() => {
     /* Time range. */
 
     range() {
-      return this.duration === null ? [this.now - this.span, this.now] : [this.from, this.from + this.span];
+      return this.ends === null ? [this.now - this.span, this.now] : [this.from, this.from + this.span];
     }
 
     whole() {
-      this.from = 0;
-      this.span = this.duration === null ? SPAN : Math.max(this.duration, SHORTEST);
+      const [from, to] = this.ends || [0, SPAN];
+      this.from = from;
+      this.span = Math.max(to - from, SHORTEST);
     }
 
     /* Show a range of a recording [s]. */
     show(from, to) {
-      const all = Math.max(this.duration, SHORTEST);
+      const [first, last] = this.ends, all = Math.max(last - first, SHORTEST);
       this.span = Math.min(all, Math.max(SHORTEST, to - from));
-      this.from = Math.min(Math.max(0, from), all - this.span);
+      this.from = Math.min(Math.max(first, from), first + all - this.span);
     }
 
     /* Change the duration by a factor, about a time. */
     zoom(factor, about) {
-      if (this.duration === null) {
+      if (this.ends === null) {
         this.span = Math.min(SPAN, Math.max(1, this.span / factor));
       } else {
         const [from, to] = this.range();
@@ -180,7 +191,7 @@ const needleCharts = (() => {
         canvas.setPointerCapture(event.pointerId);
       });
       canvas.addEventListener('pointermove', (event) => {
-        if (held && this.duration !== null) {
+        if (held && this.ends !== null) {
           held.moved = held.moved || Math.abs(event.clientX - held.x) > DRAG;
           const pixel = this.span / (canvas.clientWidth - LEFT - RIGHT);
           const from = held.from - (event.clientX - held.x) * pixel;
@@ -190,7 +201,7 @@ const needleCharts = (() => {
         this.changed();
       });
       canvas.addEventListener('pointerup', (event) => {
-        if (held && !held.moved && this.duration !== null) this.seek(this.time(canvas, event));
+        if (held && !held.moved && this.ends !== null) this.seek(this.time(canvas, event));
         held = null;
       });
       canvas.addEventListener('pointerleave', () => {
@@ -209,7 +220,7 @@ const needleCharts = (() => {
         const start = this.cursor === null ? this.now : this.cursor;
         this.cursor = Math.min(to, Math.max(from, start + step * (to - from)));
         this.changed();
-      } else if (event.key === 'Enter' && this.cursor !== null && this.duration !== null) {
+      } else if (event.key === 'Enter' && this.cursor !== null && this.ends !== null) {
         this.seek(this.cursor);
       } else if (event.key === '+' || event.key === '-') {
         this.zoom(event.key === '+' ? ZOOM : 1 / ZOOM, this.cursor);
@@ -226,23 +237,39 @@ const needleCharts = (() => {
       for (const chart of CHARTS) {
         const names = this.chosen(chart);
         chart.figure.hidden = !names.length;
-        for (const [name, box] of Object.entries(chart.values)) {
-          box.hidden = !names.includes(name);
-          const value = this.at(name, this.cursor === null ? now : this.cursor);
-          const text = `${chart.signals[name][0]} ${fixed(value === null ? null : value * chart.factor, chart.digits)}`;
-          if (box.textContent !== text) box.textContent = text;
+        for (const [name, boxes] of Object.entries(chart.values)) {
+          [this.data, this.other].forEach((data, k) => {
+            boxes[k].hidden = !names.includes(name) || !data[name];
+            if (boxes[k].hidden) return;
+            const time = this.cursor === null ? now : this.cursor;
+            /* The other recording may have ended before. */
+            const value = k && time > this.last ? null : this.at(data[name], time);
+            const words = `${chart.signals[name][0]}${k ? ', other' : ''}`;
+            const text = `${words} ${fixed(value === null ? null : value * chart.factor, chart.digits)}`;
+            if (boxes[k].textContent !== text) boxes[k].textContent = text;
+          });
         }
-        if (names.length) this.one(chart, names, limits);
+        if (names.length) this.one(chart, this.series(chart), limits);
       }
     }
 
     chosen(chart) {
-      return Object.keys(chart.signals).filter((name) => chart.chosen[name].checked && this.data[name]);
+      return Object.keys(chart.signals).filter((name) =>
+        chart.chosen[name].checked && (this.data[name] || this.other[name]));
+    }
+
+    /* Chosen signals of a chart, of both recordings: name, color, dash, and [times, values]. */
+    series(chart) {
+      return [this.data, this.other].flatMap((data, k) => this.chosen(chart).filter((name) => data[name])
+        .map((name) => {
+          const line = chart.signals[name].slice(1);
+          return {name: k ? `other_${name}` : name, line: k ? OTHER.get(line[0]) : line, data: data[name]};
+        }));
     }
 
     /* Points of a signal in a time range, without those of the same pixel between extremes. */
-    lines(name, from, to, x, y) {
-      const [times, values] = this.data[name], found = [];
+    lines([times, values], from, to, x, y) {
+      const found = [];
       let points = [], column = NaN, low = null, high = null;
       const end = () => {
         if (low !== null) points.push(...(low[0] <= high[0] ? [low, high] : [high, low]));
@@ -267,10 +294,9 @@ const needleCharts = (() => {
       return [...found, points].filter((one) => one.length);
     }
 
-    extent(names, from, to) {
+    extent(series, from, to) {
       let low = Infinity, high = -Infinity;
-      for (const name of names) {
-        const [times, values] = this.data[name];
+      for (const {data: [times, values]} of series) {
         for (let k = Math.max(0, upTo(times, from) - 1), last = upTo(times, to); k < last; k += 1) {
           if (values[k] === null) continue;
           low = Math.min(low, values[k]);
@@ -280,10 +306,10 @@ const needleCharts = (() => {
       return low > high ? null : [low, high];
     }
 
-    one({canvas, factor, least, limit, signals}, names, limits) {
+    one({canvas, factor, least, limit}, series, limits) {
       const width = canvas.clientWidth || 300, pen = prepared(canvas, width, HEIGHT);
       const right = width - RIGHT, bottom = HEIGHT - BOTTOM, [from, to] = this.range();
-      let [low, high] = (this.extent(names, from, to) || [-least / factor, least / factor]).map((one) => one * factor);
+      let [low, high] = (this.extent(series, from, to) || [-least / factor, least / factor]).map((one) => one * factor);
       const pad = Math.max(0.08 * (high - low), (least - (high - low)) / 2);
       [low, high] = [low - pad, high + pad];
       const x = (time) => LEFT + (time - from) * (right - LEFT) / (to - from);
@@ -296,7 +322,7 @@ const needleCharts = (() => {
         pen.fillText(fixed(value, across.digits), LEFT - 5, y(value) + 4);
       }
       /* Live times are relative to the present time. */
-      const zero = this.duration === null ? to : 0;
+      const zero = this.ends === null ? to : 0;
       const along = steps(from - zero, to - zero, Math.max(2, Math.min(10, width / 90)));
       for (const value of along.values) {
         const at = x(zero + value);
@@ -315,15 +341,14 @@ const needleCharts = (() => {
       pen.beginPath();
       pen.rect(LEFT, 0, right - LEFT, HEIGHT);
       pen.clip();
-      for (const name of names) {
-        const [, color, dash] = signals[name];
-        for (const points of this.lines(name, from, to, x, (value) => y(value * factor))) {
+      for (const {line: [color, dash], data} of series) {
+        for (const points of this.lines(data, from, to, x, (value) => y(value * factor))) {
           /* A sample between two gaps is a point. */
           if (points.length === 1) points.push([points[0][0] + 1, points[0][1]]);
           stroke(pen, color, 1.8, dash, points);
         }
       }
-      if (this.duration !== null) stroke(pen, COLORS.ink, 1.5, [], [[x(this.now), TOP], [x(this.now), bottom]]);
+      if (this.ends !== null) stroke(pen, COLORS.ink, 1.5, [], [[x(this.now), TOP], [x(this.now), bottom]]);
       if (this.cursor !== null) {
         stroke(pen, COLORS.tip, 1.5, [3, 3], [[x(this.cursor), TOP], [x(this.cursor), bottom]]);
       }
@@ -335,10 +360,9 @@ const needleCharts = (() => {
     /* Table of the shown signals in the shown range; an empty cell has no sample at its time. */
     csv() {
       const [from, to] = this.range(), rows = new Map(), heads = ['time [s]'];
-      const shown = CHARTS.flatMap((chart) => this.chosen(chart).map((name) => [name, chart.si]));
-      shown.forEach(([name, unit], k) => {
+      const shown = CHARTS.flatMap((chart) => this.series(chart).map((one) => [one, chart.si]));
+      shown.forEach(([{name, data: [times, values]}, unit], k) => {
         heads.push(`${name} [${unit}]`);
-        const [times, values] = this.data[name];
         times.forEach((time, i) => {
           if (values[i] === null || time < from || time > to) return;
           if (!rows.has(time)) rows.set(time, Array(shown.length).fill(''));
@@ -376,5 +400,6 @@ const needleCharts = (() => {
     }
   }
 
+  Charts.all = CHARTS;
   return {Charts, fixed, ZOOM};
 })();

@@ -21,7 +21,7 @@ window.needleWatch = seen;
 
 let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
 let frame = null, playback = null, waiting = false, worded = 0, drawnAt = 0;
-let dragging = false, unseen = 0, saying = 0;
+let other = null, dragging = false, unseen = 0, saying = 0;
 
 /* Text. */
 
@@ -144,7 +144,7 @@ function seek(time) {
 }
 
 /* Name of exported files: recording and time. */
-const named = () => `${setting.recording ? setting.recording.name : 'live'}_${fixed(frame.time, 2)}s`;
+const named = () => `${setting.recording ? setting.recording.name : 'live'}${other ? `_and_${other.name}` : ''}_${fixed(frame.time, 2)}s`;
 
 find('zoom-in').addEventListener('click', () => charts.zoom(needleCharts.ZOOM, frame.time));
 find('zoom-out').addEventListener('click', () => charts.zoom(1 / needleCharts.ZOOM, frame.time));
@@ -270,7 +270,10 @@ function take(message) {
   if (message.playback) playback = message.playback;
   if (message.history) charts.live(message.history);
   if (message.signals) {
-    charts.record(message.signals, setting.recording.duration);
+    other = message.other || null;
+    find('compared').hidden = find('other').hidden = other === null;
+    if (other) put(find('compared'), `Compared with ${other.words}.`);
+    charts.record(message.signals, setting.recording.duration, other);
     follow();
   }
   if (!message.frame) return undefined;

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Browser controlled over the Chrome DevTools protocol."""
+"""Headless Chromium, controlled over the Chrome DevTools protocol."""
 
 from __future__ import annotations
 
@@ -10,15 +10,31 @@ from contextlib import asynccontextmanager
 from itertools import count
 import json
 from pathlib import Path
+import shutil
 import subprocess
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType
-from support.pages import BROWSER
+
+#: Program of the browser; None if none is installed.
+BROWSER: Final = next(
+    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
+)
+
+#: Options of a browser without a window, which requests nothing from the network on its own.
+HEADLESS: Final = (
+    '--headless=new', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage', '--disable-quic',
+    '--no-first-run', '--disable-background-networking', '--disable-component-update',
+    '--disable-sync',
+)  # fmt: skip
 
 #: Timeout of the browser on a busy machine [s].
 _PATIENCE: Final = 120.0
+
+
+class BrowserError(RuntimeError):
+    """Failure of the browser, or of a script in its page."""
 
 
 class Tab:
@@ -36,7 +52,8 @@ class Tab:
         await self._stream.send_json({'id': number, 'method': method, 'params': parameters})
         while True:
             message = await self._stream.receive(_PATIENCE)
-            assert message.type is WSMsgType.TEXT, message
+            if message.type is not WSMsgType.TEXT:
+                raise BrowserError(f'the browser ended: {message}')
             said = json.loads(message.data)
             given = said.get('params', {})
             match said.get('method'):
@@ -49,15 +66,18 @@ class Tab:
                 case 'Log.entryAdded' if given['entry']['level'] == 'error':
                     self.faults.append(given['entry']['text'])
             if said.get('id') == number:
-                assert 'error' not in said, said
-                return said['result']
+                if 'error' in said:
+                    raise BrowserError(f'{method}: {said["error"]}')
+                result: dict[str, Any] = said['result']
+                return result
 
     async def run(self, script: str) -> Any:
         """Return the value of a script."""
         said = await self.call(
             'Runtime.evaluate', expression=script, returnByValue=True, awaitPromise=True
         )
-        assert 'exceptionDetails' not in said, said
+        if 'exceptionDetails' in said:
+            raise BrowserError(f'{script}: {said["exceptionDetails"]}')
         return said['result'].get('value')
 
     async def wait(self, script: str, what: str) -> Any:
@@ -68,10 +88,11 @@ class Tab:
             if value := await self.run(script):
                 return value
             await asyncio.sleep(0.1)
-        raise AssertionError(f'timeout waiting for {what}; faults: {self.faults}')
+        raise BrowserError(f'timeout waiting for {what}; faults: {self.faults}')
 
     async def size(self, width: int, height: int) -> None:
         """Set the page size [pixels]."""
+        await self.call('Emulation.setScrollbarsHidden', hidden=True)
         await self.call(
             'Emulation.setDeviceMetricsOverride',
             width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
@@ -91,6 +112,15 @@ class Tab:
                 text=text if kind == 'keyDown' else '', windowsVirtualKeyCode=code,
             )  # fmt: skip
 
+    async def image(self, height: int) -> bytes:
+        """Return a screenshot of the page, as PNG, of at most a height [pixels]."""
+        wide, tall = await self.run(
+            '[document.documentElement.clientWidth, document.documentElement.scrollHeight]'
+        )
+        clip = {'x': 0, 'y': 0, 'width': wide, 'height': min(tall, height), 'scale': 1}
+        said = await self.call('Page.captureScreenshot', captureBeyondViewport=True, clip=clip)
+        return b64decode(said['data'])
+
     async def picture(self, path: Path) -> None:
         """Save a screenshot of the whole page."""
         said = await self.call('Page.captureScreenshot', captureBeyondViewport=True)
@@ -104,12 +134,7 @@ async def browser() -> AsyncIterator[Tab]:
         running = subprocess.Popen(
             [
                 str(BROWSER),
-                '--headless=new',
-                '--no-sandbox',
-                '--disable-gpu',
-                '--disable-dev-shm-usage',
-                '--no-first-run',
-                '--disable-background-networking',
+                *HEADLESS,
                 '--remote-debugging-port=0',
                 f'--user-data-dir={scratch}/profile',
                 'about:blank',

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outcomes of interrupted insertions."""
+
+from __future__ import annotations
+
+from benchmarks.restarts import names_action
+import pytest
+
+
+@pytest.mark.parametrize(
+    ('line', 'named'),
+    [
+        (
+            'the insertion cannot be resumed: retract the needle to 1.00 mm first',
+            True,
+        ),
+        (
+            'the needle is at 20.00 mm and has been steered; retract it to 1.00 mm first',
+            True,
+        ),
+        ('steering: target rejected: stopped: the sensor is frozen; ~/clear_stop releases', True),
+        ('steering: target rejected: no joint_states received within 5 s', False),
+        ('steering: no answer to target within 6 s', False),
+        ('insertion is at 30 mm, not at 35 mm: joint_trajectory sent 4 times', False),
+        ('steering: target rejected: paused; wait until the retraction has ended', False),
+    ],
+)
+def test_only_documented_lines_name_an_action(line: str, named: bool) -> None:
+    """A line that only mentions a sent message or a wait is a failure."""
+    assert names_action(line) is named
