@@ -29,12 +29,12 @@ import numpy as np
 _RATE: Final = 200.0
 
 #: Times of targets [s], and targets [m].
-_GO, _RETURN = 0.5, 3.5
+_GO, _RETURN = 0.5, 3.7
 _TARGETS: Final = 0.04, 0.025
 
 #: Start times of faults [s].
 MOMENTS: Final = {
-    'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.45, 'arrived': 2.62, 'back': 4.2,
+    'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.45, 'arrived': 2.62, 'back': 4.4,
 }  # fmt: skip
 
 #: Duration of a fault, of the observation after it, and of the recovery [s].
