@@ -6,7 +6,6 @@ from __future__ import annotations
 import ast
 import doctest
 from functools import cache
-from glob import glob
 from importlib import import_module
 from importlib.util import find_spec
 import inspect
@@ -210,7 +209,10 @@ def test_commands_in_the_documentation_are_valid(monkeypatch: pytest.MonkeyPatch
         name, *words = shlex.split(line, comments=True)[1:]
         command = cli._load(name)
         # The shell lists the shipped recordings, by which a command may choose its kind.
-        listed = [sorted(glob(word)) if word.startswith('bags/') else [word] for word in words]
+        listed = [
+            sorted(map(str, Path().glob(word))) if word.startswith('bags/') else [word]
+            for word in words
+        ]
         words = [name, *command.completed([one for several in listed for one in several])]
         cli._parser(name, command).parse_args(cli._joined(words, command.signed))
 
