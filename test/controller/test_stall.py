@@ -151,6 +151,7 @@ def test_bent_needle_with_coarse_encoders_is_no_stall(law: str) -> None:
         for _ in range(800):
             loop.step('joint_states', fault)
         assert loop.supervisor.authority.reason == ''
+        # Rest of the law in friction.
         assert loop.depth == pytest.approx(target, abs=1e-4)
 
 

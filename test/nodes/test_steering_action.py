@@ -136,6 +136,7 @@ def test_retraction_by_an_action_that_refuses_partial_goals(ros_graph: RosGraph)
     bench.until(lambda: bench.status.phase is SteeringPhase.IDLE, 'the end')
     assert bench.said == 'waits for a target'
     assert not robot.refused
+    # Within the tolerances of depth and guide.
     assert bench.at('insertion') == pytest.approx(0.005, abs=3e-4)
     assert abs(bench.at('guide_x')) + abs(bench.at('guide_z')) < 3e-4
     robot.destroy()

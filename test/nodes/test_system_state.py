@@ -136,6 +136,7 @@ def test_retraction_ends_at_the_depth_of_the_controller(
     for phase in (SteeringPhase.RETRACTING, SteeringPhase.IDLE):
         system.until(lambda: system.status.phase is phase, f'the phase {phase}')  # noqa: B023
     assert system.said.startswith('waits for a target')
+    # The tolerance of the depth, and the rest of the law in friction.
     assert system.at('insertion') == pytest.approx(0.02, abs=5e-4)
     assert abs(system.at('guide_x')) + abs(system.at('guide_z')) < 3e-4
 
