@@ -395,8 +395,8 @@ class Supervisor(StateMachine[ForceCommand]):
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
         following, depth, load = self._following, measured.depth, self.bending.load
-        forces = self._last.force, measured.force
-        lost = following.update(stamp, depth, aim.velocity, *forces, load)
+        forces, steps = (self._last.force, measured.force), controller.guide.steps
+        lost = following.update(stamp, depth, aim.velocity, *forces, load, steps)
         stopped = self._stop_for(safety.guard.tracking(error[0]) or following.fault, stamp)
         if stopped is not None:
             return stopped

@@ -65,6 +65,11 @@ class ReferenceGenerator:
         return self._motion is not None
 
     @property
+    def steps(self) -> bool:
+        """Whether the motion is a step: the reference rests while the needle moves."""
+        return isinstance(self._motion, Step)
+
+    @property
     def arrived(self) -> bool:
         """Whether the motion to the target or along the path has ended."""
         motion = None if self.paused or self._change is not None else self._motion
@@ -125,7 +130,7 @@ class ReferenceGenerator:
         self.now, self.held = time, False
         if self._change is not None:
             # A step has no intermediate position.
-            anew = self._motion is None or isinstance(self._motion, Step)
+            anew = self._motion is None or self.steps
             now = self._beginning(depth, velocity) if anew else self.ahead(time)
             self._mark()
             change, self._change = self._change, None

@@ -202,16 +202,22 @@ class ResponseMonitor:
         commanded: float,
         reported: float,
         load: float = 0.0,
+        steps: bool = False,
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
-        commanded and the reported force [N], and the known load against the force [N]; the
-        reported force is NaN if the robot reports none.
+        commanded and the reported force [N], the known load against the force [N], and whether
+        the reference is a step: it rests while the needle moves, which no stall can be told from.
+        The reported force is NaN if the robot reports none.
         """
         applied = commanded if isnan(reported) else reported
-        self.fault = self._stall.update(stamp, depth, rate, applied, load)
+        self.fault = None
+        if steps:
+            self._stall.forget()
+        else:
+            self.fault = self._stall.update(stamp, depth, rate, applied, load)
         self.lost = self._follows_not(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:

@@ -8,6 +8,7 @@ from math import nan
 
 from benchmarks.loop import Loop, LoopFault, Sent
 from needle_controller.controller import ControllerSettings, DEFAULT_GAINS, LAWS
+from needle_controller.laws.inverse_dynamics import InverseDynamicsGains
 from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
@@ -139,6 +140,35 @@ def test_other_friction_is_no_stall(law: str, factor: float) -> None:
     assert loop.supervisor.authority.reason == ''
     # Dry friction holds the needle where the law has less force; a tenth of the stall limit.
     assert loop.depth == pytest.approx(0.05, abs=1e-4)
+
+
+@pytest.mark.requirement('S-261')
+@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('factor', [0.5, 1.0, 2.0])
+def test_start_from_rest_by_a_step_is_no_stall(law: str, factor: float) -> None:
+    """The reference is at rest from the beginning, 9 mm away from the needle."""
+    loop = Loop(law, 200.0, friction=factor, reference='step')
+    loop.target(0.029)
+    for _ in range(4000):
+        loop.step()
+    assert loop.supervisor.authority.reason == ''
+    assert loop.depth == pytest.approx(0.029, abs=1e-4)
+
+
+@pytest.mark.requirement('S-261')
+def test_light_needle_starts_by_a_step() -> None:
+    """A needle of 2 g, which the law of the source starts with 0.1 mN more than the friction."""
+    paper = InverseDynamicsGains(kp=1.0, kv=2.0, breakaway_speed=1e-8)
+    gains, exact = {'inverse_dynamics': {'insertion': paper}}, Uncertainty(carriage=0.0)
+    loop = Loop(
+        'inverse_dynamics', 1000.0, needle='paper_si', gains=gains, uncertainty=exact,
+        reference='step',
+    )  # fmt: skip
+    loop.target(0.029)
+    for _ in range(10_000):
+        loop.step()
+    # The error decreases to 5e-4 of its start within 10 s, and the delay takes 10 % of that.
+    assert loop.depth == pytest.approx(0.029, abs=6e-6)
 
 
 @pytest.mark.requirement('S-261')

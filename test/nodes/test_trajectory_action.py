@@ -144,17 +144,15 @@ ABORTED = GoalStatus.STATUS_ABORTED
 @KINDS
 @pytest.mark.requirement('S-249')
 def test_policy_names_the_action(ros_graph: RosGraph, actions: str, mode: str) -> None:
-    """All topics and services of actions of the node, and no others."""
-    bench = ActionBench(ros_graph, mode)
-    name = bench.node.get_name()
-    looks = (
-        bench.user.get_publisher_names_and_types_by_node,
-        bench.user.get_service_names_and_types_by_node,
-    )
+    """All topics and services of actions of the node, and no others; no client adds its own."""
+    bench = Bench(ros_graph, mode)
+    name, user = bench.node.get_name(), bench.user
 
-    def entities() -> list[str]:
-        return [one for look in looks for one, _ in look(name, '/') if ACTION in one]
+    def entities() -> set[str]:
+        found = user.get_topic_names_and_types() + user.get_service_names_and_types()
+        return {one for one, _ in found if ACTION in one}
 
+    # Feedback and status; goal, cancel and result.
     bench.until(lambda: len(entities()) == 5, 'the discovery')
     assert {one.partition(ACTION)[0] for one in entities()} == POLICY[name].execute
 
