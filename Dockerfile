@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # All nodes, the program `needle`, and its functions compiled for x86-64-v3: docs/howto/install.md.
 FROM python:3.12-bookworm
 

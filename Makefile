@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # First run of a clone: `make demo`, `make test`. All dependencies are installed in .venv.
 PYTHON ?= python3
 VENV := .venv

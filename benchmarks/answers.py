@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Time from a trajectory to the status "accepted" or "rejected" of the controller.
+Response times of nodes in separate processes.
 
-Controller and plant are separate processes; the status is read from ``/diagnostics``. Run it by
-``python -m benchmarks.answers --count 300``.
+``python -m benchmarks.answers --count 300``: time from a trajectory to the status "accepted" or
+"rejected" of the controller, read from ``/diagnostics``. With ``--configure``: response times of
+``get_state`` from the start of a node without compiled functions until it is active.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from time import monotonic
 from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import GetState
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros import contract
@@ -37,6 +39,11 @@ _DEPTHS: Final = {Verdict.ACCEPTED: 0.02, Verdict.REJECTED: 5.0}
 #: Longest pause between two trajectories [s]; pauses are shorter and longer than the status
 #: period.
 _PAUSE: Final = 0.15
+
+
+#: Nodes that compile functions, and time between two requests [s].
+_COMPILING: Final = 'plant', 'controller', 'steering'
+_INTERVAL: Final = 0.02
 
 
 class Countdown:
@@ -92,19 +99,49 @@ def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, lis
     return times
 
 
+def measure_configuring(name: str, logs: Path) -> list[float]:
+    """Start a node with an empty cache; return the response times of ``get_state`` [s]."""
+    times: list[float] = []
+    with Graph(logs) as graph:
+        graph.environment['NUMBA_CACHE_DIR'] = str(logs / 'empty')
+        node = graph.node('user')
+        graph.start(name)
+        graph.wait_for(node, name)
+        client = node.create_client(GetState, f'{name}/get_state')
+        graph.spin_until(client.service_is_ready, 'the service')
+        label = ''
+        while label != 'active':
+            begun = monotonic()
+            response = client.call_async(GetState.Request())
+            graph.spin_until(response.done, 'the response')
+            times.append(monotonic() - begun)
+            label = response.result().current_state.label
+            pause = Countdown(_INTERVAL)
+            graph.spin_until(pause.over, 'the next request')
+    return times
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Measure, print a table and the verdict; return the exit status."""
     parser = argparse.ArgumentParser('benchmarks.answers', description=__doc__)
     parser.add_argument('--count', type=int, default=300, help='number of trajectories')
     parser.add_argument('--seed', type=int, default=1, help='seed of the pauses')
     parser.add_argument('--rate', type=float, default=1000.0, help='rate of the nodes [Hz]')
+    parser.add_argument(
+        '--configure', action='store_true', help='of nodes that compile, in place of trajectories'
+    )
     given = parser.parse_args(words)
     with TemporaryDirectory() as folder:
-        found = measure(given.count, given.seed, given.rate, Path(folder))
+        logs = Path(folder)
+        if given.configure:
+            found = {name: measure_configuring(name, logs / name) for name in _COMPILING}
+        else:
+            answers = measure(given.count, given.seed, given.rate, logs)
+            found = {verdict.value: times for verdict, times in answers.items()}
     rows, slowest = [], 0.0
-    for verdict, times in found.items():
+    for name, times in found.items():
         p50, p99, longest = 1e3 * np.percentile(times, [50.0, 99.0, 100.0])
-        rows.append((verdict.value, str(len(times)), f'{p50:.2f}', f'{p99:.2f}', f'{longest:.2f}'))
+        rows.append((name, str(len(times)), f'{p50:.2f}', f'{p99:.2f}', f'{longest:.2f}'))
         slowest = max(slowest, float(longest))
     sys.stdout.write(f'{table(rows, ("answer", "count", "p50 ms", "p99 ms", "longest ms"))}\n')
     state, bar = ('met' if slowest < 1e3 * LONGEST else 'missed'), 1e3 * LONGEST

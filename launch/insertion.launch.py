@@ -156,8 +156,9 @@ def start(context: LaunchContext) -> list[Action]:
     ]
     if given['rviz'] == 'true':
         share('rviz2', 'rviz:=true')
-        layout = str(config / 'insertion.rviz')
-        nodes.append(Node(package='rviz2', executable='rviz2', arguments=['-d', layout], **common))
+        frame = f'{given["frame_prefix"]}needle_entry'
+        words = ['-d', str(config / 'insertion.rviz'), '-f', frame]
+        nodes.append(Node(package='rviz2', executable='rviz2', arguments=words, **common))
     # The argument or the environment selects the discovery range.
     environment = {**os.environ, **({RANGE: given['discovery']} if given['discovery'] else {})}
     stay_local(environment)

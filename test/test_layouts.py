@@ -124,13 +124,17 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def test_rviz_displays_match_topic_types(recording: Recording) -> None:
-    """Each display has a topic of its type, a matching QoS, and a frame of the suite."""
+    """Each display has a topic of its type, a matching QoS, and a frame of the suite.
+
+    Names of topics are relative: RViz may run in the namespace of one of several robots.
+    """
     layout = yaml.safe_load((CONFIG / 'insertion.rviz').read_text())['Visualization Manager']
     shown = {}
     for display in layout['Displays']:
         if 'Topic' in display:
             topic = display['Topic']
-            name = topic['Value']
+            assert not topic['Value'].startswith('/')
+            name = f'/{topic["Value"]}'
             shown[name] = DISPLAYS[display['Class'].removeprefix('rviz_default_plugins/')]
             # Sensor QoS of the nodes; RViz would receive nothing otherwise.
             assert (topic['Reliability Policy'], topic['Durability Policy']) == (

@@ -78,3 +78,18 @@ def test_license_is_the_first_line_after_the_interpreter(before: str, after: str
     assert line == '# SPDX-License-Identifier: Apache-2.0\n'
     assert licensed(before, line) == after.format(line)
     assert licensed(after.format(line), line) == after.format(line)
+
+
+@pytest.mark.parametrize(
+    ('ending', 'line'),
+    [
+        ('.js', '// SPDX-License-Identifier: Apache-2.0\n'),
+        ('.html', '{# SPDX-License-Identifier: Apache-2.0 #}\n'),
+        ('.xacro', '<!-- SPDX-License-Identifier: Apache-2.0 -->\n'),
+        ('.yaml', license_line()),
+    ],
+)
+def test_license_is_a_comment_of_each_kind_of_file(ending: str, line: str) -> None:
+    """After the declaration of XML."""
+    assert license_line(ending) == line
+    assert licensed('<?xml version="1.0"?>\n<a/>', line) == f'<?xml version="1.0"?>\n{line}<a/>'

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Check that each Python file names its license in its first line, after an interpreter line.
+Check that each source file names its license in its first line, after a line for its interpreter.
 
 ``--write`` inserts the missing lines. The identifier is the license of package.xml.
 """
@@ -16,39 +16,67 @@ import xml.etree.ElementTree as ET
 
 ROOT: Final = Path(__file__).parents[1]
 
+#: Start and end of a comment, by the ending of the name; other files have those of Python.
+COMMENTS: Final = {
+    '.js': ('// ', ''),
+    '.css': ('/* ', ' */'),
+    # Templates of reports: the report of a user does not have this license.
+    '.html': ('{# ', ' #}'),
+    '.xml': ('<!-- ', ' -->'),
+    '.xacro': ('<!-- ', ' -->'),
+}
 
-def license_line(root: Path = ROOT) -> str:
-    """Return the line with the license of package.xml."""
+#: First lines that precede everything else.
+FIRST: Final = '#!', '<?xml'
+
+#: Files of others and recordings; sros2 includes parts of a policy with their comments.
+EXCLUDED: Final = (
+    'bags/',
+    'config/security/',
+    'test/data/',
+    'needle_insertion/watch/page/watch.html',
+)
+
+_PATTERNS: Final = (
+    '*.py', '*.yaml', '*.yml', '*.toml', '*.rviz', 'scripts', 'Dockerfile', 'Makefile',
+    *(f'*{ending}' for ending in COMMENTS),
+)  # fmt: skip
+
+
+def license_line(ending: str = '.py', root: Path = ROOT) -> str:
+    """Return the line with the license of package.xml, for a file with this ending."""
     name = ET.parse(root / 'package.xml').findtext('license')  # noqa: S314
-    return f'# SPDX-License-Identifier: {name}\n'
+    before, after = COMMENTS.get(ending, ('# ', ''))
+    return f'{before}SPDX-License-Identifier: {name}{after}\n'
 
 
 def sources(root: Path = ROOT) -> Iterator[Path]:
-    """Yield the tracked Python files: modules, and the scripts of the nodes."""
+    """Yield the tracked source files."""
     listed = subprocess.run(
-        ['git', 'ls-files', '-z', '*.py', 'scripts'],  # noqa: S607
+        ['git', 'ls-files', '-z', *_PATTERNS],  # noqa: S607
         cwd=root,
         capture_output=True,
         text=True,
         check=True,
     )
-    yield from (root / name for name in listed.stdout.split('\0') if name)
+    for name in listed.stdout.split('\0'):
+        if name and not name.startswith(EXCLUDED):
+            yield root / name
 
 
 def licensed(text: str, line: str) -> str:
     """Return the text of a file with the line of its license."""
     first, end, rest = text.partition('\n')
-    if not first.startswith('#!'):
+    if not first.startswith(FIRST):
         return text if text.startswith(line) else line + text
     return text if rest.startswith(line) else first + end + line + rest
 
 
 def main() -> int:
     """List the files without a license, or write it; return the exit status."""
-    line = license_line()
     status = 0
     for path in sources():
-        text = path.read_text('utf-8')
+        line, text = license_line(path.suffix), path.read_text('utf-8')
         if (changed := licensed(text, line)) != text:
             if '--write' in sys.argv:
                 path.write_text(changed, encoding='utf-8')

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 'use strict';
 
 /* Page of `needle watch`: receives frames, draws the newest frame, and acknowledges it. */
