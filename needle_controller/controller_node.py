@@ -401,7 +401,9 @@ class ControllerNode(ModelNode):
         (position, velocity), (position_error, velocity_error) = answer.reference, answer.error
         reference = JointReference(position, velocity, nan, controller.guide.arrived)
         actual = position - position_error, velocity - velocity_error, answer.force
-        self._action.update(answer.stamp, {contract.INSERTION: FollowedJoint(reference, actual)})
+        joint = contract.INSERTION
+        paused = (joint,) if controller.guide.paused else ()
+        self._action.update(answer.stamp, {joint: FollowedJoint(reference, actual)}, paused)
 
     def diagnose(self) -> Diagnosis[ControllerStatus]:
         """Report target, state, faults and answers to requests."""

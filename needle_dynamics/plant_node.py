@@ -300,7 +300,7 @@ class PlantNode(ModelNode):
         return result
 
     def _obey(self) -> None:
-        """End every force and motion while the system is stopped; withdraw the needle."""
+        """End every force and motion of a stop, withdraw the needle, or hold it in a pause."""
         mode, before, reason = self._authority.mode, self._mode, self._authority.reason
         self._mode = mode
         if self._run is None or mode is before:
@@ -313,6 +313,10 @@ class PlantNode(ModelNode):
         elif mode is Mode.RETRACTING:
             self._trajectories.end('the needle is retracted')
             self._run.withdraw()
+        elif mode is Mode.PAUSED:
+            self._trajectories.pause(withdraws=before is Mode.RETRACTING)
+        elif before is Mode.PAUSED:
+            self._trajectories.resume()
         self._run.commands.stopped = mode is Mode.STOPPED
         self.publish_diagnostics()
 

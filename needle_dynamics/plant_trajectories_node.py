@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.joint_commands import moved_joints
@@ -17,10 +17,22 @@ from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
 from needle_ros.trajectory_action_node import TrajectoryAction
-from needle_ros.waiting_requests import WaitingRequests
+from needle_ros.waiting_requests import WaitingRequest, WaitingRequests
 from trajectory_msgs.msg import JointTrajectory
 
 _INACTIVE: Final = 'the plant is not active'
+
+
+class _Execution(NamedTuple):
+    """Path that some of its joints follow, and its start [ns]."""
+
+    path: JointPath
+    joints: frozenset[str]
+    begun: int
+
+    def without(self, joints: Collection[str]) -> _Execution:
+        """Return the execution without some joints."""
+        return self._replace(joints=self.joints - {*joints})
 
 
 class PlantTrajectories:
@@ -30,7 +42,8 @@ class PlantTrajectories:
     A trajectory starts at the sample nearest before its stamp: it waits for this sample, or joins
     if it arrives later. Without a stamp, it starts on arrival, or with the activation of a plant
     that is not active, which rejects those with a stamp. While `stopped` is not empty, none is
-    executed. `simulated` returns the simulated time [ns].
+    executed. A pause holds the joints that move; the remaining paths are followed after it, as
+    are the requests that await their start. `simulated` returns the simulated time [ns].
     """
 
     def __init__(self, node: BaseNode, plant_run: PlantRun, simulated: Callable[[], int]) -> None:
@@ -50,6 +63,10 @@ class PlantTrajectories:
         self.stopped = ''
         #: Error of the plant, after which it takes no sample; '' without one.
         self._halted = ''
+        #: Paths under way, and those that a pause holds, since a sample [ns].
+        self._executions: list[_Execution] = []
+        self._held: list[_Execution] = []
+        self._paused: int | None = None
         self._action: TrajectoryAction | None = None
         if self.received:
             node.subscribe(topic, self._on_trajectory)
@@ -76,6 +93,42 @@ class PlantTrajectories:
         """Discard the trajectories sent until now, and end the goals, whose joints hold."""
         self.requests.supersede(self._simulated())
         self._waiting.end(reason, Verdict.SUPERSEDED)
+        self._forget(self._moved)
+        self._paused = None
+
+    def pause(self, *, withdraws: bool = False) -> None:
+        """Hold the joints that move, and begin no motion that awaits its start."""
+        self._paused = self._sampled
+        self._held = [
+            one
+            for one in self._executions
+            if one.path.end(one.begun) > self._sampled + self._period
+        ]
+        joints = self._joints_held
+        self._forget(joints, held=False)
+        self._run.hold([name for name in self._moved if name in joints or withdraws])
+
+    def resume(self) -> None:
+        """Follow the rest of the paths that were paused."""
+        begun, held = self._paused, self._held
+        self._paused, self._held = None, []
+        if begun is None:
+            return
+        for one in held:
+            path, elapsed = one.path.only(one.joints), (begun - one.begun) / NANOSECONDS
+            self._execute(path, tuple(path.joints), self._run, elapsed)
+
+    @property
+    def _joints_held(self) -> set[str]:
+        return {name for one in self._held for name in one.joints}
+
+    def _forget(self, joints: Collection[str], *, held: bool = True) -> None:
+        """Forget the paths of joints that follow something else."""
+        kept = [one.without(joints) for one in self._executions]
+        self._executions = [one for one in kept if one.joints]
+        if held:
+            kept = [one.without(joints) for one in self._held]
+            self._held = [one for one in kept if one.joints]
 
     def halt(self, reason: str) -> None:
         """Discard all trajectories of a plant that cannot move, nor hold, until a reset."""
@@ -86,25 +139,42 @@ class PlantTrajectories:
     def displace(self, reason: str, joints: Collection[str]) -> None:
         """Discard the trajectories of joints that something else moves."""
         self._discard(joints, reason)
+        self._forget(joints)
         self.requests.end(reason, joints)
 
     def _discard(self, joints: Collection[str], reason: str) -> None:
         self._waiting.discard(reason, joints)
 
+    def _execute(
+        self, path: JointPath, moved: tuple[str, ...], plant_run: PlantRun, elapsed: float
+    ) -> None:
+        """Follow a path with some joints, at a time after its start [s]."""
+        follow(path, moved, plant_run, elapsed)
+        self._forget(moved)
+        begun = self._sampled - round(elapsed * NANOSECONDS)
+        self._executions.append(_Execution(path, frozenset(moved), begun))
+
     def _hold(self, joints: Collection[str]) -> None:
         """Hold joints now, also while no sample is taken."""
+        self._forget(joints)
         self._run.hold([name for name in self._moved if name in joints])
 
     def sample(self, stamp: int) -> None:
         """Begin the trajectories that start before the next sample; ``stamp`` [ns] is the last."""
         if self._action is not None and self._action.moves:
-            self._action.update(stamp, self._run.followed())
+            self._action.update(stamp, self._run.followed(), self._joints_held)
         self._sampled = stamp
-        self._begin(stamp + self._period, 0.0)
+        if self._paused is None:
+            self._begin(stamp + self._period, 0.0)
 
-    def _begin(self, until: int, elapsed: float) -> None:
-        """Execute the requests that start before a time [ns], at a time after their start [s]."""
-        for error in self._waiting.execute(until, self._run, elapsed):
+    def _begin(self, until: int, elapsed: float, only: WaitingRequest | None = None) -> None:
+        """
+        Execute the requests that start before a time [ns], at a time after their start [s].
+
+        During a pause only a new request is executed: `steering` brakes by one.
+        """
+        only = None if self._paused is None else only
+        for error in self._waiting.execute(until, self._run, elapsed, only):
             self._reject(str(error))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
@@ -130,11 +200,12 @@ class PlantTrajectories:
         else:
             # Not active, or before the first sample.
             self._sampled = self._sampled if self._node.is_active and self._sampled else now
-            request = self._waiting.add(topic, stamp, moved, partial(follow, path, moved))
+            action = partial(self._execute, path, moved)
+            request = self._waiting.add(topic, stamp, moved, action)
             # A stop waits for no sample.
             until = now + 1 if path.stops else 0
             due = max(self._sampled + self._period, until)
-            self._begin(due, request.elapsed(self._sampled))
+            self._begin(due, request.elapsed(self._sampled), request)
         self.publish_answers()
 
     def _reject(self, reason: str) -> None:

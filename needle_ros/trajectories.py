@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from needle_ros.errors import ParameterError
-from needle_ros.timing import seconds
+from needle_ros.timing import NANOSECONDS, seconds
 
 #: Maximum number of points: checking a million invalid points would take seconds.
 MOST_POINTS: Final = 10_000
@@ -70,6 +70,10 @@ class JointPath(NamedTuple):
         """Whether the joints must stop."""
         return not self.times
 
+    def end(self, begun: int) -> int:
+        """Return the time of the last point after a start [ns]; the start without points."""
+        return begun + round(NANOSECONDS * self.times[-1]) if self.times else begun
+
     def check(self, elapsed: float) -> None:
         """
         Check number and times of the points, at a time after the start [s].
@@ -98,6 +102,15 @@ class JointPath(NamedTuple):
             for values in (self.positions, self.velocities, self.efforts)
         )
         return JointPath(self.joints, times, *columns)
+
+    def only(self, joints: Collection[str]) -> JointPath:
+        """Return the path of some of its joints."""
+        kept = [k for k, name in enumerate(self.joints) if name in joints]
+        columns = (
+            [[point[k] for k in kept if k < len(point)] for point in values]
+            for values in (self.positions, self.velocities, self.efforts)
+        )
+        return JointPath([self.joints[k] for k in kept], self.times, *columns)
 
 
 def joint_values(joint: str, joints: Sequence[str], values: Points) -> list[float | None]:

@@ -98,6 +98,8 @@ class TrajectoryAction:
         #: Goals in execution, by their stamps [ns].
         self._running: dict[int, _Execution] = {}
         self._canceled: list[ServerGoalHandle] = []
+        #: Time of the last check of the goals [ns].
+        self._updated = 0
         package, _, kind = FOLLOW_JOINT_TRAJECTORY.type_name.partition('/action/')
         try:
             self._action = getattr(import_module(f'{package}.action'), kind)
@@ -148,6 +150,8 @@ class TrajectoryAction:
 
         stamp = nanoseconds(handle.request.trajectory.header.stamp) or self._now()
         goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, tell)
+        if not self._running:
+            self._updated = self._now()
         self._running[goal.stamp] = execution
         # Joint positions have no frame: MoveIt sends the frame of its model.
         self._request(goal.stamp, goal.trajectory)
@@ -192,11 +196,21 @@ class TrajectoryAction:
             # The joints follow something else until its start.
             self._discard(goal.joints, reason)
 
-    def update(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> None:
-        """Check the goals in execution at a sample with a stamp [ns], and publish feedback."""
+    def update(
+        self, stamp: int, followed: Mapping[str, FollowedJoint], paused: Collection[str] = ()
+    ) -> None:
+        """
+        Check the goals in execution at a sample with a stamp [ns], and publish feedback.
+
+        Goals of joints that are paused wait.
+        """
+        elapsed, self._updated = stamp - self._updated, stamp
         for execution in [*self._running.values()]:
             goal = execution.goal
             if not goal.moves:
+                continue
+            if goal.joints & {*paused}:
+                goal.paused += elapsed
                 continue
             outcome = goal.check(stamp, followed)
             if outcome is not None or stamp >= execution.due:

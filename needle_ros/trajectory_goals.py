@@ -76,8 +76,9 @@ class TrajectoryGoal:
     timeout: int
     #: Stamp of its request [ns].
     stamp: int = 0
-    #: Whether its motion has begun.
+    #: Whether its motion has begun, and time for which it was paused [ns].
     moves: bool = False
+    paused: int = 0
 
     @classmethod
     def from_message(cls, message: Any, joints: Collection[str]) -> TrajectoryGoal:
@@ -118,7 +119,8 @@ class TrajectoryGoal:
             return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess)
         if not waits and not excess:
             return Outcome(ErrorCode.SUCCESSFUL, '')
-        late = stamp - self.stamp - round(self.trajectory.times[-1] * NANOSECONDS)
+        end = self.stamp + self.paused + round(self.trajectory.times[-1] * NANOSECONDS)
+        late = stamp - end
         if 0 < self.timeout < late:
             reason = excess or f'the reference of {waits[0]} has not arrived'
             late_by = f'{late / NANOSECONDS:.3f} s after the last point'

@@ -49,9 +49,9 @@ class WaitingRequests:
         self._requests.answer(topic, stamp, Verdict.RECEIVED)
         return request
 
-    def take(self, stamp: int) -> WaitingRequest | None:
-        """Return and remove a request that was sent before a stamp [ns], if any."""
-        for one in self._waiting:
+    def take(self, stamp: int, only: WaitingRequest | None = None) -> WaitingRequest | None:
+        """Return and remove a request, or this one, that was sent before a stamp [ns], if any."""
+        for one in self._waiting if only is None else [only][: only in self._waiting]:
             if one.stamp - stamp > REQUEST_AGE * NANOSECONDS:
                 # The clock was set back after its arrival.
                 self._drop(one, 'the clock was set back', Verdict.REJECTED)
@@ -61,14 +61,16 @@ class WaitingRequests:
                 return one
         return None
 
-    def execute(self, until: int, context: Any, elapsed: float) -> list[ParameterError]:
+    def execute(
+        self, until: int, context: Any, elapsed: float, only: WaitingRequest | None = None
+    ) -> list[ParameterError]:
         """
-        Execute and answer the requests sent before a time [ns]; return the errors.
+        Execute and answer the requests, or one, sent before a time [ns]; return the errors.
 
         `context` is the object for their actions, `elapsed` the time since their stamps [s].
         """
         errors = []
-        while (request := self.take(until)) is not None:
+        while (request := self.take(until, only)) is not None:
             topic, stamp, joints, act = request
             try:
                 act(context, elapsed)

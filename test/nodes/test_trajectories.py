@@ -6,8 +6,9 @@ from __future__ import annotations
 from needle_ros.contract import REQUEST_AGE
 from needle_ros.requests import Verdict
 import pytest
+from std_srvs.srv import SetBool
 from support.ros_graph import RosGraph
-from support.trajectory_bench import Bench, DEPTH, PERIOD, SECOND
+from support.trajectory_bench import Bench, DEPTH, PERIOD, SECOND, trajectory
 
 KINDS = pytest.mark.parametrize('mode', ['robot', 'simulation'])
 
@@ -78,6 +79,74 @@ def test_empty_trajectory_stops_and_holds(ros_graph: RosGraph, mode: str) -> Non
     assert abs(bench.depth - rest) < 1e-4
     assert bench.send(0, (1.0, rest + 2e-3)) == 0
     bench.until(lambda: bench.depth > rest + 1e-3, 'the next motion')
+
+
+def pause(bench: Bench, on: bool) -> None:
+    """Pause or resume by the receiver."""
+    client = bench.user.create_client(SetBool, f'{bench.node.get_name()}/pause')
+    bench.until(client.service_is_ready, 'the service')
+    answer = client.call_async(SetBool.Request(data=on))
+    bench.until(answer.done, 'the answer')
+    assert answer.result().success, answer.result()
+
+
+def rests(bench: Bench, seconds: int) -> float:
+    """Check that the needle rests for some time after a second; return its depth [m]."""
+    begin = bench.time
+    bench.until(lambda: bench.time > begin + SECOND, 'the brake')
+    depth = bench.depth
+    bench.until(lambda: bench.time > begin + (1 + seconds) * SECOND, 'the pause')
+    # A needle at rest in friction: creep below 0.1 mm.
+    assert abs(bench.depth - depth) < 1e-4
+    return depth
+
+
+@KINDS
+@pytest.mark.requirement('S-278')
+def test_path_continues_after_a_pause(ros_graph: RosGraph, mode: str) -> None:
+    """For a longer time than the path; no part is skipped, nor faster."""
+    bench, duration, way = Bench(ros_graph, mode), 4, 8e-3
+    start = bench.send(bench.time, (duration, DEPTH + way))
+    bench.until(lambda: bench.depth > DEPTH + way / 8, 'the motion')
+    pause(bench, True)
+    paused = bench.time
+    depth = rests(bench, 2 * duration)
+    # It brakes from 2 mm/s: 0.1 mm within 0.1 s, and the time of the request on a busy machine.
+    assert depth < DEPTH + way / 2
+    pause(bench, False)
+    resumed = bench.time
+    bench.until(lambda: abs(bench.depth - DEPTH - way) < 2e-4, 'the end')
+    left = duration * SECOND - (paused - start)
+    assert resumed + 0.9 * left < bench.time < resumed + left + 2 * SECOND
+
+
+@KINDS
+@pytest.mark.requirement('S-278')
+def test_start_during_a_pause_is_awaited(ros_graph: RosGraph, mode: str) -> None:
+    """The path begins with the end of the pause."""
+    bench = Bench(ros_graph, mode)
+    bench.send(bench.time + 2 * SECOND, (2.0, DEPTH + 4e-3))
+    pause(bench, True)
+    assert abs(rests(bench, 4) - DEPTH) < 1e-4
+    pause(bench, False)
+    bench.until(lambda: abs(bench.depth - DEPTH - 4e-3) < 2e-4, 'the end')
+
+
+@pytest.mark.requirement('S-279')
+def test_motion_that_is_requested_in_a_pause_replaces_the_path(ros_graph: RosGraph) -> None:
+    """For its joints; those of the paused path that it does not name continue afterwards."""
+    bench = Bench(ros_graph, 'robot', steered=True, needle='bending_35mm')
+    goals = {'insertion': DEPTH + 8e-3, 'guide_x': 4e-3}
+    message = trajectory(bench.time, [(4.0, [*goals.values()])], [*goals])
+    bench.course.publish(message)
+    bench.until(lambda: bench.depth > DEPTH + 1e-3, 'the motion')
+    pause(bench, True)
+    depth = rests(bench, 1)
+    bench.send(bench.time, (0.5, depth - 2e-3))
+    bench.until(lambda: abs(bench.depth - depth + 2e-3) < 1e-4, 'the motion in the pause')
+    pause(bench, False)
+    bench.until(lambda: abs(bench.states[-1].position[1] - 4e-3) < 1e-4, 'the guide')
+    assert abs(bench.depth - depth + 2e-3) < 1e-4
 
 
 @KINDS

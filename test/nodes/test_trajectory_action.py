@@ -158,6 +158,24 @@ def test_policy_names_the_action(ros_graph: RosGraph, actions: str, mode: str) -
 
 
 @KINDS
+@pytest.mark.requirement('S-278')
+def test_goal_waits_during_a_pause(ros_graph: RosGraph, actions: str, mode: str) -> None:
+    """For longer than its goal_time_tolerance; it succeeds at its end."""
+    bench = ActionBench(ros_graph, mode)
+    end = DEPTH + 8e-3
+    sent = bench.run((3.0, end), late=2.0, goal=[('insertion', 1e-3)])
+    bench.moved()
+    assert bench.call(f'{bench.node.get_name()}/pause', SetBool, data=True).success
+    begin = bench.time
+    bench.until(lambda: bench.time > begin + 8 * SECOND, 'the pause')
+    assert sent.result is None
+    assert bench.depth < DEPTH + 6e-3
+    assert bench.call(f'{bench.node.get_name()}/pause', SetBool, data=False).success
+    assert bench.client.end(sent)[:2] == (GoalStatus.STATUS_SUCCEEDED, ErrorCode.SUCCESSFUL)
+    assert abs(bench.depth - end) < 1e-3
+
+
+@KINDS
 @pytest.mark.requirement('S-243')
 def test_goal_succeeds_within_tolerance(ros_graph: RosGraph, actions: str, mode: str) -> None:
     bench, near = ActionBench(ros_graph, mode), 5e-5
