@@ -32,8 +32,10 @@ from needle_ros import contract
 from needle_ros.base_node import COMMAND, message_class, SENSOR
 from needle_ros.status import node_of, PlantStatus
 import pytest
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
 from support.generated_messages import importable
 from support.installed import ROOT
 from support.ros_graph import RosGraph
@@ -70,10 +72,22 @@ class Driver:
         self.status = PlantStatus()
         self.node.create_subscription(JointState, 'joint_states', self._on_state, HEARD)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
+        if 'publish_clock' in plant:
+            self.node.set_parameters([Parameter('use_sim_time', value=True)])
         self.commands = self.node.create_publisher(JointState, 'joint_commands', SENT)
         graph.start('plant', {'rate': 1000.0, **plant})
         self.node.create_timer(1.0 / rate, self.write)
-        self.until(lambda: self.state and self.commands.get_subscription_count(), 'the plant')
+        self.until(self.commands.get_subscription_count, 'the plant')
+        if 'paused' not in plant:
+            self.until(lambda: self.state, 'the first sample')
+
+    def proceed(self) -> None:
+        """Start the time of a plant that is paused."""
+        client = self.node.create_client(SetBool, 'plant/pause_time')
+        self.until(client.service_is_ready, 'the service')
+        answer = client.call_async(SetBool.Request(data=False))
+        self.until(answer.done, 'the answer')
+        self.until(lambda: self.state, 'the first sample')
 
     def _on_state(self, message: JointState) -> None:
         for k, name in enumerate(message.name):
@@ -314,8 +328,13 @@ def test_commanded_run_is_reproduced_by_replay(
         ros_graph,
         tmp_path,
         kinds[mode],
-        # The recorder and this process keep up on a busy machine.
-        **{'rate': 200.0, **(STEERED if mode == 'steered' else {'mode': mode, 'depth': 0.02})},
+        # This process keeps up on a busy machine, and the plant waits for the recorder.
+        **{
+            'rate': 100.0,
+            'publish_clock': True,
+            'paused': True,
+            **(STEERED if mode == 'steered' else {'mode': mode, 'depth': 0.02}),
+        },
     )
 
     def recorded() -> bool:
@@ -330,6 +349,7 @@ def test_commanded_run_is_reproduced_by_replay(
         )
 
     ros_graph.spin_until(recorded, 'the recorder')
+    driver.proceed()
     course = Trajectory(driver, 0.024, 0.01)
 
     def follow() -> None:
@@ -347,7 +367,7 @@ def test_commanded_run_is_reproduced_by_replay(
     driver.further(0.3)
     recorder.interrupt()
     (run,) = verify(tmp_path / 'bag')
-    assert run.verdict == 'identical', (run.first, run.reason, run.notes)
+    assert run.verdict == 'identical', f'{run.first} | {run.reason} | {run.notes}'
     assert set(run.topics) == {'/joint_states', '/base_wrench', '/tip_deflection', '/ground_truth'}
     assert run.recorded.rows['/joint_states'].values[-1, 0] > 0.0235
     driven = [note for note in run.notes if 'joint_commands' in note]

@@ -117,7 +117,8 @@ def test_path_continues_after_a_pause(ros_graph: RosGraph, mode: str) -> None:
     resumed = bench.time
     bench.until(lambda: abs(bench.depth - DEPTH - way) < 2e-4, 'the end')
     left = duration * SECOND - (paused - start)
-    assert resumed + 0.9 * left < bench.time < resumed + left + 2 * SECOND
+    # The smooth path of the controller is 0.2 mm from its end for a sixth of its duration.
+    assert resumed + left - duration * SECOND / 5 < bench.time < resumed + left + 2 * SECOND
 
 
 @KINDS
