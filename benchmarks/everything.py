@@ -147,6 +147,9 @@ class Insertions:
 
                 def passes(is_done: Callable[[], bool] = is_done) -> bool:
                     sample()
+                    steering = self.status('steering', SteeringStatus)
+                    if steering.phase is SteeringPhase.STOPPED:
+                        raise GraphError(f'the insertion was stopped: {steering.fault}')
                     return time.monotonic() > end or is_done()
 
                 self.until(passes, f'the end of {what}')
