@@ -20,6 +20,7 @@ from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
+from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros import contract
@@ -40,10 +41,12 @@ _DEPTHS: Final = {Verdict.ACCEPTED: 0.02, Verdict.REJECTED: 5.0}
 #: period.
 _PAUSE: Final = 0.15
 
-
 #: Nodes that compile functions, and time between two requests [s].
 _COMPILING: Final = 'plant', 'controller', 'steering'
 _INTERVAL: Final = 0.02
+
+#: Timeout of their activation [s].
+_START: Final = 180.0
 
 
 class Countdown:
@@ -109,8 +112,10 @@ def measure_configuring(name: str, logs: Path) -> list[float]:
         graph.wait_for(node, name)
         client = node.create_client(GetState, f'{name}/get_state')
         graph.spin_until(client.service_is_ready, 'the service')
-        label = ''
+        label, limit = '', Countdown(_START)
         while label != 'active':
+            if limit.over():
+                raise GraphError(f'{name} is {label} {_START:g} s after its start')
             begun = monotonic()
             response = client.call_async(GetState.Request())
             graph.spin_until(response.done, 'the response')

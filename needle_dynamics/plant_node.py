@@ -315,7 +315,7 @@ class PlantNode(ModelNode):
             self._run.withdraw()
         elif mode is Mode.PAUSED:
             self._trajectories.pause(withdraws=before is Mode.RETRACTING)
-        elif before is Mode.PAUSED:
+        if before is Mode.PAUSED:
             self._trajectories.resume()
         self._run.commands.stopped = mode is Mode.STOPPED
         self.publish_diagnostics()

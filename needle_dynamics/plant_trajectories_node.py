@@ -30,10 +30,6 @@ class _Execution(NamedTuple):
     joints: frozenset[str]
     begun: int
 
-    def without(self, joints: Collection[str]) -> _Execution:
-        """Return the execution without some joints."""
-        return self._replace(joints=self.joints - {*joints})
-
 
 class PlantTrajectories:
     """
@@ -94,10 +90,13 @@ class PlantTrajectories:
         self.requests.supersede(self._simulated())
         self._waiting.end(reason, Verdict.SUPERSEDED)
         self._forget(self._moved)
-        self._paused = None
 
     def pause(self, *, withdraws: bool = False) -> None:
-        """Hold the joints that move, and begin no motion that awaits its start."""
+        """
+        Hold the joints that move, and begin no motion that awaits its start.
+
+        `withdraws` is whether the plant withdraws the needle, which is no trajectory.
+        """
         self._paused = self._sampled
         self._held = [
             one
@@ -105,11 +104,13 @@ class PlantTrajectories:
             if one.path.end(one.begun) > self._sampled + self._period
         ]
         joints = self._joints_held
-        self._forget(joints, held=False)
-        self._run.hold([name for name in self._moved if name in joints or withdraws])
+        self._executions = []
+        # At rest nothing changes: an indenter keeps its force.
+        if joints or withdraws:
+            self._run.hold([name for name in self._moved if name in joints or withdraws])
 
     def resume(self) -> None:
-        """Follow the rest of the paths that were paused."""
+        """End a pause: follow the rest of the paths that it holds."""
         begun, held = self._paused, self._held
         self._paused, self._held = None, []
         if begun is None:
@@ -122,13 +123,11 @@ class PlantTrajectories:
     def _joints_held(self) -> set[str]:
         return {name for one in self._held for name in one.joints}
 
-    def _forget(self, joints: Collection[str], *, held: bool = True) -> None:
+    def _forget(self, joints: Collection[str]) -> None:
         """Forget the paths of joints that follow something else."""
-        kept = [one.without(joints) for one in self._executions]
-        self._executions = [one for one in kept if one.joints]
-        if held:
-            kept = [one.without(joints) for one in self._held]
-            self._held = [one for one in kept if one.joints]
+        for paths in (self._executions, self._held):
+            kept = [one._replace(joints=one.joints - {*joints}) for one in paths]
+            paths[:] = [one for one in kept if one.joints]
 
     def halt(self, reason: str) -> None:
         """Discard all trajectories of a plant that cannot move, nor hold, until a reset."""

@@ -119,8 +119,7 @@ class TrajectoryGoal:
             return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess)
         if not waits and not excess:
             return Outcome(ErrorCode.SUCCESSFUL, '')
-        end = self.stamp + self.paused + round(self.trajectory.times[-1] * NANOSECONDS)
-        late = stamp - end
+        late = stamp - self.trajectory.end(self.stamp + self.paused)
         if 0 < self.timeout < late:
             reason = excess or f'the reference of {waits[0]} has not arrived'
             late_by = f'{late / NANOSECONDS:.3f} s after the last point'

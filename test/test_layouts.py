@@ -124,7 +124,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def test_rviz_displays_match_topic_types(recording: Recording) -> None:
-    """Each display has a topic of its type, a matching QoS, and a frame of the suite.
+    """
+    Each display has a topic of its type, a matching QoS, and a frame of the suite.
 
     Names of topics are relative: RViz may run in the namespace of one of several robots.
     """

@@ -209,8 +209,8 @@ class ResponseMonitor:
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
         commanded and the reported force [N], the known load against the force [N], and whether
-        the reference is a step: it rests while the needle moves, which no stall can be told from.
-        The reported force is NaN if the robot reports none.
+        the reference is a step; the reported force is NaN if the robot reports none. During a step
+        no stall is detected: the reference rests while the needle moves.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None

@@ -152,7 +152,8 @@ def test_start_from_rest_by_a_step_is_no_stall(law: str, factor: float) -> None:
     for _ in range(4000):
         loop.step()
     assert loop.supervisor.authority.reason == ''
-    assert loop.depth == pytest.approx(0.029, abs=1e-4)
+    # Dry friction holds the needle where the law has less force, as after other motions.
+    assert abs(loop.depth - 0.029) < 1e-4
 
 
 @pytest.mark.requirement('S-261')
@@ -167,8 +168,11 @@ def test_light_needle_starts_by_a_step() -> None:
     loop.target(0.029)
     for _ in range(10_000):
         loop.step()
-    # The error decreases to 5e-4 of its start within 10 s, and the delay takes 10 % of that.
-    assert loop.depth == pytest.approx(0.029, abs=6e-6)
+    # (1 + t) exp(-t) of the 9 mm at t = 10 s is 4.5 um; a tenth more for the delay of a period. A
+    # needle that never starts misses by 9 mm, and one that a check stops at the end by more than
+    # the lower limit.
+    error = 0.029 - loop.depth
+    assert 4e-6 < error < 5e-6
 
 
 @pytest.mark.requirement('S-261')

@@ -27,7 +27,7 @@ from needle_ros.trajectory_goals import ErrorCode
 import pytest
 from rclpy.action.client import ActionClient
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 from support.generated_messages import importable
 from support.policies import ACTION, POLICY
 from support.ros_graph import RosGraph
@@ -117,26 +117,6 @@ class ActionBench(Bench):
         self.moved()
         return sent
 
-    def call(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
-        """Call a service of a node; return its response."""
-        client = self.user.create_client(kind, service)
-        self.until(client.service_is_ready, service)
-        done = client.call_async(kind.Request(**fields))
-        self.until(done.done, f'the response of {service}')
-        self.user.destroy_client(client)
-        return done.result()
-
-    def rests(self, margin: float = 1e-3) -> None:
-        """Check that the needle brakes within a margin [m], and holds for two seconds."""
-        at = self.depth
-        begin = self.time
-        self.until(lambda: self.time > begin + SECOND, 'the brake')
-        rest = self.depth
-        assert abs(rest - at) < margin
-        self.until(lambda: self.time > begin + 3 * SECOND, 'two seconds')
-        # Creep of a needle at rest in friction.
-        assert abs(self.depth - rest) < 1e-4
-
 
 ABORTED = GoalStatus.STATUS_ABORTED
 
@@ -166,12 +146,12 @@ def test_goal_waits_during_a_pause(ros_graph: RosGraph, actions: str, mode: str)
     end = DEPTH + 8e-3
     sent = bench.run((3.0, end), late=2.0, goal=[('insertion', 1e-3)])
     bench.moved()
-    assert bench.call(f'{bench.node.get_name()}/pause', SetBool, data=True).success
+    bench.call('pause', SetBool, data=True)
     begin = bench.time
     bench.until(lambda: bench.time > begin + 8 * SECOND, 'the pause')
     assert sent.result is None
     assert bench.depth < DEPTH + 6e-3
-    assert bench.call(f'{bench.node.get_name()}/pause', SetBool, data=False).success
+    bench.call('pause', SetBool, data=False)
     assert bench.client.end(sent)[:2] == (GoalStatus.STATUS_SUCCEEDED, ErrorCode.SUCCESSFUL)
     assert abs(bench.depth - end) < 1e-3
 
@@ -258,7 +238,7 @@ def test_violated_tolerance_aborts_and_holds(
     assert (status, code.name) == (ABORTED, f'{kind.upper()}_TOLERANCE_VIOLATED')
     assert 'of insertion is' in reason
     assert 'beyond its tolerance 1e-12' in reason
-    bench.rests()
+    bench.rests(1e-3)
 
 
 @KINDS
@@ -306,7 +286,7 @@ def test_cancel_holds(ros_graph: RosGraph, actions: str, mode: str) -> None:
     sent = bench.start()
     sent.handle.cancel_goal_async()
     assert bench.client.end(sent)[0] == GoalStatus.STATUS_CANCELED
-    bench.rests()
+    bench.rests(1e-3)
     again = bench.run((0.5, bench.depth + 1e-3))
     assert bench.client.end(again)[0] == GoalStatus.STATUS_SUCCEEDED
 
@@ -325,7 +305,7 @@ def test_cancel_of_a_waiting_goal_moves_nothing(
     assert bench.client.end(waiting)[0] == GoalStatus.STATUS_CANCELED
     assert bench.client.end(first)[0] == GoalStatus.STATUS_SUCCEEDED
     assert abs(bench.depth - end) < 1e-3
-    bench.rests()
+    bench.rests(1e-3)
 
 
 @KINDS
@@ -335,7 +315,7 @@ def test_stop_needs_no_joint_states(ros_graph: RosGraph, actions: str, mode: str
     """Time is paused, and no sample is taken."""
     bench = ActionBench(ros_graph, mode)
     sent = bench.start()
-    assert bench.call('plant/pause_time', SetBool, data=True).success
+    assert bench.ask('plant/pause_time', SetBool, data=True).success
     paused = bench.time
     if by == 'cancel':
         sent.handle.cancel_goal_async()
@@ -345,8 +325,8 @@ def test_stop_needs_no_joint_states(ros_graph: RosGraph, actions: str, mode: str
         assert bench.answer(stamp)[0] is Verdict.ACCEPTED
         assert bench.client.end(sent)[2] == 'a newer joint_trajectory is followed'
     assert bench.time - paused <= PERIOD
-    bench.call('plant/pause_time', SetBool, data=False)
-    bench.rests()
+    bench.ask('plant/pause_time', SetBool, data=False)
+    bench.rests(1e-3)
 
 
 @KINDS
@@ -404,11 +384,11 @@ def _transition(bench: ActionBench, *numbers: int) -> None:
         request: Any = ChangeState.Request()
         request.transition.id = number
         name = f'{bench.node.get_name()}/change_state'
-        assert bench.call(name, ChangeState, transition=request.transition).success
+        assert bench.ask(name, ChangeState, transition=request.transition).success
 
 
 def _by_service(word: str, bench: ActionBench) -> None:
-    assert bench.call(f'{bench.node.get_name()}/{word}').success
+    bench.call(word)
 
 
 def _duplicate(bench: ActionBench) -> None:
@@ -457,7 +437,7 @@ def test_every_end_of_the_motion_ends_the_goal(
         sent = bench.run(*LONG)
         assert bench.client.end(sent)[2] == 'the node is not active'
         _transition(bench, Transition.TRANSITION_ACTIVATE)
-        bench.rests()
+        bench.rests(1e-3)
 
 
 @pytest.mark.requirement('S-247')
@@ -516,7 +496,7 @@ def test_fault_of_the_controller_ends_goal_and_motion(ros_graph: RosGraph, actio
     assert 'joint_states' in reason
     bench.user.destroy_publisher(other)
     bench.until(lambda: bench.node.diagnose().status.fault == '', 'the end of the fault')
-    bench.rests()
+    bench.rests(1e-3)
 
 
 @KINDS

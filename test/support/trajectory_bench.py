@@ -92,13 +92,30 @@ class Bench:
         self.until(answered, 'the answer')
         return found[0].verdict, found[0].reason
 
-    def call(self, service: str) -> None:
-        """Call a service of the node that follows `insertion`."""
-        client = self.user.create_client(Trigger, f'{self.node.get_name()}/{service}')
+    def ask(self, service: str, kind: Any = Trigger, **fields: Any) -> Any:
+        """Call a service of any node; return its response."""
+        client = self.user.create_client(kind, service)
         self.until(client.service_is_ready, service)
-        answer = client.call_async(Trigger.Request())
-        self.until(answer.done, f'the answer of {service}')
-        assert answer.result().success, answer.result()
+        answer = client.call_async(kind.Request(**fields))
+        self.until(answer.done, f'the response of {service}')
+        self.user.destroy_client(client)
+        return answer.result()
+
+    def call(self, service: str, kind: Any = Trigger, **fields: Any) -> None:
+        """Call a service of the node that follows `insertion`, which succeeds."""
+        response = self.ask(f'{self.node.get_name()}/{service}', kind, **fields)
+        assert response.success, response
+
+    def rests(self, margin: float, seconds: int = 2) -> float:
+        """Check that the needle brakes within a margin [m], and rests; return its depth [m]."""
+        at, begin = self.depth, self.time
+        self.until(lambda: self.time > begin + SECOND, 'the brake')
+        rest = self.depth
+        assert abs(rest - at) < margin
+        self.until(lambda: self.time > begin + (1 + seconds) * SECOND, 'the rest')
+        # Creep of a needle at rest in friction.
+        assert abs(self.depth - rest) < 1e-4
+        return rest
 
     def moved(self) -> int:
         """Return the stamp of the first sample away from the start [ns]."""
