@@ -30,9 +30,7 @@ from std_msgs.msg import Bool
 SENSOR: Final = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED: Final = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
 #: Messages of the plant for each sample, in order.

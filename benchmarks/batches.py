@@ -17,13 +17,7 @@ from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
-from needle_dynamics import (
-    Batch,
-    FloatArray,
-    NeedleModel,
-    NeedleParameters,
-    simulate_batch,
-)
+from needle_dynamics import Batch, FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.compiled.step import run
 import numpy as np
 

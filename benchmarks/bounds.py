@@ -12,12 +12,7 @@ from collections.abc import Mapping
 from math import atan2, pi, sqrt
 from typing import Final, TypeAlias
 
-from needle_dynamics import (
-    FloatArray,
-    ForceSensorParameters,
-    IndenterParameters,
-    NeedleParameters,
-)
+from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters, NeedleParameters
 from needle_identification import FrictionSettings, StiffnessSettings
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np

@@ -49,12 +49,7 @@ from needle_insertion.report.paper_tables import FORCE_LEVELS
 from needle_ros.process_pool import processes
 import numpy as np
 from reproduction.population import draw_friction, draw_stiffness
-from reproduction.protocol import (
-    ExperimentProtocol,
-    indenter_name,
-    PROTOCOLS,
-    START_DEPTH,
-)
+from reproduction.protocol import ExperimentProtocol, indenter_name, PROTOCOLS, START_DEPTH
 
 #: Limits of the coverage, and of the mean squared error over the Cramer-Rao bound.
 COVERAGE: Final = (0.93, 0.97)

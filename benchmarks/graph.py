@@ -134,10 +134,7 @@ def _publish(pair: Pair, turn: float) -> Figures:
 
 def _close_loop(pair: Pair, turn: float) -> Figures:
     """Run plant and controller in closed loop."""
-    topics = {
-        'joint_states': (JointState, SENSOR),
-        'wrench_command': (WrenchStamped, COMMAND),
-    }
+    topics = {'joint_states': (JointState, SENSOR), 'wrench_command': (WrenchStamped, COMMAND)}
     with pair.watching(topics) as seen, pair.running():
         pair.until(lambda: all(seen.values()), 'the loop')
         pair.aim()

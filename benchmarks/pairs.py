@@ -31,11 +31,7 @@ _BARE: Final = {'bare': 'events', 'bare, usual executor': 'single'}
 #: Parameters of the plants by name of the pair: the needle of the paper, and a flexible needle.
 _OURS: Final[Mapping[str, dict[str, object]]] = {
     'needle': {},
-    'needle, steered': {
-        'steered': True,
-        'needle': 'bending_35mm',
-        'steering.bevel_load': [0.3],
-    },
+    'needle, steered': {'steered': True, 'needle': 'bending_35mm', 'steering.bevel_load': [0.3]},
 }
 
 #: Names of the pairs; the first is the pair of this package.

@@ -28,13 +28,7 @@ from benchmarks.measure import (
     seconds,
 )
 from benchmarks.page import Answer, PageSection, Tick
-from needle_dynamics import (
-    FloatArray,
-    Integrator,
-    mode_shapes,
-    NeedleModel,
-    NeedleParameters,
-)
+from needle_dynamics import FloatArray, Integrator, mode_shapes, NeedleModel, NeedleParameters
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar

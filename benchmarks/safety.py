@@ -92,11 +92,7 @@ def _ms(number: float) -> int:
 
 
 #: Offsets of the numbers of a topic: well below its limits, and above noise.
-_SIZE: Final = {
-    JOINT_STATES.name: 5e-3,
-    BASE_WRENCH.name: 3.0,
-    TIP_DEFLECTION.name: 10e-3,
-}
+_SIZE: Final = {JOINT_STATES.name: 5e-3, BASE_WRENCH.name: 3.0, TIP_DEFLECTION.name: 10e-3}
 
 
 def _with(sent: Sent, change: Callable[[float], float], topic: str) -> Sent:
@@ -115,9 +111,7 @@ def _lies(topic: str) -> dict[str, _Alter]:
         # Every second measurement is swapped with the next.
         return (s._replace(late=_ms(7.0)) if k % 2 == 0 else s,)
 
-    def added(
-        change: Callable[[int, np.random.Generator], float],
-    ) -> _Alter:
+    def added(change: Callable[[int, np.random.Generator], float]) -> _Alter:
         return lambda k, s, _f, r: (_with(s, lambda v: v + change(k, r), topic),)
 
     def set_to(value: float) -> _Alter:

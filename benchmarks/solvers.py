@@ -146,12 +146,7 @@ def user_right_hand_side(
     which is the straightforward code. The modes of the model give (11).
     """
     p = model.parameters
-    rho, ei, ka, ca = (
-        p.linear_density,
-        p.bending_stiffness,
-        p.tissue_stiffness,
-        p.tissue_damping,
-    )
+    rho, ei, ka, ca = (p.linear_density, p.bending_stiffness, p.tissue_stiffness, p.tissue_damping)
     k, mu, c = model.modes.wavenumbers, model.modes.ratios, model.modes.scales
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes = 0.5 * (nodes + 1.0)[:, np.newaxis]

@@ -20,15 +20,7 @@ from benchmarks.measure import Bar
 from benchmarks.message_faults import ASIDE, DELAYS, MESSAGES, OFFSET, TopicFault
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
-from benchmarks.steering_nodes import (
-    COMMAND,
-    GraphNode,
-    HARDWARE,
-    NODES,
-    RATE,
-    ROBOTS,
-    SPEED,
-)
+from benchmarks.steering_nodes import COMMAND, GraphNode, HARDWARE, NODES, RATE, ROBOTS, SPEED
 from needle_controller.steering.motion_control import BRAKING
 from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import TARGET, TIP_DEFLECTION

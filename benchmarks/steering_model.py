@@ -9,13 +9,7 @@ from typing import Final
 
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
-from needle_dynamics import (
-    FloatArray,
-    insert_batch,
-    NeedleParameters,
-    NEEDLES,
-    SteeredNeedle,
-)
+from needle_dynamics import FloatArray, insert_batch, NeedleParameters, NEEDLES, SteeredNeedle
 import numpy as np
 from scipy.linalg import solveh_banded
 

@@ -16,11 +16,7 @@ class NominalLaw:
     warning = ''
 
     def __init__(
-        self,
-        model: SteeringModel,
-        target: FloatArray,
-        limits: SteeringLimits,
-        roll: float,
+        self, model: SteeringModel, target: FloatArray, limits: SteeringLimits, roll: float
     ) -> None:
         skin = model.steering.skin_stiffness / model.needle.tissue_stiffness
         nominal = np.argmin(abs(model.lengths - 1.0) + abs(model.skins - skin))

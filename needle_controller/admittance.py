@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Admittance: converts the force of a law to positions, for a position-controlled robot."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_controller.laws.axis import Axis
@@ -53,13 +51,7 @@ class Admittance:
     """
 
     def __init__(
-        self,
-        axis: Axis,
-        *,
-        period: float,
-        speed: float,
-        lead: float,
-        depths: tuple[float, float],
+        self, axis: Axis, *, period: float, speed: float, lead: float, depths: tuple[float, float]
     ) -> None:
         #: May be exchanged between steps.
         self.axis = axis

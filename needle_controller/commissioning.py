@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commissioning: compare a robot and its first motion with its configuration."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Axial controller: reference, control laws and limits; one command per measurement."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -24,8 +22,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant, flag
 from needle_ros.status import ControllerStatus
 
-#: Controlled axes.
-AXES: Final = ('insertion', 'rotation')
+AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
 
 Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
 
@@ -33,10 +30,7 @@ Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
 #: rotary inertia of the paper's needle.
 DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
     'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
-    'inverse_dynamics': {
-        'insertion': InverseDynamicsGains(),
-        'rotation': InverseDynamicsGains(),
-    },
+    'inverse_dynamics': {'insertion': InverseDynamicsGains(), 'rotation': InverseDynamicsGains()},
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
 }
 
@@ -47,8 +41,7 @@ LAW_OF: Final[Mapping[type[Gains], type[Law]]] = {
     PidGains: Pid,
 }
 
-#: Control laws by name, the default first.
-LAWS: Final = tuple(DEFAULT_GAINS)
+LAWS: Final = tuple(DEFAULT_GAINS)  #: Control laws by name, the default first.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,8 +126,7 @@ class Measurement:
         return insertion and isfinite(self.angle) and isfinite(self.angular_velocity)
 
 
-#: Setpoint of a command without a reference.
-NO_SETPOINT: Final = Setpoint(nan)
+NO_SETPOINT: Final = Setpoint(nan)  #: Setpoint of a command without a reference.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

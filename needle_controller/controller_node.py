@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `controller`: compute needle forces from encoder measurements and a target."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
@@ -13,13 +11,7 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from needle_controller.commissioning import CommissioningSettings
-from needle_controller.controller import (
-    Controller,
-    ControllerSettings,
-    DEFAULT_GAINS,
-    Gains,
-    LAWS,
-)
+from needle_controller.controller import Controller, ControllerSettings, DEFAULT_GAINS, Gains, LAWS
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import HardwareSettings
 from needle_controller.hardware_node import await_topics, CONTRACT, Driver
@@ -54,14 +46,9 @@ _RETRACT = 'retract_depth'
 #: timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
-#: Checks without joint states before a warning is logged.
-_PATIENCE = 20
-
-#: Joints that no axis law controls.
-_GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
-
-#: Sources of the load of the bent needle.
-FEEDBACKS = ('observer', 'ground_truth', 'none')
+_PATIENCE = 20  #: Checks without joint states before a warning is logged.
+_GUIDE = {joint.name for joint in contract.STEERING_JOINTS}  #: Joints that no axis law controls.
+FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the bent needle.
 
 
 class ControllerNode(ModelNode):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force command of the axial supervisor."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adapter for robot drivers with their own topics, joints and units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isfinite, isnan, nan
@@ -25,8 +23,7 @@ EFFORT: Final = 'effort'
 POSITION: Final = 'position'
 COMMANDS: Final = (EFFORT, POSITION)
 
-#: Selects the only topic of its type.
-BY_TYPE: Final = 'auto'
+BY_TYPE: Final = 'auto'  #: Selects the only topic of its type.
 
 #: Message types of commands and joint states; the first is the type of the contract.
 COMMAND_TYPES: Final = {

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS adapter for a robot driver with its own topics and message types."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from time import monotonic, sleep

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execution of a joint trajectory by a controller."""
 
-from __future__ import annotations
-
 from needle_controller.controller import Controller
 from needle_ros.contract import INSERTION
 from needle_ros.trajectories import joint_values, JointPath

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Load of the bent needle on the insertion axis, from an observer or from the simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,8 +12,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.status import ObserverStatus
 import numpy as np
 
-#: Samples between two consistency checks of the observer.
-_CHECK_INTERVAL: Final = 25
+_CHECK_INTERVAL: Final = 25  #: Samples between two consistency checks of the observer.
 
 
 def build_observer(
@@ -37,10 +34,7 @@ class LoadEstimator:
     """
 
     def __init__(
-        self,
-        parameters: NeedleParameters,
-        observer: Observer | None = None,
-        largest: float = 1e6,
+        self, parameters: NeedleParameters, observer: Observer | None = None, largest: float = 1e6
     ) -> None:
         self.model = NeedleModel(parameters)
         self.observer, self._largest = observer, largest

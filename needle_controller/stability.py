@@ -13,8 +13,6 @@ the direction of the measured velocity, or if its integral is too fast. Such law
 simulated on each axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf
@@ -37,11 +35,8 @@ from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Default distance of the spectral radius from one.
-MARGIN: Final = 1e-6
-
-#: Periods of unmodeled delay in reserve.
-RESERVE: Final = 1
+MARGIN: Final = 1e-6  #: Default distance of the spectral radius from one.
+RESERVE: Final = 1  #: Periods of unmodeled delay in reserve.
 
 #: Largest factors on gains and rate in the search for stable gains.
 _MOST_GAIN: Final = 1e6

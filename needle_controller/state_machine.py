@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base of the state machines: event log, request log, clock, and checks of the inputs."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Generic, TypeVar

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `steering`: steer the tip to a target by motions of the guide."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import asdict
 import json
@@ -47,18 +45,12 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Time between two checks for missing inputs, and for a plan that is computed [s].
-_WATCH = 0.05
-
-#: Parameter with the action of a robot.
-_ACTION = 'trajectory_action'
-
-#: Longest time until a motion is acknowledged, in lock-step.
-_ARRIVAL = Delay(seconds=1.0)
+_WATCH = 0.05  #: Time between two checks for missing inputs, and for a plan that is computed [s].
+_ACTION = 'trajectory_action'  #: Parameter with the action of a robot.
+_ARRIVAL = Delay(seconds=1.0)  #: Longest time until a motion is acknowledged, in lock-step.
 
 
-#: Shortest time between two warnings of a record that cannot be written [s].
-_SELDOM = 10.0
+_SELDOM = 10.0  #: Shortest time between two warnings of a record that cannot be written [s].
 
 
 class SteeringNode(CompiledNode):

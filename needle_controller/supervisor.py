@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Axial supervisor, without ROS: input checks, stops, requests, force commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertainty of the true axis about the nominal one, and limit cycles of dry friction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import product
 from math import ceil, log
@@ -26,8 +24,7 @@ _SHORTEST: Final = 0.5
 _LONGEST: Final = 20.0
 _DECREASE: Final = 0.1
 
-#: Least range of motion that is a limit cycle [m] or [rad].
-_LEAST: Final = 1e-6
+_LEAST: Final = 1e-6  #: Least range of motion that is a limit cycle [m] or [rad].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

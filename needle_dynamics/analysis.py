@@ -9,8 +9,6 @@ smallest singular value of the Hautus (PBH) pencil [A - lambda I, B] gives the d
 uncontrollability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Array types shared by all packages."""
 
-from __future__ import annotations
-
 from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Euler buckling loads of the part of the needle outside the tissue."""
 
-from __future__ import annotations
-
 from math import inf, pi
 from typing import Final, NamedTuple
 

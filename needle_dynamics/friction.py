@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction between needle and tissue along the insertion axis, including equation (15)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf

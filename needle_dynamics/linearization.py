@@ -6,8 +6,6 @@ The only equilibria of the model are straight needles. Elsewhere (19) holds alon
 coefficients frozen at the operating point.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import inf, isfinite
 from typing import Final

@@ -8,8 +8,6 @@ The formulation `as_printed` is the final form in the source, which omits the ro
 terms from dG/dt.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of nodes that declare the constants of the needle model as parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -7,8 +7,6 @@ values, curvatures, G, H and the first two moments. `needle_dynamics.compiled.in
 evaluates them; this module computes the constants and series coefficients.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import cos, cosh, factorial, pi, sin, tanh

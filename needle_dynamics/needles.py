@@ -19,11 +19,8 @@ from needle_ros.settings import from_values, unknown_name
 #: Needle of new commands, studies and environments, and of the node `steering`.
 DEFAULT_NEEDLE: Final = 'bending_35mm'
 
-#: Ends of the names of files of needles.
-FILES: Final = ('.yaml', '.yml')
-
-#: Prefixes of the constants in a ROS parameter file.
-_PREFIXES: Final = ('model.', 'steering.')
+FILES: Final = ('.yaml', '.yml')  #: Ends of the names of files of needles.
+_PREFIXES: Final = ('model.', 'steering.')  #: Prefixes of the constants in a ROS parameter file.
 
 
 class NeedlePreset(NamedTuple):

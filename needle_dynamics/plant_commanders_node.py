@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command topics of the node `plant`, and the number of nodes that publish on them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from time import monotonic_ns
 

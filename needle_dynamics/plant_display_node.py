@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Visualization messages of the node `plant`: shape, path, poses and transform."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from builtin_interfaces.msg import Time as TimeMessage

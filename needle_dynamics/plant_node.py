@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `plant`: simulated needle, optionally moved by a simulated robot, or simulated indenter."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
@@ -40,8 +38,7 @@ from std_srvs.srv import SetBool, Trigger
 _CHECK = 0.1
 _REPEAT, _LONG = 5, 20
 
-#: Commands per sample above which a warning is reported.
-_TOO_MANY = 3.0
+_TOO_MANY = 3.0  #: Commands per sample above which a warning is reported.
 
 _NO_FAULT = 'none'
 

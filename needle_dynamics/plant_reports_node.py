@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reports of other nodes on processed and recorded samples, for the clock of the plant."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

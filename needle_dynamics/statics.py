@@ -7,8 +7,6 @@ eight numbers for n = 2. d is the length of needle outside the tissue and decrea
 insertion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

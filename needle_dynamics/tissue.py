@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tissue model along the needle: layered elastic foundation, swelling, damping; equation (7)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from math import expm1, inf

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node that identifies friction and stiffness from recordings and from running topics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node that plays a recording into the ROS graph with its original timing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 import signal

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node that records topics to an MCAP bag with the QoS that their publishers offer."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from functools import partial
 from pathlib import Path

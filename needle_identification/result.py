@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import fields
 from math import atan2, hypot, isfinite, sqrt

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification results as messages."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the command line `needle`: exit status 0 success, 1 failed job, 2 invalid usage or input."""
 
-from __future__ import annotations
-
 import argparse
 from codecs import register_error
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compile the kernels of all packages for this machine, on all processors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import as_completed
 from importlib.util import find_spec

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Entry points of the nodes: ``ros2 run needle_insertion plant``, or needle-plant."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import runpy
 import signal

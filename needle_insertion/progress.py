@@ -13,8 +13,7 @@ from typing import Any, Final, Protocol, TextIO
 _UPDATE: Final = 0.5
 _LINE: Final = 10.0
 
-#: Moves to the start of the line and clears it.
-_CLEAR: Final = '\r\033[K'
+_CLEAR: Final = '\r\033[K'  #: Moves to the start of the line and clears it.
 
 
 class Show(Protocol):

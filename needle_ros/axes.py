@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parse axes and names with a sign, such as ``-x`` or ``-slide``, in options and parameters."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_ros.errors import ParameterError
 
-#: Axes of a frame, in the order of message fields.
-AXES: Final = ('x', 'y', 'z')
+AXES: Final = ('x', 'y', 'z')  #: Axes of a frame, in the order of message fields.
 
 
 def signed(text: str) -> tuple[float, str]:

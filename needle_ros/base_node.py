@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -77,11 +75,8 @@ LATCHED, COMMAND, SENSOR = (
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
-#: Parameter with the real-time priority.
-_PRIORITY = 'realtime_priority'
-
-#: Period of log lines about a running preparation [s].
-_LONG = 2.0
+_PRIORITY = 'realtime_priority'  #: Parameter with the real-time priority.
+_LONG = 2.0  #: Period of log lines about a running preparation [s].
 
 
 class BaseNode(ParameterNode):

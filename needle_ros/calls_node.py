@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Service calls with repetition until a response."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
@@ -13,8 +11,7 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.task import Future
 
-#: Period of the checks [s].
-_CHECK: Final = 0.25
+_CHECK: Final = 0.25  #: Period of the checks [s].
 
 
 @dataclass(slots=True)

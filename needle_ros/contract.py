@@ -17,8 +17,7 @@ from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 #: Frames: fixed at the entry point; at the needle base, parallel to the first.
 ENTRY: Final = 'needle_entry'
 BASE: Final = 'needle_base'
-#: Frame at the tip, y along the needle.
-TIP: Final = 'needle_tip'
+TIP: Final = 'needle_tip'  #: Frame at the tip, y along the needle.
 
 #: Joint along the needle, and joint of the base about x.
 INSERTION: Final = 'insertion'
@@ -38,14 +37,10 @@ USER: Final = 'user'
 class Qos(NamedTuple):
     """Quality of service that the publishers of a topic offer."""
 
-    #: Name in the documentation.
-    name: str
-    #: Whether a lost message is sent again.
-    reliable: bool
-    #: Whether late-joining subscribers receive the previous messages.
-    latched: bool
-    #: Messages kept for a busy or late-joining subscriber.
-    depth: int
+    name: str  #: Name in the documentation.
+    reliable: bool  #: Whether a lost message is sent again.
+    latched: bool  #: Whether late-joining subscribers receive the previous messages.
+    depth: int  #: Messages kept for a busy or late-joining subscriber.
     #: Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
     lossy: bool = False
     #: Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
@@ -68,8 +63,7 @@ class Stamp(Enum):
     #: answered but not executed again, and a request older than the current request is not
     #: executed. It is valid for `REQUEST_AGE`. Zero means now.
     REQUEST = 'request'
-    #: Not checked: the message is a result, or information for users.
-    UNCHECKED = 'unchecked'
+    UNCHECKED = 'unchecked'  #: Not checked: the message is a result, or information for users.
 
 
 #: Maximum age of a request [s]. It covers three repetitions at intervals of 1 s and a delay of
@@ -95,10 +89,8 @@ class Joint(NamedTuple):
     """A joint of a JointState."""
 
     name: str
-    #: Unit of the position; the unit of the velocity is the same per second.
-    unit: str
-    #: Unit of the effort, '' if the topic has no efforts.
-    effort: str = ''
+    unit: str  #: Unit of the position; the unit of the velocity is the same per second.
+    effort: str = ''  #: Unit of the effort, '' if the topic has no efforts.
 
 
 class Quantity(NamedTuple):
@@ -127,13 +119,11 @@ class Topic:
     #: Name, relative to the namespace of the node; ``~`` stands for the node.
     name: str
     type_name: str
-    #: Publishing nodes, `EVERY_NODE`, or `USER`.
-    publisher: str
+    publisher: str  #: Publishing nodes, `EVERY_NODE`, or `USER`.
     #: Content of the messages, for the documentation.
     meaning: str
     qos: Qos = SENSOR
-    #: Frame of the header, '' without a frame.
-    frame: str = ''
+    frame: str = ''  #: Frame of the header, '' without a frame.
     #: Joints of a JointState.
     joints: tuple[Joint, ...] = ()
     stamp: Stamp = Stamp.UNCHECKED

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Safe reading of YAML from external files: bag metadata, recorded parameters, parameter files."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, Final
 

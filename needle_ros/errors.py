@@ -3,8 +3,7 @@
 
 from typing import Final
 
-#: Maximum length of a log line [characters].
-_LONGEST: Final = 500
+_LONGEST: Final = 500  #: Maximum length of a log line [characters].
 
 #: Endings of the Python modules with the messages of ROS 2, and its other modules.
 _MESSAGES: Final = ('_msgs', '_srvs', '_interfaces')

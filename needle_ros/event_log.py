@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Event log of a node: log lines, and changes of /diagnostics."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from enum import IntEnum
@@ -12,8 +10,7 @@ from typing import Final
 
 from needle_ros.errors import printable
 
-#: Minimum time between two lines of the same kind [s].
-_PAUSE: Final = 1.0
+_PAUSE: Final = 1.0  #: Minimum time between two lines of the same kind [s].
 
 
 class Severity(IntEnum):

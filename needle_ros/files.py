@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Atomic writing of files."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 import os
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lazy import of the public names of a package (PEP 562)."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 from importlib import import_module

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lifecycle service: reject invalid transitions, and defer `configure` until preparation ends."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import gc
 from typing import Any, Final

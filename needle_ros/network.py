@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network range of DDS: restrict nodes to this machine unless the environment opens it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 from socket import AF_UNIX, SOCK_DGRAM, socket
@@ -31,11 +29,8 @@ DOMAIN: Final = 'ROS_DOMAIN_ID'
 #: Address of the claim of a domain: abstract, without a file, and the same for all users.
 _CLAIM: Final = '\0needle_insertion/domain_{}'
 
-#: Largest domain ID with valid UDP ports for several processes.
-_LARGEST_DOMAIN: Final = 232
-
-#: Discovery ranges that include other machines.
-OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')
+_LARGEST_DOMAIN: Final = 232  #: Largest domain ID with valid UDP ports for several processes.
+OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')  #: Discovery ranges that include other machines.
 
 
 def stay_local(environment: MutableMapping[str, str]) -> None:

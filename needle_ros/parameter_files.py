@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Match the sections of ROS parameter files to nodes; rcl reports no unused section."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -7,8 +7,6 @@ checks them. An invalid parameter file therefore fails the `configure` transitio
 error that names the parameter.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -24,11 +22,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 import yaml
 
-#: Largest finite number.
-_LARGEST = float_info.max
-
-#: Strings that rcl parses as booleans in a parameter file.
-_READ_AS_BOOL = ('y', 'n')
+_LARGEST = float_info.max  #: Largest finite number.
+_READ_AS_BOOL = ('y', 'n')  #: Strings that rcl parses as booleans in a parameter file.
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
@@ -128,10 +123,7 @@ class ParameterNode(LifecycleNode):
             self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
 
     def settings(
-        self,
-        prefix: str,
-        kind: Callable[..., _Settings],
-        changes: Mapping[str, Any] | None = None,
+        self, prefix: str, kind: Callable[..., _Settings], changes: Mapping[str, Any] | None = None
     ) -> _Settings:
         """Return the dataclass filled from the parameters; ``changes`` override values."""
         values = {}
@@ -154,10 +146,7 @@ class ParameterNode(LifecycleNode):
         return self.get_parameter(name).value
 
     def text(
-        self,
-        name: str,
-        valid: tuple[str, ...] = (),
-        changes: Mapping[str, Any] | None = None,
+        self, name: str, valid: tuple[str, ...] = (), changes: Mapping[str, Any] | None = None
     ) -> str:
         """Return a text parameter; ``changes`` override it, empty ``valid`` allows any value."""
         value = (changes or {}).get(name, self._value(name))

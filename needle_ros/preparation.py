@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Preparation of a node in a thread before `configure`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 from threading import Thread

@@ -9,8 +9,6 @@ closes the pipe when the worker ends, at any moment from its first instruction, 
 assigns the job to a new worker.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -25,8 +23,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 from needle_ros.errors import JobError
 
-#: Number of lost workers after which a job fails.
-_TRIES: Final = 10
+_TRIES: Final = 10  #: Number of lost workers after which a job fails.
 
 _P = ParamSpec('_P')
 _T = TypeVar('_T')

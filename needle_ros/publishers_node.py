@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detection of duplicate publishers and of their liveliness."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quantities with units as text, such as ``4mm``, ``3N`` and ``20 s``, and targets of the tip."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import isfinite
 import re

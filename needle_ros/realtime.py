@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real-time scheduling of a process."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -10,8 +8,7 @@ from typing import Final
 
 from needle_ros.errors import ParameterError
 
-#: Highest real-time priority of Linux.
-HIGHEST: Final = 99
+HIGHEST: Final = 99  #: Highest real-time priority of Linux.
 
 _HELP: Final = (
     'set the limit rtprio of the user in /etc/security/limits.conf, or realtime_priority 0'

@@ -35,8 +35,7 @@ CALL_TIMEOUT: Final = 10.0
 _PUBLISHED: Final = 8
 _KEPT: Final = 64
 
-#: Minimum time between two statuses published for an answer [s].
-_PAUSE: Final = 0.05
+_PAUSE: Final = 0.05  #: Minimum time between two statuses published for an answer [s].
 
 #: Keys and key prefixes in a status.
 _TAKES: Final = 'takes '
@@ -54,21 +53,18 @@ class Verdict(Enum):
     REJECTED = 'rejected'
     #: Rejected because all its points are in the past: it may be sent again with a new stamp.
     LATE = 'rejected as late'
-    #: Not executed, because the receiver executes a newer request.
-    SUPERSEDED = 'superseded'
+    SUPERSEDED = 'superseded'  #: Not executed, because the receiver executes a newer request.
 
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
     """Answer of a receiver to a request."""
 
-    #: Topic of the request, by its name in the contract.
-    topic: str
+    topic: str  #: Topic of the request, by its name in the contract.
     #: Stamp of the request [ns]; 0 for a message without a stamp.
     stamp: int
     verdict: Verdict
-    #: Reason of a rejection, for users.
-    reason: str = ''
+    reason: str = ''  #: Reason of a rejection, for users.
 
     @property
     def refused(self) -> bool:
@@ -82,8 +78,7 @@ class RequestStatus:
 
     #: Moved joints by topic of the request.
     takes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: The latest answers, the newest last.
-    answers: tuple[Acknowledgement, ...] = ()
+    answers: tuple[Acknowledgement, ...] = ()  #: The latest answers, the newest last.
 
     def to_values(self) -> dict[str, str]:
         """Return the fields as values of a DiagnosticStatus."""

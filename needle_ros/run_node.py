@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Main function of a node process."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 import ctypes

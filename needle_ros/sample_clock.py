@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schedule of simulation samples, on a clock that may differ from simulated time."""
 
-from __future__ import annotations
-
 from math import ceil
 from typing import Final
 
 from needle_ros.errors import JobError
 from needle_ros.timing import NANOSECONDS
 
-#: Maximum tick period, and so the maximum delay of a sample [s].
-_TICK: Final = 1e-3
-
-#: Samples per tick at maximum speed.
-_AT_ONCE: Final = 20
+_TICK: Final = 1e-3  #: Maximum tick period, and so the maximum delay of a sample [s].
+_AT_ONCE: Final = 20  #: Samples per tick at maximum speed.
 
 #: Maximum lead of an independent time over a recorder, by lockstep [samples]: the pending messages
 #: fit into the queues of the recorder, in lockstep together with the messages of other nodes.

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings: frozen dataclasses whose fields have a unit, a description and a range."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
@@ -16,8 +14,7 @@ from needle_ros.quantities import quantity
 
 _Settings = TypeVar('_Settings')
 
-#: Types accepted for a tuple.
-_LISTS: Final = (list, array, type(None))
+_LISTS: Final = (list, array, type(None))  #: Types accepted for a tuple.
 
 #: Names of the types of fields and parameters.
 _NAMES: Final = {
@@ -25,8 +22,7 @@ _NAMES: Final = {
     int: 'a number', float: 'a number',
 }  # fmt: skip
 
-#: Larger integers cannot be converted to float.
-_LARGEST_INTEGER: Final = 10**300
+_LARGEST_INTEGER: Final = 10**300  #: Larger integers cannot be converted to float.
 
 
 def constant(

@@ -9,42 +9,25 @@ name of the field, such as ``input joint_states rate [Hz]``. An optional field w
 no pair.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import (
-    Any,
-    ClassVar,
-    Final,
-    Generic,
-    get_args,
-    get_origin,
-    get_type_hints,
-    TypeVar,
-)
+from typing import Any, ClassVar, Final, Generic, get_args, get_origin, get_type_hints, TypeVar
 
 from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus
 from needle_ros.system_state import Mode
 
-#: Task in the name of the status of a node: ``/plant: state``.
-TASK: Final = 'state'
+TASK: Final = 'state'  #: Task in the name of the status of a node: ``/plant: state``.
 
 #: Hardware of nodes without a namespace; the hardware of others is their namespace.
 HARDWARE: Final = 'needle'
 
-#: Level STALE of a DiagnosticStatus: its values are no longer updated.
-STALE: Final = bytes([3])
-
-#: Key of the kind of a status.
-_KIND: Final = 'kind'
-
-#: Result of a field that is missing or invalid in a status.
-_MISSING: Final = object()
+STALE: Final = bytes([3])  #: Level STALE of a DiagnosticStatus: its values are no longer updated.
+_KIND: Final = 'kind'  #: Key of the kind of a status.
+_MISSING: Final = object()  #: Result of a field that is missing or invalid in a status.
 
 _Status = TypeVar('_Status', bound='NodeStatus')
 _Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
@@ -71,14 +54,10 @@ class ControllerPhase(Enum):
     """Phase of the controller."""
 
     INACTIVE = 'inactive'
-    #: No `joint_states` received yet.
-    WAITING = 'waiting'
-    #: Answers measurements.
-    ACTIVE = 'active'
-    #: Without force, or with a reference that waits, as long as a fault lasts.
-    FAULT = 'fault'
-    #: Without force until `~/clear_stop`.
-    STOPPED = 'stopped'
+    WAITING = 'waiting'  #: No `joint_states` received yet.
+    ACTIVE = 'active'  #: Answers measurements.
+    FAULT = 'fault'  #: Without force, or with a reference that waits, as long as a fault lasts.
+    STOPPED = 'stopped'  #: Without force until `~/clear_stop`.
 
 
 class CommissioningPhase(Enum):
@@ -110,10 +89,8 @@ class PlantPhase(Enum):
 
     INACTIVE = 'inactive'
     RUNNING = 'running'
-    #: Simulated time stands still.
-    PAUSED = 'paused'
-    #: Stopped by an error until a reset.
-    HALTED = 'halted'
+    PAUSED = 'paused'  #: Simulated time stands still.
+    HALTED = 'halted'  #: Stopped by an error until a reset.
 
 
 class PlayerPhase(Enum):
@@ -175,8 +152,7 @@ class ObserverStatus:
 class NodeStatus:
     """Status of any node."""
 
-    #: Value of the key `kind`.
-    KIND: ClassVar[str] = 'node'
+    KIND: ClassVar[str] = 'node'  #: Value of the key `kind`.
 
     invalid_messages: Mapping[str, int] = entry(dict, '', 'unreadable messages by topic')
     failure: str = entry('', '', 'reason of the last refused transition')

@@ -39,8 +39,7 @@ _LONGEST_KEY: Final = len(_CLEARED) + 255
 #: must be accepted and have at most 19 digits.
 _LARGEST_LEAD: Final = 100 * 365 * 24 * 3600 * NANOSECONDS
 
-#: Default insertion depth at the end of a retraction [m].
-RETRACT_DEPTH: Final = 0.01
+RETRACT_DEPTH: Final = 0.01  #: Default insertion depth at the end of a retraction [m].
 
 #: Requests of a user.
 STOP: Final = 'stop'
@@ -55,12 +54,9 @@ class Mode(Enum):
     """Mode of the system."""
 
     RUNNING = 'running'
-    #: Needle and guide rest until a user resumes the motion.
-    PAUSED = _PAUSED
-    #: The needle is withdrawn, until a user requests another motion.
-    RETRACTING = _RETRACTING
-    #: No force and no motion of the guide until a user clears the stop.
-    STOPPED = 'stopped'
+    PAUSED = _PAUSED  #: Needle and guide rest until a user resumes the motion.
+    RETRACTING = _RETRACTING  #: The needle is withdrawn, until a user requests another motion.
+    STOPPED = 'stopped'  #: No force and no motion of the guide until a user clears the stop.
 
 
 class Stop(NamedTuple):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """System state of a node: its topic, the services of a user, and the emergency topic."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -15,8 +13,7 @@ from needle_ros.system_state import Authority, Mode, PAUSE, REQUESTS, RESUME, ST
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
-#: Period at which the state is published again [s].
-_AGAIN: Final = 1.0
+_AGAIN: Final = 1.0  #: Period at which the state is published again [s].
 
 
 class SystemStateTopics:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time stamps in integer nanoseconds, and event rates."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 NANOSECONDS: Final = 1_000_000_000

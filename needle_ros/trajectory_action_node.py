@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Action server ``follow_joint_trajectory`` of a node that receives `joint_trajectory`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from importlib import import_module

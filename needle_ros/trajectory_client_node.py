@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Action client ``follow_joint_trajectory`` of a node that sends trajectories."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial

@@ -14,8 +14,7 @@ from needle_ros.requests import Acknowledgement, is_stale, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import FollowedJoint, JointPath
 
-#: Value of a tolerance that disables its check, as 0 does.
-_ERASED: Final = -1.0
+_ERASED: Final = -1.0  #: Value of a tolerance that disables its check, as 0 does.
 
 
 class ErrorCode(IntEnum):
@@ -74,8 +73,7 @@ class TrajectoryGoal:
     path: Mapping[str, Tolerance]
     goal: Mapping[str, Tolerance]
     timeout: int
-    #: Stamp of its request [ns].
-    stamp: int = 0
+    stamp: int = 0  #: Stamp of its request [ns].
     #: Whether its motion has begun, and time for which it was paused [ns].
     moves: bool = False
     paused: int = 0

@@ -45,8 +45,7 @@ _FIELDS: Final = {
     ODOMETRY: _Fields(strings=1, numbers=7 + 36 + 6 + 36),
 }
 
-#: Supported message types.
-TYPES: Final = tuple(_FIELDS)
+TYPES: Final = tuple(_FIELDS)  #: Supported message types.
 
 #: Alignment of 8-byte numbers by encapsulation: plain CDR and plain XCDR2, big and little endian.
 _WIDEST: Final = {0: 8, 1: 8, 6: 4, 7: 4}
@@ -54,8 +53,7 @@ _WIDEST: Final = {0: 8, 1: 8, 6: 4, 7: 4}
 #: Encapsulation of written messages: plain CDR, little endian, no options.
 _HEAD: Final = b'\0\1\0\0'
 
-#: Position of the stamp (seconds, nanoseconds) after the encapsulation [bytes].
-_STAMP: Final = 4
+_STAMP: Final = 4  #: Position of the stamp (seconds, nanoseconds) after the encapsulation [bytes].
 
 #: Maximum padding of the last word by some middlewares, and additional bytes after the message for
 #: each empty array: rclpy aligns it in the size of its buffer, but not in the message [bytes].
@@ -68,12 +66,9 @@ _TEMPLATES: Final = 32
 class Reading(NamedTuple):
     """Content of a message."""
 
-    #: Time of the header [ns].
-    stamp: int
-    #: Frame of the header.
-    frame: str
-    #: Joints; empty if the type has no such field.
-    names: tuple[str, ...]
+    stamp: int  #: Time of the header [ns].
+    frame: str  #: Frame of the header.
+    names: tuple[str, ...]  #: Joints; empty if the type has no such field.
     #: Positions, velocities and efforts of a JointState; else one tuple of all numbers, in the
     #: order of the fields.
     values: tuple[tuple[float, ...], ...]
@@ -302,12 +297,10 @@ Choice = Callable[[Template], Sequence[int] | None]
 class Decoded(NamedTuple):
     """Content of a batch of messages."""
 
-    #: Stamps of the headers [ns], shape (n,).
-    stamps: NDArray[np.int64]
+    stamps: NDArray[np.int64]  #: Stamps of the headers [ns], shape (n,).
     #: The selected numbers, nan where a message has no such number, shape (n, k).
     values: NDArray[np.float64]
-    #: Indices of these messages in the batch, shape (n,).
-    used: NDArray[np.intp]
+    used: NDArray[np.intp]  #: Indices of these messages in the batch, shape (n,).
     #: Number of invalid messages, and error of the first.
     invalid: int
     fault: str

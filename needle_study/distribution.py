@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distributions of one variable, as defined in a study file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -7,8 +7,6 @@ are not computed again. When all are complete they become one table, in the orde
 whose bytes depend neither on the chunks nor on the number of workers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress

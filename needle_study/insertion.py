@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Insert sampled flexible needles to a depth, under a control law or in open loop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import copysign, nan
@@ -26,13 +24,7 @@ from needle_controller.controller import LAW_OF
 from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
 from needle_controller.uncertainty import Uncertainty
-from needle_dynamics import (
-    find_needle,
-    FloatArray,
-    NeedleModel,
-    NeedleParameters,
-    simulate_batch,
-)
+from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract
 from needle_ros.errors import ParameterError

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the content of a study file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Insert sampled needles to a target, steered by a law or in open loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -51,7 +49,6 @@ _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 _JOINTS: Final = contract.steered_states().without_efforts()
 
 _EXACT: Final = SteppedTipErrors()  # of a sensor with white noise alone
-
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion
 _SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]

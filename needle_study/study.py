@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
 _PARTS: Final = 50  # largest number of parts of a study that shows its progress
-
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 
 #: Largest number of samples and of dimensions, as limited by the Sobol sequence.

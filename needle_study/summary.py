@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from math import sqrt
 from pathlib import Path

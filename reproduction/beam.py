@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finite element beam of the whole needle, to test the model assumption about the outer part."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 from needle_dynamics import FloatArray, NeedleParameters
@@ -30,12 +28,9 @@ _GRAM: Final = np.array([
 class WholeNeedle(NamedTuple):
     """Response of a beam that is clamped at its base."""
 
-    #: First natural frequency [Hz].
-    frequency: float
-    #: Deflection of the tip per lateral force at the tip [m/N].
-    compliance: float
-    #: Magnitude of the lateral force at the base for 1 N at the tip [N].
-    force: float
+    frequency: float  #: First natural frequency [Hz].
+    compliance: float  #: Deflection of the tip per lateral force at the tip [m/N].
+    force: float  #: Magnitude of the lateral force at the base for 1 N at the tip [N].
 
 
 def whole_needle(parameters: NeedleParameters, depth: float, entry: str) -> WholeNeedle:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated robot in each repeat of an experiment."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,8 +10,7 @@ from needle_ros.errors import ParameterError
 from reproduction.population import draw_friction, draw_stiffness
 from reproduction.protocol import ExperimentProtocol, indenter_name
 
-#: Sample rates at which strokes and presses are resolved [Hz].
-RATES: Final = (40.0, 5000.0)
+RATES: Final = (40.0, 5000.0)  #: Sample rates at which strokes and presses are resolved [Hz].
 
 _MOST_REPEATS: Final = 1000
 
@@ -26,8 +23,7 @@ class Campaign:
     repeats: int = EXPERIMENTS
     #: Seed of the true values; the sensor noise of run k, from 0, has the seed plus k.
     seed: int = 2014
-    #: Sample rate [Hz].
-    rate: float = 250.0
+    rate: float = 250.0  #: Sample rate [Hz].
     #: Use the means of the paper's tables in each run instead of sampled values.
     fixed: bool = False
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle reproduce`: compute the paper's results again and compare them with the paper."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path
@@ -19,8 +17,7 @@ RESULTS: Final = (
     *('controllability', 'claims', 'mismatch', 'all'),
 )
 
-#: Default folder of the page of all results.
-_OUTPUT: Final = Path('reproduce_output')
+_OUTPUT: Final = Path('reproduce_output')  #: Default folder of the page of all results.
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

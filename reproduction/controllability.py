@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controllability and observability of the paper's needle, sections 3.2.3 to 3.2.6."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters

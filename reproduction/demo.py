@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the demo: insertions, identification of friction and stiffness, and one report."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -54,15 +52,9 @@ from reproduction.insertions.insertion import (
 )
 from reproduction.protocol import PROTOCOLS
 from reproduction.record import rig
-from reproduction.truth import (
-    compare_friction,
-    compare_stiffness,
-    Coverage,
-    TruthComparison,
-)
+from reproduction.truth import compare_friction, compare_stiffness, Coverage, TruthComparison
 
-#: Speed of the recorded experiments, as a multiple of real time.
-EXPERIMENT_SPEED: Final = 25.0
+EXPERIMENT_SPEED: Final = 25.0  #: Speed of the recorded experiments, as a multiple of real time.
 
 #: Largest error of a fresh estimate at every force, in half-widths of the 95 % interval. With new
 #: noise one of the 22 estimates would exceed it in one of 20 runs, but the noise seed is fixed.

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle demo`: insertion, recording and identification, with one report."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle experiment`: the paper's experiments on the simulated robot, recorded to bags."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw figures 4 to 8 of the paper from the runs of `runs`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables 1 and 2 of the paper, identified from recordings of a simulated robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from math import inf, sqrt
@@ -22,12 +20,7 @@ from needle_insertion.report.content import Grid, ReportSection
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import NeedleError
 from reproduction.protocol import SHIPPED_BAGS
-from reproduction.truth import (
-    compare_friction,
-    compare_stiffness,
-    Coverage,
-    LEVEL,
-)
+from reproduction.truth import compare_friction, compare_stiffness, Coverage, LEVEL
 from scipy.special import chdtri
 from tqdm import tqdm
 
@@ -61,8 +54,7 @@ class ReproduceError(NeedleError):
 class PublishedValue:
     """Published quantity and its statistics over the recordings."""
 
-    #: With its unit and condition.
-    quantity: str
+    quantity: str  #: With its unit and condition.
     #: Published mean and standard deviation, SI.
     paper: tuple[float, float]
     found: Statistic

@@ -7,8 +7,6 @@ inverse dynamics without feedback, PID without integral. They actuate the base (
 nominal model is the preset; the plant parameters are sampled for each run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -48,8 +46,7 @@ DEFLECTION: Final = 5e-4
 #: Longest step [s]: the modal flow is exact; a step of 1/100 changes no error by a nanometer.
 STEP: Final = 1e-3
 
-#: Preset of the nominal model, and mean of the plants.
-PRESET: Final = PAPER_NEEDLE
+PRESET: Final = PAPER_NEEDLE  #: Preset of the nominal model, and mean of the plants.
 
 #: Cases: description and delay [periods].
 CASES: Final[Mapping[str, tuple[str, int]]] = {
@@ -72,8 +69,7 @@ _MEASURES: Final = {
 class Mismatch:
     """Results of the mismatch study."""
 
-    #: Ratio of true to nominal mu_s, mu_v and k_a, shape (runs, 3).
-    factors: FloatArray
+    factors: FloatArray  #: Ratio of true to nominal mu_s, mu_v and k_a, shape (runs, 3).
     #: Runs of each of `CASES`, and run of each case without mismatch.
     batches: Mapping[str, LoopBatch]
     nominal: Mapping[str, LoopBatch]

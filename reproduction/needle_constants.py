@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Constants of the needle, Table 3, compared with a round wire."""
 
-from __future__ import annotations
-
 from math import pi
 from typing import Final
 
 from needle_dynamics import NeedleParameters
 from needle_insertion.report.content import Grid, ReportSection
 
-#: Diameter of an 18 gauge needle [m].
-DIAMETER: Final = 1.27e-3
+DIAMETER: Final = 1.27e-3  #: Diameter of an 18 gauge needle [m].
 
 
 def section() -> ReportSection:

@@ -8,8 +8,6 @@ order of its own. Quantities that cannot be negative follow a gamma distribution
 normal distribution.
 """
 
-from __future__ import annotations
-
 from itertools import count
 from typing import Final
 
@@ -18,8 +16,7 @@ from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 import numpy as np
 from scipy.special import gammaincinv, ndtri
 
-#: Entries of the stiffness matrix that cannot be negative.
-_POSITIVE: Final = ('k_xx', 'k_zz')
+_POSITIVE: Final = ('k_xx', 'k_zz')  #: Entries of the stiffness matrix that cannot be negative.
 
 
 def draw_friction(repeats: int, seed: int) -> list[dict[str, float]]:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commanded motion and force in the experiments of sections 3.2.2.2 and 3.2.2.3."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, pi, sin
@@ -20,8 +18,7 @@ START_DEPTH: Final = 0.1
 #: Speeds of the strokes [m/s], in the range of manual insertion.
 SPEEDS: Final = (0.002, 0.005, 0.010, 0.015, 0.020)
 
-#: Time of one stroke, and of a rest [s].
-STROKE_TIME, REST_TIME = 0.75, 0.15
+STROKE_TIME, REST_TIME = 0.75, 0.15  #: Time of one stroke, and of a rest [s].
 
 #: Acceleration and deceleration time of a stroke [s], and its number of steps.
 EASE_TIME, _EASE_STEPS = 0.05, 5
@@ -30,8 +27,7 @@ EASE_TIME, _EASE_STEPS = 0.05, 5
 #: needle, its duration, and the return time [s].
 PUSH, PUSH_TIME, RETURN_TIME = 1.0, 1.5, 0.25
 
-#: Number of directions of the presses, evenly around the circle.
-DIRECTIONS: Final = 8
+DIRECTIONS: Final = 8  #: Number of directions of the presses, evenly around the circle.
 
 #: Times of one press [s]: force up or down, force held, at rest.
 RAMP_TIME, HOLD_TIME, RELEASED_TIME = 0.15, 0.35, 0.15
@@ -53,16 +49,12 @@ class TrajectoryPoint(NamedTuple):
 class ExperimentProtocol:
     """One experiment on the simulated robot."""
 
-    #: First part of the names of its bags.
-    name: str
-    #: Commanded joints.
-    joints: tuple[str, ...]
+    name: str  #: First part of the names of its bags.
+    joints: tuple[str, ...]  #: Commanded joints.
     #: Trajectory: times [s], insertion depths [m], forces [N].
     points: tuple[TrajectoryPoint, ...]
-    #: Topic of the motion, sampled as often as ``/base_wrench``.
-    motion: str
-    #: Parameters of the plant, with its mode.
-    plant: Mapping[str, object]
+    motion: str  #: Topic of the motion, sampled as often as ``/base_wrench``.
+    plant: Mapping[str, object]  #: Parameters of the plant, with its mode.
 
     @property
     def duration(self) -> float:

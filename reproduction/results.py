@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reproduce the results of the paper as text, as JSON, and as a page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
@@ -33,8 +31,7 @@ _JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     'all': tuple(TABLES),
 }
 
-#: Heads of `Result.verdicts`.
-VERDICT_HEADS: Final = ('where', 'what', 'verdict')
+VERDICT_HEADS: Final = ('where', 'what', 'verdict')  #: Heads of `Result.verdicts`.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,8 +43,7 @@ class Result:
     #: Place in the paper, statement, and verdict.
     verdicts: tuple[tuple[str, str, str], ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)
-    #: False if a table differs from the paper.
-    holds: bool = True
+    holds: bool = True  #: False if a table differs from the paper.
 
 
 def campaigns(what: str) -> dict[str, Campaign]:

@@ -24,13 +24,7 @@ from needle_controller import (
     LoopRun,
     run_continuous,
 )
-from needle_dynamics import (
-    FORMULATIONS,
-    Integrator,
-    NeedleModel,
-    NeedleParameters,
-    simulate,
-)
+from needle_dynamics import FORMULATIONS, Integrator, NeedleModel, NeedleParameters, simulate
 import numpy as np
 
 #: Readings of Table 1, and their combinations with both formulations.
@@ -55,8 +49,7 @@ PID_KV: Final = 1e4
 OPEN_LOOP: Final[Mapping[str, float]] = {'paper_si': 0.035, 'paper_mm': 24.0}
 CLOSED_LOOP: Final = {'inverse_dynamics': 150.0, 'pid': 150.0}
 
-#: Drawn part of a closed loop, with denser samples [s].
-SHOWN: Final = 40.0
+SHOWN: Final = 40.0  #: Drawn part of a closed loop, with denser samples [s].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,14 +59,10 @@ class RunOutcome:
     #: Signed tip deflection of largest magnitude [m], and its time [s].
     peak: float
     peak_time: float
-    #: Largest magnitude of the tip deflection [m] over the last tenth of the run.
-    final: float
-    #: Final d [m]: the position error, as q_d = 0.
-    error: float
-    #: Largest insertion depth [m].
-    deepest: float
-    #: Final time [s].
-    end: float
+    final: float  #: Largest magnitude of the tip deflection [m] over the last tenth of the run.
+    error: float  #: Final d [m]: the position error, as q_d = 0.
+    deepest: float  #: Largest insertion depth [m].
+    end: float  #: Final time [s].
 
     @classmethod
     @cache

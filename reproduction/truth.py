@@ -29,10 +29,8 @@ class TruthComparison:
     """An estimate and its true value."""
 
     estimate: ParameterEstimate
-    #: In the unit of the estimate; None if the recording lacks it.
-    truth: float | None
-    #: Force level of a stiffness [N].
-    force: float | None = None
+    truth: float | None  #: In the unit of the estimate; None if the recording lacks it.
+    force: float | None = None  #: Force level of a stiffness [N].
 
     @property
     def holds(self) -> bool:

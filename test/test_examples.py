@@ -48,10 +48,7 @@ ELSEWHERE = {'robot_driver', 'steering_law'}
 
 @pytest.mark.parametrize('name', sorted({path.stem for path in EXAMPLES.glob('*.py')} - ELSEWHERE))
 def test_example_runs(
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The script runs alone in an empty folder."""
     if name in NEEDS:

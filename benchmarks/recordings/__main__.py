@@ -21,14 +21,7 @@ from benchmarks.page import conclusion, PageSection
 from benchmarks.recordings import identification, replay
 from benchmarks.recordings.folder import read_folder
 from benchmarks.recordings.identification import identify_medium
-from benchmarks.recordings.replay import (
-    figures,
-    follow,
-    LAWS,
-    PLANTS,
-    ReplaySettings,
-    SETTINGS,
-)
+from benchmarks.recordings.replay import figures, follow, LAWS, PLANTS, ReplaySettings, SETTINGS
 from needle_identification import SteeringRecording
 from needle_ros.errors import NeedleError
 from needle_ros.process_pool import processes

@@ -6,8 +6,6 @@ The filter state of each normal mode is c = omega a and b = a_dot, both in sqrt(
 damping the transition over any time is a rotation.
 """
 
-from __future__ import annotations
-
 from math import cos, sin, sqrt
 from typing import NamedTuple
 

@@ -375,12 +375,7 @@ def replay(boxed: Boxed[Filter], count: int, oldest: int, newest: int, since: fl
 
 @kernel
 def estimate(  # noqa: C901
-    boxed: Boxed[Filter],
-    slot: int,
-    depth: float,
-    span: float,
-    modal: Vector,
-    jacobian: Matrix,
+    boxed: Boxed[Filter], slot: int, depth: float, span: float, modal: Vector, jacobian: Matrix
 ) -> tuple[float, float, float]:
     """
     Transform the newest slot to modal coordinates at the present depth, half a sample later.

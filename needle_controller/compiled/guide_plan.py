@@ -26,8 +26,7 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
-#: Fraction of the later guide motion that the plan uses.
-_USED: Final = 0.8
+_USED: Final = 0.8  #: Fraction of the later guide motion that the plan uses.
 
 #: Candidate positions of the guide, relative to its range.
 _FINE: Final = np.linspace(-1.0, 1.0, 121)
@@ -54,8 +53,7 @@ _DEVIATION, _MOTION = 1e-3, 2.5e-3
 #: relative to its square, and least weight of a hypothesis in the plan.
 _AHEAD, _DOUBT, _LEAST_WEIGHT = 4, 0.05, 1e-4
 
-#: Distance from the target that counts as a hit [m].
-HIT: Final = 1e-3
+HIT: Final = 1e-3  #: Distance from the target that counts as a hit [m].
 
 
 class FinalTip(NamedTuple):

@@ -55,11 +55,8 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
-#: Standard deviation of the relative loss of the bevel load at rest.
-_BEVEL_RELEASE: Final = 0.03
-
-#: Index of the bevel load among the constants.
-BEVEL: Final = 3
+_BEVEL_RELEASE: Final = 0.03  #: Standard deviation of the relative loss of the bevel load at rest.
+BEVEL: Final = 3  #: Index of the bevel load among the constants.
 
 #: Standard deviation of a gross error of a tip measurement along each axis [m]: organs below the
 #: diaphragm move by 5 to 10 mm.
@@ -86,8 +83,7 @@ _LEAST_LOG: Final = -30.0
 #: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
 MOST_SAME: Final = 2
 
-#: Largest number of successive missing tip measurements.
-MOST_MISSING: Final = 6
+MOST_MISSING: Final = 6  #: Largest number of successive missing tip measurements.
 
 #: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
 #: gross and missing measurements.
@@ -97,8 +93,7 @@ STEP, TURNS, SAME, GROSS, MISSING = range(5)
 #: of a sensor fault, and the last innovation along x and z [m].
 _ERRORS, _MEASURED, _EVIDENCE, _LAST_X, _LAST_Z = range(5)
 
-#: Result of the check of a tip measurement.
-VALID, LOST, FROZEN, OUTLIER = range(4)
+VALID, LOST, FROZEN, OUTLIER = range(4)  #: Result of the check of a tip measurement.
 
 
 class HypothesisResponses(NamedTuple):
@@ -142,8 +137,7 @@ class Steering(NamedTuple):
     #: Direction of the bevel relative to zero roll, on the skin and in each step, by point of the
     #: grid, shape (g, n + 1).
     turned: ComplexMatrix
-    #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
-    roll: Vector
+    roll: Vector  #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
     last: Vector  #: last tip measurement [m], shape (2,)
     #: Tip measurements so far, remaining turns, successive equal, gross and missing measurements,
     #: shape (5,).

@@ -7,8 +7,6 @@ together drive the rest; the memory of the low-pass and its reading, for each ch
 wrench; the running mean of the tip deflection over the current exposure.
 """
 
-from __future__ import annotations
-
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
 

@@ -7,8 +7,6 @@ They take `LawConstants` and `Instant` as plain tuples and name their fields ins
 recognizes a plain tuple several times faster than a named tuple.
 """
 
-from __future__ import annotations
-
 from math import inf
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
@@ -38,8 +36,7 @@ MEASURED: Final = 6
 LEARNED: Final = 9
 MEMORY: Final = LEARNED + 2 * BLOCK
 
-#: Least speed at which friction is learned [m/s].
-_SLIDES: Final = 5e-4
+_SLIDES: Final = 5e-4  #: Least speed at which friction is learned [m/s].
 
 
 class LawConstants(NamedTuple):

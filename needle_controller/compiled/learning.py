@@ -9,8 +9,6 @@ modeled friction at the mean speed. Corrections without excitation do not change
 learns, the covariance grows slowly, up to the prior.
 """
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Final
 
@@ -22,11 +20,8 @@ import numpy as np
 TERMS: Final = 3
 BLOCK: Final = TERMS + TERMS * TERMS
 
-#: Insertion depth over which dry friction may change by its bound [m].
-LENGTH: Final = 0.05
-
-#: Correlation time of the measurement noise [s].
-_CORRELATED: Final = 0.01
+LENGTH: Final = 0.05  #: Insertion depth over which dry friction may change by its bound [m].
+_CORRELATED: Final = 0.01  #: Correlation time of the measurement noise [s].
 
 #: Time in which the covariance of a correction grows to its prior, without measurements [s].
 _MEMORY: Final = 60.0

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
-from __future__ import annotations
-
 from needle_controller.compiled.laws import (
     axis_step,
     law_learn,

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extreme values of polynomials of fifth order."""
 
-from __future__ import annotations
-
 from needle_dynamics.arrays import FloatArray, Vector
 from needle_dynamics.compiled.cache import compiled, kernel
 import numpy as np

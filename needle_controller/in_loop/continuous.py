@@ -6,8 +6,6 @@ The motion is solved in pieces with a fixed direction of sliding. A piece ends w
 stops, breaks away, or reaches the hub. Friction is not smoothed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import inf, sqrt
 from typing import Final
@@ -19,15 +17,13 @@ from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Smallest velocity of either sign, for a start from rest [m/s].
-_AT_REST: Final = 1e-300
+_AT_REST: Final = 1e-300  #: Smallest velocity of either sign, for a start from rest [m/s].
 
 #: Relative excess of a force over dry friction at break-away, so that an exponentially decaying
 #: motion ends only once.
 _ROUNDING: Final = 1e-9
 
-#: Largest number of pieces of a motion; more are chatter.
-_MOST_PIECES: Final = 1000
+_MOST_PIECES: Final = 1000  #: Largest number of pieces of a motion; more are chatter.
 
 
 def run_continuous(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Result of a run of a closed loop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from needle_dynamics import FloatArray, NeedleModel

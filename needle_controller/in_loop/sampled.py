@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sampled controllers with a simulated needle, and sampled laws with batches of needles."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

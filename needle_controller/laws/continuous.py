@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Continuous-time control laws of section 3.2.7 of the paper, for analysis."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from math import copysign, inf
@@ -18,8 +16,7 @@ from numpy.typing import ArrayLike
 #: Actuated coordinates: base only (f_y, tau), or all coordinates, which is not realizable.
 ACTUATIONS: Final = ('physical', 'modal')
 
-#: Coordinates of the base, d and theta.
-_BASE: Final = 2
+_BASE: Final = 2  #: Coordinates of the base, d and theta.
 
 
 def _gain_matrix(

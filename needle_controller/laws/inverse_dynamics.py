@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics control, section 3.2.7.1 of the paper, in sampled form, with feedback."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,8 +15,7 @@ _DAMPING: Final = 1.0 / 3.0
 _INTEGRAL: Final = 0.25
 _PERIODS: Final = 5.0
 
-#: Default bandwidth of the feedback [1/s].
-BANDWIDTH: Final = 30.0
+BANDWIDTH: Final = 30.0  #: Default bandwidth of the feedback [1/s].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,6 @@ A late tip sample is processed at its time: the filter keeps a history and repea
 there. The result equals the result of a filter without late samples.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import ceil, inf, isfinite, nan
 from operator import index
@@ -41,17 +39,13 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Relative deviation of encoder stamps from the period that is ignored.
-_EVEN: Final = 0.01
+_EVEN: Final = 0.01  #: Relative deviation of encoder stamps from the period that is ignored.
 
 #: Relative tolerance of the ratio of the sensor's filter rate to the sample rate.
 _NEAR: Final = 0.1
 
-#: Largest stamp difference of a wrench and its encoder sample, in periods.
-_SAME: Final = 0.1
-
-#: Largest number of wrenches that wait for their encoder sample.
-_WAITING: Final = 16
+_SAME: Final = 0.1  #: Largest stamp difference of a wrench and its encoder sample, in periods.
+_WAITING: Final = 16  #: Largest number of wrenches that wait for their encoder sample.
 
 #: Largest relative overlap of exposures of the tip; above it a sample is a duplicate.
 _OVERLAP: Final = 0.1
@@ -168,11 +162,7 @@ class Observer:
     # Measurements.
 
     def update(
-        self,
-        stamp: int,
-        depth: float,
-        velocity: float,
-        wrench: tuple[float, float] | None = None,
+        self, stamp: int, depth: float, velocity: float, wrench: tuple[float, float] | None = None
     ) -> None:
         """
         Process a sample of the encoders, and optionally of the base wrench.

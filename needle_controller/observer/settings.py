@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of the observer: assumed sensor noise and model uncertainty."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import lru_cache
 from math import nan
@@ -17,8 +15,7 @@ from needle_ros.settings import check_constants, constant
 import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
 
-#: Default force sensor of the plant, assumed by default.
-_SENSOR: Final = ForceSensorParameters()
+_SENSOR: Final = ForceSensorParameters()  #: Default force sensor of the plant, assumed by default.
 
 
 @lru_cache(maxsize=32)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reference generator of a controller: a target or a path, with pauses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from math import copysign, sqrt
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hold of a reference: it advances only while the needle can follow."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Final
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Path through given points, and a motion that joins it from any setpoint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import copysign, isfinite, sqrt
 
@@ -213,11 +211,7 @@ def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float])
 
 
 def _join(
-    start: Setpoint,
-    path: Path,
-    since: float,
-    limits: ReferenceLimits,
-    depths: tuple[float, float],
+    start: Setpoint, path: Path, since: float, limits: ReferenceLimits, depths: tuple[float, float]
 ) -> tuple[Reference | None, float] | None:
     """
     Return the quintic to a path, and the time on the path at its end [s].

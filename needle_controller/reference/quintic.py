@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions of least integrated squared jerk: polynomials of fifth order in time."""
 
-from __future__ import annotations
-
 from math import inf, sqrt
 
 from needle_controller.compiled.quintic import quintic_extremes

@@ -1,21 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Setpoints over time and their limits: the interface of all references."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
 from needle_ros.settings import CheckedSettings, constant
 
-#: Relative rounding error by which a limit may be exceeded.
-ROUNDING: Final = 1e-9
-
-#: Shortest duration of a motion [s].
-SHORTEST: Final = 1e-3
-
-#: Factor by which a motion is made longer until it is within its limits.
-LONGER: Final = 1.1
+ROUNDING: Final = 1e-9  #: Relative rounding error by which a limit may be exceeded.
+SHORTEST: Final = 1e-3  #: Shortest duration of a motion [s].
+LONGER: Final = 1.1  #: Factor by which a motion is made longer until it is within its limits.
 
 
 class Setpoint(NamedTuple):
@@ -39,8 +32,7 @@ class ReferenceLimits(CheckedSettings):
 class Reference(Protocol):
     """Motion that ends at rest, with times from its start [s]."""
 
-    #: Duration of the motion [s].
-    duration: float
+    duration: float  #: Duration of the motion [s].
 
     def at(self, time: float) -> Setpoint:
         """

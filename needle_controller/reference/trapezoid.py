@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fastest motion within the limits, and the target as a step."""
 
-from __future__ import annotations
-
 from math import copysign, sqrt
 
 from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
@@ -51,8 +49,7 @@ class Trapezoid(Reference):
     def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
         top, ramp = limits.speed, limits.acceleration
         position, velocity = start.position, start.velocity
-        #: (duration, acceleration) of each part.
-        parts: list[tuple[float, float]] = []
+        parts: list[tuple[float, float]] = []  #: (duration, acceleration) of each part.
         # First brake a motion in the wrong direction, too fast, or too far.
         stop = position + copysign(velocity * velocity / (2.0 * ramp), velocity)
         sign = copysign(1.0, target - stop)

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Displacement monitor: compare measured displacements with measured velocities."""
 
-from __future__ import annotations
-
 from math import exp
 from typing import Final
 
-#: Time over which positions and velocities are compared [s].
-_MEMORY: Final = 2.0
+_MEMORY: Final = 2.0  #: Time over which positions and velocities are compared [s].
 
 
 class DisplacementMonitor:

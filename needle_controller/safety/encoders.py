@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encoder measurements of the needle from joint states."""
 
-from __future__ import annotations
-
 from math import nan
 
 from needle_controller.controller import Measurement

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of measurements with their limits."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import hypot, isnan, nan
 from typing import Final

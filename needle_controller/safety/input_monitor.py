@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Input monitor: check stamp, frame and values of the messages of a topic."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from math import isfinite
@@ -20,8 +18,7 @@ DROPPED: Final = 'dropped'
 _LIVELY: Final = 10
 
 
-#: Stamps are rounded to nanoseconds [ns].
-_ROUNDING: Final = 2
+_ROUNDING: Final = 2  #: Stamps are rounded to nanoseconds [ns].
 
 
 class Refusal(NamedTuple):

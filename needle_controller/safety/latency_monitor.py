@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latency monitor: compare the latency of the commands with the configured delay."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_ros.status import LatencyStatus

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of the measurements, as parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from needle_ros.settings import CheckedSettings, constant, flag

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rate monitor: compare the rate of the measurements with the rate of the control laws."""
 
-from __future__ import annotations
-
 from collections import deque
 from statistics import median
 from typing import Final

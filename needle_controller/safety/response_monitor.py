@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Response monitor: check that plant and encoders follow the commands."""
 
-from __future__ import annotations
-
 from math import copysign, isnan
 from typing import Final, NamedTuple
 
@@ -23,8 +21,7 @@ _NOTHING: Final = 0.1
 _STRONGER, _WEAKER = 1.5, 0.7
 _OBSERVED: Final = 0.1, 4.0
 
-#: Longest time of a displacement that shows the friction [ns].
-_WINDOW: Final = NANOSECONDS // 5
+_WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 
 class _Mark(NamedTuple):

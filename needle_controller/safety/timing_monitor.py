@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timing monitor: rate of the measurements, and latency of the commands."""
 
-from __future__ import annotations
-
 from needle_controller.controller import ControllerSettings
 from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.latency_monitor import LatencyMonitor

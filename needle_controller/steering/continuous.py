@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Continuous insertion: the needle moves without rest, and the guide follows its depth."""
 
-from __future__ import annotations
-
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import InsertionStrategy
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError

@@ -7,8 +7,6 @@ that converts the insertion to forces. The executive processes events, requests 
 insertion follows one of two strategies, `SteppedInsertion` or `ContinuousInsertion`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from time import monotonic

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steering law with checked measurements and checked setpoints."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import isfinite, sqrt
@@ -24,11 +22,8 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
 import numpy as np
 
-#: Tolerance of equal positions [m, rad].
-SAME: Final = 1e-6
-
-#: Tolerance of a setpoint beyond its limit [m].
-_ROUNDING: Final = 1e-6
+SAME: Final = 1e-6  #: Tolerance of equal positions [m, rad].
+_ROUNDING: Final = 1e-6  #: Tolerance of a setpoint beyond its limit [m].
 
 
 class GuardedLaw:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common part of stepped and continuous insertions: motions, rest, and measurement of the tip."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 from needle_controller.steering.guarded_law import GuardedLaw

@@ -18,26 +18,18 @@ from needle_ros.status import SteeringPhase
 from needle_ros.system_state import Authority
 import numpy as np
 
-#: Largest slope of the path of a tip.
-_STEEPEST: Final = 0.5
-
-#: Tolerance of a computed setpoint [m, rad].
-_SAME: Final = 1e-9
+_STEEPEST: Final = 0.5  #: Largest slope of the path of a tip.
+_SAME: Final = 1e-9  #: Tolerance of a computed setpoint [m, rad].
 
 
 class PlannedInsertion(NamedTuple):
     """Request of an insertion."""
 
-    #: Stamp of its message [ns].
-    stamp: int
-    #: Target of the tip, x, y, z [m].
-    point: tuple[float, float, float]
-    #: Positions of the joints now [m, rad].
-    at: FloatArray
-    #: Depths of the tip measurements [m], shape (n + 1,).
-    depths: FloatArray = np.empty(0)
-    #: Record of the insertion that is resumed, if it is.
-    record: SteeringRecord | None = None
+    stamp: int  #: Stamp of its message [ns].
+    point: tuple[float, float, float]  #: Target of the tip, x, y, z [m].
+    at: FloatArray  #: Positions of the joints now [m, rad].
+    depths: FloatArray = np.empty(0)  #: Depths of the tip measurements [m], shape (n + 1,).
+    record: SteeringRecord | None = None  #: Record of the insertion that is resumed, if it is.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Status of a steered insertion: phase, law, expected tip and last measurement."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steering law: interface to the executive and the simulation, and construction by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -168,11 +166,7 @@ def find_law(name: str) -> LawClass:
 
 
 def build_law(
-    name: str,
-    model: SteeringModel,
-    target: ArrayLike,
-    limits: SteeringLimits,
-    roll: float = 0.0,
+    name: str, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
 ) -> SteeringLaw:
     """
     Construct a steering law by name.

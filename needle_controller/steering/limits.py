@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limits of a steering law, as parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -37,8 +35,7 @@ class SteeringLimits:
         object.__setattr__(self, 'turns', int(self.turns))
 
 
-#: Default insertion from one tip measurement to the next [m].
-STEP_LENGTH: Final = 5e-3
+STEP_LENGTH: Final = 5e-3  #: Default insertion from one tip measurement to the next [m].
 
 #: Default limits of simulations: only the position of the guide is limited.
 SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monitor of a motion: check that the robot follows it, and that no node rejects it."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple
@@ -17,11 +15,8 @@ import numpy as np
 #: Least displacement of a joint that follows, if less than its tolerance [m, rad].
 _MOVED: Final = 1e-4
 
-#: Time for a robot to react to a motion [s].
-_REACTION: Final = 0.3
-
-#: Number of kept stamps of a stream of motions: more than in a second.
-_STREAMED: Final = 64
+_REACTION: Final = 0.3  #: Time for a robot to react to a motion [s].
+_STREAMED: Final = 64  #: Number of kept stamps of a stream of motions: more than in a second.
 
 
 class MotionRefusal(NamedTuple):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint motions of needle and guide from rest to rest."""
 
-from __future__ import annotations
-
 from math import ceil, sqrt
 from typing import Final, NamedTuple
 
@@ -10,18 +8,14 @@ from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
 import numpy as np
 
-#: Highest speed of a smooth motion from rest to rest over its mean.
-_PEAK: Final = 1.875
+_PEAK: Final = 1.875  #: Highest speed of a smooth motion from rest to rest over its mean.
 
 #: Highest acceleration of such a motion, times its squared duration over its distance; cubics
 #: between its points add 5 %.
 _STEEPEST: Final = 1.05 * 10.0 / sqrt(3.0)
 
-#: Fewest points of a motion.
-_POINTS: Final = 20
-
-#: Longest time from one point of a motion to the next [s].
-_INTERVAL: Final = 0.05
+_POINTS: Final = 20  #: Fewest points of a motion.
+_INTERVAL: Final = 0.05  #: Longest time from one point of a motion to the next [s].
 
 
 class JointMotion(NamedTuple):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion control of an insertion: motions of needle and guide, their repetition, and the stop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 
@@ -17,24 +15,19 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-#: Time in which needle and guide brake to rest after a stop [s].
-BRAKING: Final = 0.2
+BRAKING: Final = 0.2  #: Time in which needle and guide brake to rest after a stop [s].
 
 #: Number of points of a stop: one that arrives within a second is not in the past yet.
 _HELD: Final = 6
 
-#: Tolerance of a moving joint, as a multiple of its tolerance at rest.
-LAGGING: Final = 5.0
+LAGGING: Final = 5.0  #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 
 #: Time after which a stop is sent again to a needle that still moves [s], and number of times that
 #: it is sent.
 _STOP_AGAIN, _STOPS = 0.5, 4
 
-#: Time over which the velocity of the needle is measured [s].
-_SPAN: Final = 0.05
-
-#: Largest displacement of a needle at rest [m].
-STILL: Final = 1e-4
+_SPAN: Final = 0.05  #: Time over which the velocity of the needle is measured [s].
+STILL: Final = 1e-4  #: Largest displacement of a needle at rest [m].
 
 
 class MotionControl:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planner of an insertion: check its start, and compute the steering law in a job."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil
 from typing import Final
@@ -23,11 +21,8 @@ import numpy as np
 #: Largest depth of a needle outside tissue, where the guide may move freely [m].
 _OUTSIDE: Final = 1e-3
 
-#: Tolerance of equal numbers of steps.
-_SAME: Final = 1e-6
-
-#: Most steps of a plan.
-_MOST_STEPS: Final = 200
+_SAME: Final = 1e-6  #: Tolerance of equal numbers of steps.
+_MOST_STEPS: Final = 200  #: Most steps of a plan.
 
 
 class InsertionPlanner:

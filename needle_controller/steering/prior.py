@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prior uncertainty of needle, tissue, path and sensor for a steering law."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from needle_ros.settings import check_constants, constant

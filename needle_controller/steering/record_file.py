@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """File with the record of an insertion, for a restart of the node `steering`."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -68,23 +68,12 @@ _SKINS: Final = (0.0, 0.1, 1.0 / 3.0, 1.0)
 _LEADS: Final = (0.0, 0.025)
 _WINDUPS: Final = (0.0, 4.0, 8.0)
 
-#: Hypotheses of path noise, relative to the least one.
-_PATHS: Final = (1.0, 10.0, 100.0)
-
-#: Correlation length of the slow error of the sensor [m].
-_DRIFT_LENGTH: Final = 0.05
-
-#: Half width of the grid over the spread.
-_BEYOND: Final = 1.1
-
-#: Longest element [m]: good to a few micrometers.
-_ELEMENT: Final = 1.25e-3
-
-#: Tolerance of equal depths [m].
-_SAME: Final = 1e-9
-
-#: Standard deviation of a uniform distribution over a cell of the grid.
-_EVEN: Final = 12.0**-0.5
+_PATHS: Final = (1.0, 10.0, 100.0)  #: Hypotheses of path noise, relative to the least one.
+_DRIFT_LENGTH: Final = 0.05  #: Correlation length of the slow error of the sensor [m].
+_BEYOND: Final = 1.1  #: Half width of the grid over the spread.
+_ELEMENT: Final = 1.25e-3  #: Longest element [m]: good to a few micrometers.
+_SAME: Final = 1e-9  #: Tolerance of equal depths [m].
+_EVEN: Final = 12.0**-0.5  #: Standard deviation of a uniform distribution over a cell of the grid.
 
 
 class SteeringModel:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Retraction of a steered needle: the guide returns to its zero as the needle is withdrawn."""
 
-from __future__ import annotations
-
 from needle_controller.steering.law import SteeringFaultError
 from needle_controller.steering.monitor import MotionRefusal
 from needle_controller.steering.motion import JointMotion

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps, tip measurements and limits of a steered insertion, as parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 from typing import Final
@@ -15,8 +13,7 @@ from needle_ros.settings import constant, flag
 from needle_ros.system_state import RETRACT_DEPTH
 import numpy as np
 
-#: Least number of guide commands within a step.
-_PER_STEP: Final = 4.0
+_PER_STEP: Final = 4.0  #: Least number of guide commands within a step.
 
 #: Joints that are moved; roll only if turns are allowed.
 JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)

@@ -27,14 +27,11 @@ class GroundTruth:
 
     needle: NeedleParameters
     steering: SteeringParameters
-    #: Tilt of the guide in x and z [rad].
-    tilt: tuple[float, float]
-    #: Load of the bevel in x and z [N], shape (2,).
-    bevel: FloatArray
+    tilt: tuple[float, float]  #: Tilt of the guide in x and z [rad].
+    bevel: FloatArray  #: Load of the bevel in x and z [N], shape (2,).
     #: Rotation of the sensor's frame: shift of the tip in x and z per depth [rad], shape (2,).
     frame: FloatArray
-    #: Seed of the noise of the path.
-    seed: int
+    seed: int  #: Seed of the noise of the path.
 
     def plant(self, depths: FloatArray) -> SteeringPlant:
         """Return the needle before an insertion to depths [m], shape (n + 1,)."""
@@ -157,12 +154,10 @@ class SteeringRun(NamedTuple):
     #: Distance traveled by the guide [m], and number of turns of the needle.
     travel: float
     turns: int
-    #: Largest force on the guide after a motion of the guide [N].
-    load: float
+    load: float  #: Largest force on the guide after a motion of the guide [N].
     #: First warning of the law before the last depth, with its depth; '' without one.
     warning: str
-    #: Computation time of the law at each depth [s].
-    times: list[float]
+    times: list[float]  #: Computation time of the law at each depth [s].
 
 
 def simulate_steering(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stepped insertion: the guide moves while the needle rests, then the needle moves."""
 
-from __future__ import annotations
-
 from needle_controller.steering.insertion import InsertionStrategy
 from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.motion import JointMotion

@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averaged tip measurement: one position from many readings, at rest or during motion."""
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 import numpy as np
 
-#: Distance of an outlier from the median, in standard deviations.
-_OUTLIER: Final = 5.0
+_OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.
 
 #: Standard deviation of a normal distribution over the median of its absolute deviations.
 _NORMAL: Final = 1.4826
 
-#: Least number of readings for outlier rejection.
-_FEW: Final = 3
+_FEW: Final = 3  #: Least number of readings for outlier rejection.
 
 
 class AveragedTipMeasurement(NamedTuple):

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion along the insertion axis: friction per length, cutting force, and membranes."""
 
-from __future__ import annotations
-
 from math import copysign, inf, sqrt
 from typing import Final, NamedTuple
 

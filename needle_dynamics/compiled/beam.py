@@ -18,8 +18,6 @@ estimation, C and x_0 are the covariance and the mean of a Kalman filter, and th
 needle is its smoother.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from needle_dynamics.arrays import Array3, FloatArray, Matrix, Vector

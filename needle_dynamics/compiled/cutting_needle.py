@@ -23,8 +23,7 @@ from needle_dynamics.compiled.tissue import layer_at
 if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
-#: Indices of `Cut.pose`.
-DEPTH, ROLL, TIP_ROLL, FREE, DEEPEST = range(5)
+DEPTH, ROLL, TIP_ROLL, FREE, DEEPEST = range(5)  #: Indices of `Cut.pose`.
 
 #: Indices of `Cut.counts`: row of the last node, and whether the path restarts there.
 LAST, RESTARTS = range(2)

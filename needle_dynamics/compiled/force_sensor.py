@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force sensor samples: offset, noise, saturation, filters, quantization."""
 
-from __future__ import annotations
-
 from needle_dynamics.arrays import Array3, Matrix, Vector
 from needle_dynamics.compiled.cache import kernel
 import numpy as np

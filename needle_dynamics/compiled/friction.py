@@ -8,8 +8,6 @@ branch there; simulation, linearization and inverse dynamics use it. A new const
 of a law of a user (`needle_dynamics.friction.add_friction_law`) is the address of its function.
 """
 
-from __future__ import annotations
-
 from math import exp, inf, log1p, sqrt, tanh
 from typing import Final, NamedTuple
 

@@ -7,8 +7,6 @@ cancellation; power series in s, stored side by side in `ModeTables.series`, do 
 of two modes are small enough at any s, so that a single Horner pass evaluates all series.
 """
 
-from __future__ import annotations
-
 from math import cos, exp, isfinite, nan, sin
 from typing import Final, NamedTuple
 

@@ -15,8 +15,6 @@ Modes scale with the length of the needle: with the modes of a needle of length 
 and a single table is enough for all needles.
 """
 
-from __future__ import annotations
-
 from math import factorial, inf, isfinite, pi, sqrt
 from typing import Final, NamedTuple
 

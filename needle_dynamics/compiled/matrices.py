@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small dense matrices: Cholesky factor, triangular solutions, eigenvalues by Jacobi rotations."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 from needle_dynamics.arrays import FloatArray

@@ -7,8 +7,6 @@ part. With the momenta p = rho A G q_dot as variables, dG/dt needs no separate s
 the modes on the insertion axis and the sensor loads are closed-form integrals over the rotation.
 """
 
-from __future__ import annotations
-
 from math import cos, sin, sqrt
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ In their coordinates a, with q = N a, the modal mass is the identity and the sti
 N^T rho A G N = 1 and N^T (E I_y H + k_a G) N = omega^2.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray, Matrix, Vector

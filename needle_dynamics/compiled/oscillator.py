@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Damped oscillator, and first-order lag under a constant force; both exact."""
 
-from __future__ import annotations
-
 from math import cos, exp, expm1, sin, sqrt
 
 from needle_dynamics.compiled.cache import compiled, kernel

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Call of a friction law that a user has compiled, by its address."""
 
-from __future__ import annotations
-
 from typing import Any, cast, Final, Protocol
 
 

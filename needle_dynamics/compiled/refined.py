@@ -8,8 +8,6 @@ of the slowest mode, which grows as the square of the insertion depth, and becom
 vibration decays. A second run with steps of half the length everywhere gives the error.
 """
 
-from __future__ import annotations
-
 from math import ceil, sqrt
 from typing import Final
 

@@ -5,8 +5,6 @@ Conversion of function annotations to Numba types.
 This file imports Numba: import it where it is first needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 

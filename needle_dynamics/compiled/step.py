@@ -8,8 +8,6 @@ move the insertion axis under the force, the mean force of the modes and frictio
 Steps end at the borders of tissue layers, and the motion stops at the hub.
 """
 
-from __future__ import annotations
-
 from math import ceil, exp, inf, nan
 from typing import Final, NamedTuple
 

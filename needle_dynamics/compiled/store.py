@@ -12,8 +12,6 @@ Entries are read from the folder of this package, which may be read-only, and fr
 of the user. New entries are written to the first writable folder of the two.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import errno

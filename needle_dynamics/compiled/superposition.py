@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planar insertion of a needle for many load cases (causes) at once."""
 
-from __future__ import annotations
-
 from needle_dynamics.arrays import Matrix, Vector
 from needle_dynamics.compiled.beam import begin, cross, element, SpringSupports
 from needle_dynamics.compiled.cache import kernel

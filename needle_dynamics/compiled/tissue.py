@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tissue layers along the needle."""
 
-from __future__ import annotations
-
 from math import expm1, inf
 from typing import NamedTuple
 

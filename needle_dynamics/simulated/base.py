@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion-controlled base that moves the needle in mode `robot`, and its trajectories."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest

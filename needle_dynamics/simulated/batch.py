@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parallel simulation of many insertions on all cores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clock of a simulated plant, from its constants."""
 
-from __future__ import annotations
-
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_ros.errors import ParameterError
 from needle_ros.sample_clock import SampleClock

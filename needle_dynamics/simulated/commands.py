@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Selection of the commanded force that acts on the needle from one sample to the next."""
 
-from __future__ import annotations
-
 from math import exp, inf
 from typing import NamedTuple
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Force-torque sensor at the base (JR3 in the source): noise, drift, filters, resolution, tare."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field, fields
 from math import pi, sqrt, tan

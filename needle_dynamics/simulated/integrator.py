@@ -10,8 +10,6 @@ Numerical Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly
 problems).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from math import copysign, inf, isfinite, isnan, sqrt
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parser of `joint_commands` messages from ros2_control."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import isnan
 from typing import Final, NamedTuple

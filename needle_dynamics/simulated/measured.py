@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Common base of all simulated plants, and their measurements."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Final, NamedTuple, TypeAlias

@@ -6,8 +6,6 @@ An `Event` is an input other than a command. It takes effect from the next sampl
 performs it again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import nan
 from typing import Any, Final, NamedTuple

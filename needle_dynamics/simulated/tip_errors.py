@@ -21,8 +21,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import exp, expm1, pi, sqrt
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tip sensor: a tracker or imager with exposure time, noise, delay and its own frame."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from math import ceil, cos, pi, sin

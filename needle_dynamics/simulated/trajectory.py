@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation of one insertion under a given force."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, nan

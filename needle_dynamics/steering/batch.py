@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parallel simulation of many steered needles on all cores."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Insertion of a steered needle: dynamics along the axis, quasi-static lateral bending."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import copysign, inf, isfinite
 

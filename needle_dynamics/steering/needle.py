@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Needle that cuts its path, moved by guide, roll and insertion depth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil, exp, isfinite, sqrt
 from typing import Any, Final, NamedTuple

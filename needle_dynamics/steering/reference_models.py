@@ -17,8 +17,6 @@ References
    Transactions on Robotics 23, 2007.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import inf, tan
 

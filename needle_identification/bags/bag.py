@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read topics and messages of bags, also of incomplete or damaged bags."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from heapq import heappop, heappush

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """List the files of a bag."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import re
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read messages of MCAP files chunk by chunk, also of truncated or damaged files."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Message definitions, and serialization of messages, without ROS."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 import os
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Play back a bag: schedule its messages in recorded time."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping, Set
 from dataclasses import dataclass

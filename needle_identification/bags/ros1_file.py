@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read ROS 1 recordings, with messages converted to ROS 2."""
 
-from __future__ import annotations
-
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator
 from functools import partial

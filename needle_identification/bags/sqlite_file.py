@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read messages of sqlite3 files, also of damaged files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing, ExitStack, suppress
 from functools import partial

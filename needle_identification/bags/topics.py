@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics of a bag, and the quality of service (QoS) that their publishers offered."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 import re

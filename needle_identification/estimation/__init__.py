@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear regression with standard errors, residual tests, and parameter estimates."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_ros.settings import check_choice

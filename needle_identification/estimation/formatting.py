@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format numbers with the digits that are significant for their error."""
 
-from __future__ import annotations
-
 from math import floor, inf, isfinite, log10
 from typing import Final
 

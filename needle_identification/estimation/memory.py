@@ -24,8 +24,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from math import exp, sqrt

@@ -7,8 +7,6 @@ With the mean products of regressors :math:`G = X^T X / n`, of regressors and re
 the recording's own, has the mean squared error :math:`p + 2 c^T d + d^T G d`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
@@ -74,7 +72,5 @@ def predicted(recordings: Sequence[Moments]) -> RecordingPrediction | None:
     rms = sqrt(float(np.mean(squares)))
     low, high = (rms * sqrt(len(known) / float(chdtri(len(known), p))) for p in (0.025, 0.975))
     return RecordingPrediction(
-        rms=rms,
-        interval=(low, high),
-        residual=sqrt(float(np.mean([one.power for one in known]))),
+        rms=rms, interval=(low, high), residual=sqrt(float(np.mean([one.power for one in known])))
     )

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Test the residuals of a fit, with validity for correlated noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 import warnings

@@ -6,8 +6,6 @@ The base pushes with a rising force until the needle moves. A straight line is f
 of the last 0.3 s at rest and evaluated at the onset of motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil, hypot, sqrt
 from typing import Final

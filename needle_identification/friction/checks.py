@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plausibility checks of a friction estimate: errors and warnings."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Final
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Friction estimate of a recording, and summary over several recordings, as in Table 1."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import log

@@ -6,8 +6,6 @@ The interval of a coefficient is its standard error from `score_covariance` time
 Student's t. Ratios have intervals by the delta method.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import hypot, sqrt
 

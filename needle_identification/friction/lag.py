@@ -7,8 +7,6 @@ The lag is estimated coarsely in steps of half the filter, then by Gauss-Newton 
 step is part of the friction regression.
 """
 
-from __future__ import annotations
-
 from math import hypot
 from typing import Final
 

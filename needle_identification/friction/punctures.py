@@ -7,8 +7,6 @@ before and after each sample, over one correlation length of the filter and with
 friction, are compared; a puncture is a drop clearly above the usual changes by noise and tissue.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final

@@ -9,8 +9,6 @@ with the same sample selection. The acceleration is an additional regressor that
 of the force.
 """
 
-from __future__ import annotations
-
 from collections import Counter, deque
 from itertools import pairwise
 from math import ceil, exp, inf, isfinite, nan
@@ -45,7 +43,6 @@ _ROUNDING: Final = 1e-7
 _SETTLING: Final = 0.05
 
 _LAGS: Final = 5  # number of blocks over which the noise may be correlated
-
 _FIRST: Final = 50  # number of pairs that determine the sampling rate
 _LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
 

@@ -15,8 +15,6 @@ with :math:`\ell_i` the length of the needle in layer i; for the term ``length``
 depth. To add a friction law, add a term to `TERMS` and its columns here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

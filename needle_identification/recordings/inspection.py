@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inspect a recording: list its content, find force and motion, suggest a command."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,13 +15,7 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
-from needle_identification.recordings.tables import (
-    guessed,
-    is_table,
-    read_table,
-    ROLES,
-    with_unit,
-)
+from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES, with_unit
 from needle_identification.steering.columns import (
     check_depth,
     is_inverted,

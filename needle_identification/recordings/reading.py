@@ -7,8 +7,6 @@ and values alike, which causes no delay; see `series`. The motion is interpolate
 the force; see `timebase`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gather the samples of one topic while its bag is read."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence, Set
 from typing import Final, NamedTuple, NoReturn

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sort samples by time, in bounded memory."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray

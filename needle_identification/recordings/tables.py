@@ -8,8 +8,6 @@ by default it is taken from the name (``q_mm``, ``Force (N)``), else it is the S
 two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress

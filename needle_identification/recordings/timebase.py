@@ -9,8 +9,6 @@ differ, and the stamps of the force are shifted. A smaller difference may be a l
 stamps stay unchanged.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sensor estimate: errors of a tip sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from needle_identification.estimation.display import DisplayedEstimate, EstimateRows

@@ -7,8 +7,6 @@ The delay is found first by least squares on a grid, then with bias and noise
 eleven samples by more than six robust standard deviations; outliers are left out of the fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import permutations
@@ -32,7 +30,6 @@ _EXACT: Final = 1e-9  # largest change of errors that are rounding [m]
 _WINDOW: Final = 11  # samples of a running median
 _FAR: Final = 6.0  # deviation of an outlier [robust standard deviations]
 _ROBUST: Final = 1.4826  # standard deviation of normal values over their median deviation
-
 _DELAYS: Final = (-0.2, 1.0)  # range of the delay [s]
 _GRID: Final = 0.01  # step of the search for the delay [s], short relative to motions
 _ALIGNED: Final = 5000  # largest number of samples of this search
@@ -49,8 +46,7 @@ _SIMILAR: Final = 0.3
 _EXCHANGED: Final = 5.0
 _BIASED: Final = 2e-3
 
-#: Duration of a recording over a correlation time that it determines well.
-_LONG: Final = 20.0
+_LONG: Final = 20.0  #: Duration of a recording over a correlation time that it determines well.
 
 
 def identify_sensor(recording: SensorRecording) -> SensorEstimate:

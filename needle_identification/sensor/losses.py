@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fraction of lost samples and duration of bursts, from the gaps between samples."""
 
-from __future__ import annotations
-
 from math import exp, inf, log, log1p, nan, sqrt
 from typing import Final, NamedTuple
 

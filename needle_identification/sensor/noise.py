@@ -21,8 +21,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from itertools import product
 from math import exp, inf, log, sqrt
 from typing import Final, NamedTuple

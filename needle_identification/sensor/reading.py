@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read recordings of a tip sensor and true positions, from bags and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording of a tip sensor, with the true position."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

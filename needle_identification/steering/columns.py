@@ -11,8 +11,6 @@ inverted. Columns with times of their own, such as ``Base sec`` and ``Base nanos
 rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from math import pi
 import re

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steering estimate: constants of needle and medium from steered insertions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain

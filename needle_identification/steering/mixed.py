@@ -22,8 +22,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 from typing import Final, NamedTuple
@@ -33,7 +31,6 @@ import numpy as np
 from scipy.special import logsumexp
 
 _REACH: Final = 0.1  # depth at which path noise and slopes have the deviations of the grid [m]
-
 _TRAVEL: Final = 1e-3  # motion of the guide whose response has the deviation of the grid [m]
 
 #: Grid of the deviations of path noise and slopes at this depth, and of responses, over sigma.

@@ -6,8 +6,6 @@ Signs, units and factors of columns are written as in other tables; the suffix `
 from the previous row: ``guide_x=base.x[mm]@1``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 import re
@@ -23,12 +21,7 @@ from needle_identification.recordings.reading import (
     Wanted,
 )
 from needle_identification.recordings.samples import EachJoint, source_of
-from needle_identification.recordings.tables import (
-    column_values,
-    is_table,
-    read_table,
-    Table,
-)
+from needle_identification.recordings.tables import column_values, is_table, read_table, Table
 from needle_identification.recordings.timebase import merge
 from needle_identification.steering.columns import (
     check_depth,

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recording of a steered insertion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
@@ -28,7 +26,6 @@ _LEVER: Final = 0.01  # motion for a roll of 1 rad [m]
 _MOST: Final = 100
 
 _JUMP: Final = 0.01  # smallest guide position after rows of zeros that is no motion [m]
-
 _AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
 _JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulate the tip response of a recorded insertion to guide, tilt and bevel."""
 
-from __future__ import annotations
-
 from math import ceil
 from typing import Final, NamedTuple
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the lengths with the highest likelihood, and their profile intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from math import copysign, exp, inf, log, sqrt

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tissue stiffness at a place, by force level, and summary over places, as in Table 2."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain

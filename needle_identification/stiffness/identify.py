@@ -6,8 +6,6 @@ The end-effector presses the tissue with force F and displaces it by d; the reac
 each force level the stiffness matrix K of F = K d is fitted to the presses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from math import hypot, nan, sqrt

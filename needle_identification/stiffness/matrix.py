@@ -14,8 +14,6 @@ antisymmetric part of K over the norm of its symmetric part. Its largest value f
 `StiffnessSettings.largest_asymmetry`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import atan2, degrees, hypot, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple

@@ -6,8 +6,6 @@ A plateau is the longest interval of steady force and position. Plateaus near th
 force are rests, the others are holds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil, hypot, inf, sqrt
 from typing import Final, NamedTuple

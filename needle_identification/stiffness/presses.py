@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute displacement and force of each hold relative to the rests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import exp, hypot, log, pi, sqrt
 from typing import Final, NamedTuple

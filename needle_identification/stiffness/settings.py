@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of stiffness identification."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from needle_identification.estimation import check_estimator

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle analyze`: controllability and observability of the linearized needle model."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 from pathlib import Path

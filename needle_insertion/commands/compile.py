@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle compile`: compile all functions for this machine, once."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

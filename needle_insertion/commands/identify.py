@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle identify`: fit parameters to recordings; write tables, JSON, parameter file and page."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
@@ -45,8 +43,7 @@ from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.quantities import quantities
 
-#: Kinds of identification.
-KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')
+KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')  #: Kinds of identification.
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle identify sensor`: noise, bias, delay and losses of a tip sensor."""
 
-from __future__ import annotations
-
 import argparse
 from math import isfinite
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle identify steering`: fit the bending of a needle that cuts its path to recordings."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from itertools import count

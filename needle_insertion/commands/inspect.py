@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle inspect`: list the contents of recordings, and the command that identifies from them."""
 
-from __future__ import annotations
-
 import argparse
 from math import isfinite
 from pathlib import Path

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle run`: start the nodes of an insertion, execute commands of a person or a script."""
 
-from __future__ import annotations
-
 import argparse
 from datetime import datetime
 from pathlib import Path

@@ -1,21 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle simulate`: simulate the needle in open loop; write a table, CSV, picture or bag."""
 
-from __future__ import annotations
-
 import argparse
 from math import sqrt
 from pathlib import Path
 from time import perf_counter
 from typing import Final
 
-from needle_dynamics import (
-    DEFAULT_NEEDLE,
-    find_needle,
-    NeedleModel,
-    NeedleParameters,
-    simulate,
-)
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
 from needle_insertion.commands.common import (
@@ -38,11 +30,9 @@ _DEFLECTION: Final = 5e-4  #: default tip deflection at the start [m], from sect
 _DURATION: Final = 1.0  #: default duration if the force does not insert the needle [s]
 _MOMENT: Final = 1e-6  #: duration of the warm-up simulation [s]
 
-#: Default insertion depth at the start [m] and default force [N].
-_DEPTH, _FORCE = 0.02, 3.0
+_DEPTH, _FORCE = 0.02, 3.0  #: Default insertion depth at the start [m] and default force [N].
 
-#: Options of a single model.
-_MODES: Final = 'modes'
+_MODES: Final = 'modes'  #: Options of a single model.
 _ONLY: Final = {
     _MODES: ('force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
     'steering': ('to', 'speed', 'motion', 'seed'),

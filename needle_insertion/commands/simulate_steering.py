@@ -43,9 +43,7 @@ def add_steering(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('model steering only')
     group.add_argument('--to', help=f'target depth (default {1e3 * TO:g}mm)', **with_unit('m'))
     group.add_argument(
-        '--speed',
-        help=f'insertion velocity (default {1e3 * SPEED:g}mm/s)',
-        **with_unit('m/s'),
+        '--speed', help=f'insertion velocity (default {1e3 * SPEED:g}mm/s)', **with_unit('m/s')
     )
     group.add_argument(
         '--motion',

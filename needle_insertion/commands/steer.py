@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle steer`: steer a simulated needle to a target, and compare with a guide at rest."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -10,12 +8,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
-from needle_controller.steering.law import (
-    build_law,
-    DEFAULT_LAW,
-    find_law,
-    STEERING_LAWS,
-)
+from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 from needle_controller.steering.simulation import (

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle study`: simulate a population of insertions on all cores or on a cluster."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor

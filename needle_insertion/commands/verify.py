@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle verify`: compute recorded runs again and compare them with the recordings."""
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence

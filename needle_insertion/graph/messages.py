@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages to and from running nodes: targets, and the status of each node."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from time import monotonic
 from typing import NamedTuple
@@ -24,12 +22,9 @@ class State(NamedTuple):
     #: 0 OK, 1 warning, 2 error.
     level: int
     message: str
-    #: Typed status of a node of the suite.
-    status: NodeStatus | None
-    #: Requests that the node accepts, and its answers.
-    requests: RequestStatus
-    #: Time of receipt by `time.monotonic` [s].
-    received: float
+    status: NodeStatus | None  #: Typed status of a node of the suite.
+    requests: RequestStatus  #: Requests that the node accepts, and its answers.
+    received: float  #: Time of receipt by `time.monotonic` [s].
 
     @property
     def age(self) -> float:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run a node of the suite as a process."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import os
 from pathlib import Path

@@ -35,14 +35,9 @@ ACTIVATE = Transition.TRANSITION_ACTIVATE
 DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
 
-#: Timeout of the start of a node, with compilation on a busy machine [s].
-_START: Final = 180.0
-
-#: Period of the requests for the state of a node [s].
-_REQUEST: Final = 0.2
-
-#: Timeout of the clean end of the nodes, before they are killed [s].
-_PATIENCE: Final = 3.0
+_START: Final = 180.0  #: Timeout of the start of a node, with compilation on a busy machine [s].
+_REQUEST: Final = 0.2  #: Period of the requests for the state of a node [s].
+_PATIENCE: Final = 3.0  #: Timeout of the clean end of the nodes, before they are killed [s].
 
 
 class Graph:
@@ -81,11 +76,7 @@ class Graph:
             os.environ.update(LOCAL)
             free = filterfalse(is_claimed, range(1, 101))
             self.domain = self._domain.enter_context(domain_id(partial(next, free)))
-        self.environment = {
-            **os.environ,
-            'ROS_DOMAIN_ID': str(self.domain),
-            END_WITH_PARENT: '1',
-        }
+        self.environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.domain), END_WITH_PARENT: '1'}
         self.context = Context()
         self.context.init(domain_id=self.domain)
         self.executor = self._executor_kind(context=self.context)
@@ -142,10 +133,7 @@ class Graph:
         return latest
 
     def start(
-        self,
-        name: str,
-        parameters: Mapping[str, object] | None = None,
-        file: Path | None = None,
+        self, name: str, parameters: Mapping[str, object] | None = None, file: Path | None = None
     ) -> NodeProcess:
         """Start a node of `NODES` as a process; `parameters` override the ROS parameter file."""
         self._logs.mkdir(parents=True, exist_ok=True)

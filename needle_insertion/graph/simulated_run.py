@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run simulated nodes in lock-step, so that the result depends on simulated time only."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -25,28 +23,21 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-#: Time before the target is sent, until all sensors have reported [s].
-WARM_UP: Final = 0.1
+WARM_UP: Final = 0.1  #: Time before the target is sent, until all sensors have reported [s].
 
 #: Timeout of the arrival of a message on a busy machine [s].
 _ARRIVAL: Final = Duration(seconds=30.0)
 
-#: Timeout of a sample on a busy machine [s].
-_STALL: Final = 60.0
-
-#: Period of the checks for the end of the run [s].
-_CHECK: Final = 0.05
+_STALL: Final = 60.0  #: Timeout of a sample on a busy machine [s].
+_CHECK: Final = 0.05  #: Period of the checks for the end of the run [s].
 
 
 class RunSample(NamedTuple):
     """A sample of the plant."""
 
-    #: [ns].
-    stamp: int
-    #: Time since the first sample [s].
-    time: float
-    #: Insertion depth [m].
-    depth: float
+    stamp: int  #: [ns].
+    time: float  #: Time since the first sample [s].
+    depth: float  #: Insertion depth [m].
 
 
 class Witness:

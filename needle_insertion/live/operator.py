@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Send requests of a person to running nodes: target, pause, retraction, stop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
@@ -23,11 +21,8 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-#: Timeout of the discovery of a node at the first request [s].
-_DISCOVERY: Final = 1.0
-
-#: Period of the checks for answers to a target [s].
-_CHECK: Final = 0.1
+_DISCOVERY: Final = 1.0  #: Timeout of the discovery of a node at the first request [s].
+_CHECK: Final = 0.1  #: Period of the checks for answers to a target [s].
 
 
 class RequestOutcome(NamedTuple):

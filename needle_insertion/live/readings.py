@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read the newest measurements of a running graph on demand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from time import time_ns
 from typing import Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Services of the nodes by operator command."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -18,8 +16,7 @@ class Request(NamedTuple):
 
     node: str
     service: str
-    #: Request of a `SetBool`; None for a `Trigger`.
-    data: bool | None = None
+    data: bool | None = None  #: Request of a `SetBool`; None for a `Trigger`.
 
 
 #: Service by command, and the request of a `SetBool`.

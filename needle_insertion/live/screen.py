@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read lines from a terminal or a script, and write lines to it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import FileIO
@@ -17,8 +15,7 @@ from needle_ros.errors import ParameterError
 
 _PROMPT: Final = 'needle> '
 
-#: Moves to the start of a line and clears it.
-_CLEAR: Final = '\r\033[K'
+_CLEAR: Final = '\r\033[K'  #: Moves to the start of a line and clears it.
 
 
 class Screen:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start nodes for a person or a script, and end them with the session."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 import os
@@ -15,12 +13,7 @@ from typing import Any, Final
 from needle_controller.hardware import BY_TYPE, HardwareSettings, Robot
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import (
-    activate_plant,
-    start_nodes,
-    WARM_UP,
-    Witness,
-)
+from needle_insertion.graph.simulated_run import activate_plant, start_nodes, WARM_UP, Witness
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
@@ -44,8 +37,7 @@ _START: Final = 180.0
 #: Commands of a script during which simulated time is paused, up to the first target.
 _AT_REST: Final = ('', 'target', 'law', 'set', 'status', 'help')
 
-#: Order in which nodes end.
-_ENDING: Final = ('steering', 'controller', 'plant', 'recorder')
+_ENDING: Final = ('steering', 'controller', 'plant', 'recorder')  #: Order in which nodes end.
 
 
 def config_file(name: str) -> Path:
@@ -70,12 +62,9 @@ class Session:
     #: Parameters by node, in the order of their start: `controller`, and optionally `recorder`,
     #: `plant` and `steering`.
     nodes: Mapping[str, Mapping[str, Any]]
-    #: ROS parameter file of all nodes; `nodes` overrides it.
-    file: Path
-    #: Folder of the node output.
-    logs: Path
-    #: Whether the plant runs in lock-step, and the nodes in its time.
-    lockstep: bool = False
+    file: Path  #: ROS parameter file of all nodes; `nodes` overrides it.
+    logs: Path  #: Folder of the node output.
+    lockstep: bool = False  #: Whether the plant runs in lock-step, and the nodes in its time.
 
 
 def run(session: Session) -> int:
@@ -117,13 +106,7 @@ def run(session: Session) -> int:
 
 
 def _bring_up(
-    session: Session,
-    graph: Graph,
-    node: Node,
-    operator: Operator,
-    screen: Screen,
-    *,
-    holds: bool,
+    session: Session, graph: Graph, node: Node, operator: Operator, screen: Screen, *, holds: bool
 ) -> tuple[list[NodeProcess], Readings]:
     """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
     begin = monotonic()

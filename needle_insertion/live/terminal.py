@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execute the commands of `needle run`, typed by a person or read from a script."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from math import inf
@@ -34,18 +32,14 @@ from needle_ros.status import (
 )
 from rclpy.task import Future
 
-#: Timeout of the first status and the first measurements of a node [s].
-_ANSWER: Final = 30.0
-
-#: Settling time of the needle after the end of the reference [s].
-_SETTLING: Final = 1.0
+_ANSWER: Final = 30.0  #: Timeout of the first status and the first measurements of a node [s].
+_SETTLING: Final = 1.0  #: Settling time of the needle after the end of the reference [s].
 
 #: Timeout of a stop [s], and velocity below which the needle rests [m/s].
 _BRAKING: Final = 2.0
 _REST: Final = 1e-4
 
-#: Timeout of the status of a node, which is published every second [s].
-_SILENT: Final = 5.0
+_SILENT: Final = 5.0  #: Timeout of the status of a node, which is published every second [s].
 
 #: Sensors without which a node rejects all targets.
 _NEEDED: Final = (
@@ -54,8 +48,7 @@ _NEEDED: Final = (
     (STEERING, TIP_DEFLECTION.name),
 )
 
-#: Shortest time between two prints of the same warning [s].
-_AGAIN: Final = 30.0
+_AGAIN: Final = 30.0  #: Shortest time between two prints of the same warning [s].
 
 _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
 _ERROR: Final = _LEVELS.index('ERROR')
@@ -65,10 +58,7 @@ _AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE, SteeringPhase.STOPPED
 
 #: Arguments and description of each command.
 WORDS: Final = {
-    'target': (
-        'DEPTH | X,Y,Z',
-        f'insert to a depth, 50mm, or steer the tip to {TARGET_HELP}',
-    ),
+    'target': ('DEPTH | X,Y,Z', f'insert to a depth, 50mm, or steer the tip to {TARGET_HELP}'),
     'wait': ('[TIME]', 'wait until the needle is at its target, at most 20s'),
     'pause': ('', 'brake to rest and hold'),
     'resume': ('', 'continue after a pause'),

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Take messages from the queue of the middleware on demand."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -40,8 +40,7 @@ _NEEDED: Final = ('mode', 'seed', 'rate', 'step', 'depth', 'force_limit', 'comma
 #: Limits that older versions of the plant did not have.
 _UNLIMITED: Final = {'force_rate_limit': 1e12, 'power_limit': 1e12}
 
-#: Messages of a topic with their recording time [ns].
-_Messages = list[tuple[int, Any]]
+_Messages = list[tuple[int, Any]]  #: Messages of a topic with their recording time [ns].
 
 
 def recorded_runs(path: Path) -> list[RecordedRun]:
@@ -123,8 +122,7 @@ class Rows(NamedTuple):
 
     numbers: NDArray[np.int64]
     stamps: NDArray[np.int64]
-    #: Shape (n, k), nan for values that an older version did not publish.
-    values: FloatArray
+    values: FloatArray  #: Shape (n, k), nan for values that an older version did not publish.
 
 
 class RecordedRun:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recompute a recorded run sample by sample, and compare it with the recording."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import ceil, isnan
 from pathlib import Path
@@ -60,8 +58,7 @@ class TopicComparison:
     #: Of the largest difference, '' if there is no difference.
     quantity: str
     unit: str
-    #: First difference beyond the tolerance.
-    first: dict[str, Any] | None
+    first: dict[str, Any] | None  #: First difference beyond the tolerance.
 
     @property
     def verdict(self) -> str:

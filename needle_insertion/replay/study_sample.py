@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute one sample of a study again and record it to a bag."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from needle_identification import BagWriter

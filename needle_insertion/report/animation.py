@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interactive animation of a needle for report pages."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

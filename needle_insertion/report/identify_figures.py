@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of identified friction and stiffness."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
 import re
@@ -60,10 +58,7 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
             np.where(fit.used, np.nan, fit.force),
             {'color': _EXCLUDED, 'linewidth': 1.2, 'linestyle': ':', 'label': _NAMED},
         ),
-        (
-            np.where(fit.used, fit.model, np.nan),
-            {'color': _FIT, 'linewidth': 1.2, 'label': 'fit'},
-        ),
+        (np.where(fit.used, fit.model, np.nan), {'color': _FIT, 'linewidth': 1.2, 'label': 'fit'}),
     ):
         above.plot(*_thinned(time, values), **style)
     _label(above, 'time [s]', 'force on the needle [N]')

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Report pages of identified friction and stiffness: results, data and warnings."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format identified parameters as text, tables for the terminal, and JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from math import isfinite

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Version, command and date of a report page."""
 
-from __future__ import annotations
-
 from contextvars import ContextVar
 from datetime import datetime, timezone
 from importlib.metadata import version

@@ -6,8 +6,6 @@ Pages load no other files, and their content security policy forbids it. The sam
 same bytes, except for the date. Templates escape all inserted text.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path

@@ -7,8 +7,6 @@ N takes seconds; Table 2 is read as kN/m, for which its last k_zz is the 0.52 of
 constants of Table 3 are the defaults of `needle_dynamics.NeedleParameters`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

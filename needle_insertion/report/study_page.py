@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the page of a study."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import ceil, floor, isfinite, log10, nan, sqrt
 from pathlib import Path

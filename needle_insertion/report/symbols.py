@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Typeset symbols in plain text, such as mu_s or q1_dot, for HTML."""
 
-from __future__ import annotations
-
 import re
 from typing import Final
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format tables and checks as text for the terminal."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Split a byte stream into OpenIGTLink messages, in bounded memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import struct
 from typing import Final, NamedTuple

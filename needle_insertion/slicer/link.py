@@ -8,8 +8,6 @@ core after a peer has closed its end, until data is sent; they read any size tha
 declares, do not verify checksums, send outdated data, and print tracebacks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from errno import EADDRINUSE, EINPROGRESS

@@ -8,8 +8,6 @@ those used by SmartNeedle (trajcontrol, and its module of 3D Slicer), where it d
 docs/howto/slicer.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from datetime import datetime, timedelta, timezone
 import re

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Present state of the needle: its measured shape, or a line to its tip."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transformation between the frame of the needle and the frame of the images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 from typing import Final

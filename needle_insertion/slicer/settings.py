@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of the connection and of targets, as parameters."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from ipaddress import AddressValueError, IPv4Address
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """States of the nodes, as lines for 3D Slicer."""
 
-from __future__ import annotations
-
 from typing import Final
 
 _PERIOD: Final = 1.0  #: time between two transmissions, unless something changes [s]

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of a bag at any time."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable
@@ -38,17 +36,14 @@ _OTHERS: Final = (contract.NEEDLE_SHAPE, contract.TIP_EXPECTED, contract.DIAGNOS
 #: Largest number of stored messages per topic; longer recordings are decimated by two.
 _MOST: Final = 8192
 
-#: Shortest pause that is a gap of a thinned signal [intervals of the thinning].
-_GAP: Final = 5.0
+_GAP: Final = 5.0  #: Shortest pause that is a gap of a thinned signal [intervals of the thinning].
 
 #: Change of the depth that is a motion of the needle [m]: above the noise of encoders.
 _MOVED: Final = 1e-4
 
-#: Difference of the durations by stamps and by arrival that is reported [s].
-_SLACK: Final = 10.0
+_SLACK: Final = 10.0  #: Difference of the durations by stamps and by arrival that is reported [s].
 
-#: Range of the playback speed, relative to real time.
-SLOWEST, FASTEST = 0.02, 50.0
+SLOWEST, FASTEST = 0.02, 50.0  #: Range of the playback speed, relative to real time.
 
 _Item = TypeVar('_Item')
 

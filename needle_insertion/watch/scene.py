@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Needle, tissue and limits for the page, from the configurations of the nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import isfinite
 from typing import Any, Final

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """State of the page: stores messages of all topics and returns frames."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Sequence
 from math import isfinite, sqrt
 from typing import Any, Final, NamedTuple

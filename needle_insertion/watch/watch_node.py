@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `watch`: subscriptions of the page, with minimum load on the other nodes."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ Register the reinforcement learning environments `NeedleInsertion-v0`, `NeedleSt
 Gymnasium finds them by ``needle_study.gym:NeedleSteering-v0`` (extra ``gym``).
 """
 
-from __future__ import annotations
-
 import gymnasium
 
 gymnasium.register(

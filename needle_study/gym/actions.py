@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check the actions of an environment."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from needle_dynamics import FloatArray

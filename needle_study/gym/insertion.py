@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle that is pushed to a depth, single or vectorized."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Final
@@ -20,15 +18,13 @@ from needle_study.gym.picture import picture
 from needle_study.gym.pushed import BOUND, FORCE, observe, push, Pushed, START, Tissues, UNITS
 import numpy as np
 
-#: Range of target depths [m].
-TARGETS: Final = (0.03, 0.12)
+TARGETS: Final = (0.03, 0.12)  #: Range of target depths [m].
 
 #: Largest relative deviation from the nominal needle, and the constants that deviate.
 SPREAD: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
 _ONE: Final = np.ones(1, dtype=bool)  #: mask of a single environment
-
 _EDGE: Final = 2e-3  #: lateral position at the upper edge of an image [m]
 
 

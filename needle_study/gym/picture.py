@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Side view of a needle in tissue as an image, without a graphics library."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

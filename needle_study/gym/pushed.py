@@ -21,8 +21,7 @@ PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
 #: Largest depth error [m] and speed [m/s] of a needle at rest at its target.
 NEAR, SLOW = 2e-4, 1e-3
 
-#: Depth at the start [m].
-START: Final = 0.02
+START: Final = 0.02  #: Depth at the start [m].
 
 #: Rewards: of the whole way to the target, of an arrival, of a needle that leaves its range, of
 #: a period, and of a period at the largest force.

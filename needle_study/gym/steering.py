@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle whose guide steers its tip."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Final
 
 import gymnasium

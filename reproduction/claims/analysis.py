@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about controllability and observability, sections 3.2.3 to 3.2.6."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from needle_dynamics import Analysis
@@ -25,10 +23,7 @@ def _analyses(deflection: float) -> tuple[Analysis, ...]:
 def _controllability() -> Finding:
     """Test state controllability by the ranks."""
     straight, bent = map(_analyses, DEFLECTIONS)
-    least, most = (
-        {one.state.rank for one in bent},
-        {one.state.rank for one in straight},
-    )
+    least, most = ({one.state.rank for one in bent}, {one.state.rank for one in straight})
     return finding(
         {
             'bent': min(least),

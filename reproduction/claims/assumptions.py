@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about model assumptions, sections 3.2.1 to 3.2.4 and 3.2.8."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import log, pi
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Claim of the paper, and the statistics for its verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
@@ -32,8 +30,7 @@ def finding(numbers: Numbers, *, always: bool, sometimes: bool = False) -> Findi
 class Claim:
     """Claim of the paper with its verdict."""
 
-    #: Short name, equal to the name of the function that computes the verdict.
-    name: str
+    name: str  #: Short name, equal to the name of the function that computes the verdict.
     #: Section of the paper, and its statement.
     section: str
     claim: str
@@ -43,8 +40,7 @@ class Claim:
     #: Evidence as text with numbers, and these numbers by name.
     evidence: str
     numbers: Numbers = field(default_factory=dict)
-    #: Test that proves the verdict, if any.
-    test: str = ''
+    test: str = ''  #: Test that proves the verdict, if any.
 
     @property
     def words(self) -> str:
@@ -63,5 +59,4 @@ class Tables:
     stiffness: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(
         default_factory=lambda: TABLE_2
     )
-    #: Number of experiments of each statistic.
-    experiments: int = EXPERIMENTS
+    experiments: int = EXPERIMENTS  #: Number of experiments of each statistic.

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about the controllers and their figures, sections 3.2.7 and 3.2.8."""
 
-from __future__ import annotations
-
 from math import exp, sqrt
 
 from needle_controller import Axis, LoopRun, Pid, PidGains, stability_limit

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about Tables 1 and 2, section 3.2.2."""
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Final
 
@@ -40,12 +38,7 @@ def _identifiable(tables: Tables) -> Finding:
     error = deviation / sqrt(tables.experiments)
     apart = abs(mean - TABLE_1['coulomb_friction'][0]) / error
     return finding(
-        {
-            'mean': mean,
-            'deviation': deviation,
-            'experiments': tables.experiments,
-            'apart': apart,
-        },
+        {'mean': mean, 'deviation': deviation, 'experiments': tables.experiments, 'apart': apart},
         always=False,
         sometimes=apart < 3.0,
     )

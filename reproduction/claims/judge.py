@@ -1,22 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute the verdicts on all claims of ``claims.yaml`` in the order of the paper."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.resources import files
 from types import ModuleType
 from typing import Any
 
 from needle_insertion.report.content import Grid, ReportSection
-from reproduction.claims import (
-    analysis,
-    assumptions,
-    control,
-    identified,
-    mismatch,
-    needle,
-)
+from reproduction.claims import analysis, assumptions, control, identified, mismatch, needle
 from reproduction.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
 from reproduction.mismatch import Mismatch
 import yaml

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about mismatch between needle and model, section 3.2.8."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from needle_controller import run_continuous
@@ -10,15 +8,7 @@ from needle_dynamics import NeedleModel
 import numpy as np
 from reproduction.claims.claim import Finding, finding
 from reproduction.mismatch import Mismatch
-from reproduction.runs import (
-    closed_loop,
-    DEFLECTION,
-    DEPTH,
-    LAWS,
-    needle,
-    paper_law,
-    RunOutcome,
-)
+from reproduction.runs import closed_loop, DEFLECTION, DEPTH, LAWS, needle, paper_law, RunOutcome
 
 
 def _informed(study: Mismatch) -> Finding:

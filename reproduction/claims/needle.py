@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on claims about the model of the needle, section 3.2.1."""
 
-from __future__ import annotations
-
 from functools import cache
 from math import pi, sqrt
 

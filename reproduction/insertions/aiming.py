@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record, check and draw a steered insertion, and the same insertion with a guide at rest."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
@@ -34,8 +32,7 @@ from reproduction.insertions.insertion import RATE, SETTLING
 TARGET: Final = (4e-3, 0.1, -2e-3)
 START: Final = 5e-3
 
-#: Insertion speed [m/s].
-SPEED: Final = 0.02
+SPEED: Final = 0.02  #: Insertion speed [m/s].
 
 #: Plant: tissue softer than the nominal model, bevel, random path deviation, EM tracker.
 PLANT: Final[dict[str, object]] = {
@@ -73,14 +70,12 @@ LARGEST_MISS: Final = 1e-3
 #: chi-squared distribution with two degrees of freedom.
 _LARGEST: Final = 13.8
 
-#: Number of frames in the animation.
-_FRAMES: Final = 80
+_FRAMES: Final = 80  #: Number of frames in the animation.
 
 #: Timeout of the insertion, and of the answer to a target, in simulated time [s].
 _LONGEST, _ANSWER = 180.0, 2.0
 
-#: Half-width of a 95 % interval over the standard deviation.
-_NORMAL: Final = 1.96
+_NORMAL: Final = 1.96  #: Half-width of a 95 % interval over the standard deviation.
 
 
 def record_aimed(
@@ -130,8 +125,7 @@ class Aimed:
     #: True and expected tip position, x and z, shape (2,) [m].
     tip: FloatArray
     expected: FloatArray
-    #: Covariance of the expected position, shape (2, 2) [m^2].
-    covariance: FloatArray
+    covariance: FloatArray  #: Covariance of the expected position, shape (2, 2) [m^2].
 
     @property
     def miss(self) -> float:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record, check and draw an insertion of a bending needle whose guide and roll move."""
 
-from __future__ import annotations
-
 from math import pi
 from pathlib import Path
 from typing import Final
@@ -43,14 +41,12 @@ PLANT: Final[dict[str, object]] = {
 JOINTS: Final = ('guide_x', 'roll')
 COURSE: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
 
-#: Least distance of the tip of a bending needle from the axis [m].
-LEAST_DEFLECTION: Final = 2e-3
+LEAST_DEFLECTION: Final = 2e-3  #: Least distance of the tip of a bending needle from the axis [m].
 
 #: Largest error of the bending length, in half-widths of the 95 % interval.
 LARGEST_DISTANCE: Final = 2.0
 
-#: Number of needles in the picture.
-DRAWN: Final = 5
+DRAWN: Final = 5  #: Number of needles in the picture.
 
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:

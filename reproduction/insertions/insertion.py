@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Record, read, check and draw a controlled insertion of the simulated needle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,14 +20,12 @@ from trajectory_msgs.msg import JointTrajectory
 #: Insertion depth at the start and at the end [m], speed [m/s], sample rate [Hz].
 START_DEPTH, TARGET_DEPTH, SPEED, RATE = 0.02, 0.12, 0.010, 1000.0
 
-#: Tip deflection at the start [m], as in the paper's simulations.
-START_DEFLECTION: Final = 5e-4
+START_DEFLECTION: Final = 5e-4  #: Tip deflection at the start [m], as in the paper's simulations.
 
 #: Topics sampled at `RATE`, whose messages are counted.
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
 
-#: Recorded time after the nominal arrival, for ramps and settling [s].
-SETTLING: Final = 1.6
+SETTLING: Final = 1.6  #: Recorded time after the nominal arrival, for ramps and settling [s].
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +36,8 @@ class RecordedInsertion:
     #: Insertion depth and its reference [m].
     depth: FloatArray
     reference: FloatArray
-    #: Tip deflection [m].
-    tip: FloatArray
-    #: Commanded force [N].
-    force: FloatArray
+    tip: FloatArray  #: Tip deflection [m].
+    force: FloatArray  #: Commanded force [N].
     #: Recorded over expected number of messages, by topic of `COUNTED`.
     completeness: dict[str, float]
 

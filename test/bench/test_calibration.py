@@ -110,12 +110,7 @@ def test_every_case_reports_its_parameters(friction: list[list[CalibrationResult
     for one in friction[0]:
         by_case.setdefault(one.case, set()).add(one.name)
     assert list(by_case) == list(calibration.FRICTION_CASES)
-    assert by_case['(15)'] == {
-        'coulomb_friction',
-        'viscous_friction',
-        'breakaway_force',
-        'lag',
-    }
+    assert by_case['(15)'] == {'coulomb_friction', 'viscous_friction', 'breakaway_force', 'lag'}
     assert 'offset' in by_case['+ offset']
     assert 'withdrawal_friction' in by_case['+ direction']
     assert {'breakaway_friction', 'stribeck_friction'} <= by_case['+ break-away']

@@ -5,11 +5,7 @@ from itertools import pairwise
 
 from benchmarks import control as bench_control
 from benchmarks.control import NumpyInverseDynamics, PERIOD
-from needle_controller import (
-    InverseDynamicsGains,
-    SampledLoop,
-    Setpoint,
-)
+from needle_controller import InverseDynamicsGains, SampledLoop, Setpoint
 from needle_dynamics import NeedleParameters
 import numpy as np
 from numpy.testing import assert_allclose

@@ -66,9 +66,7 @@ def test_separate_process_reports_time_and_memory(bag: Path) -> None:
     assert 1e7 < figures['before'] <= figures['memory'] < 1e10
 
 
-def test_missing_readers_are_reported_and_others_compared(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_missing_readers_are_reported_and_others_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_identification, 'optional', lambda _name: None)
     monkeypatch.setattr(bench_identification, 'LONGER', (1, 2))
     asked = []

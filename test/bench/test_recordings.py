@@ -51,9 +51,7 @@ def _insertion(seed: int, *, moves: bool = True) -> tuple[FloatArray, FloatArray
     nominal = NEEDLES['phantom'].needle
     tissue = tissue_of(nominal.bending_stiffness, _LENGTH)
     needle = SteeredNeedle(
-        replace(nominal, tissue_stiffness=tissue),
-        SteeringParameters(free_length=FREE),
-        tilt=_TILT,
+        replace(nominal, tissue_stiffness=tissue), SteeringParameters(free_length=FREE), tilt=_TILT
     )
     tips = [needle.tip[[0, 2]]]
     for depth, to in zip(_DEPTHS[1:].tolist(), guide[1:], strict=True):

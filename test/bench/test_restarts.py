@@ -10,14 +10,8 @@ import pytest
 @pytest.mark.parametrize(
     ('line', 'named'),
     [
-        (
-            'the insertion cannot be resumed: retract the needle to 1.00 mm first',
-            True,
-        ),
-        (
-            'the needle is at 20.00 mm and has been steered; retract it to 1.00 mm first',
-            True,
-        ),
+        ('the insertion cannot be resumed: retract the needle to 1.00 mm first', True),
+        ('the needle is at 20.00 mm and has been steered; retract it to 1.00 mm first', True),
         ('steering: target rejected: stopped: the sensor is frozen; ~/clear_stop releases', True),
         ('steering: target rejected: no joint_states received within 5 s', False),
         ('steering: no answer to target within 6 s', False),

@@ -487,11 +487,7 @@ def measured(command: list[str]) -> tuple[str, Cost]:
         'print(run.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss)\n'
     )
     run = subprocess.run(
-        [command[0], '-c', script, *command],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=ROOT,
+        [command[0], '-c', script, *command], capture_output=True, text=True, check=True, cwd=ROOT
     )
     code, duration, memory = run.stdout.split()
     lines = run.stderr.splitlines()

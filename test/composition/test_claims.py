@@ -96,9 +96,7 @@ def test_verdicts_agree_with_the_equations(found: dict[str, Claim]) -> None:
     assert len({one.claim for one in found.values()}) == len(found)
 
 
-def test_claims_are_computed_or_proved_by_an_existing_test(
-    found: dict[str, Claim],
-) -> None:
+def test_claims_are_computed_or_proved_by_an_existing_test(found: dict[str, Claim]) -> None:
     for one in found.values():
         assert bool(one.numbers) != bool(one.test), one.name
         assert bool(one.condition) == (one.verdict == ONLY_IF) or one.verdict == FAILS, one.name
@@ -496,11 +494,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
         },
         **table_2(),
         # Values of docs/analysis.md, rounded.
-        'controllability': {
-            'bent': (8, 0.0),
-            'straight': (4, 0.0),
-            'distance': (4.0e-4, 0.02),
-        },
+        'controllability': {'bent': (8, 0.0), 'straight': (4, 0.0), 'distance': (4.0e-4, 0.02)},
         # The tip of a cantilever of length s follows by 3 w / 2 s; docs/analysis.md at 20 cm.
         'inadequate': {'least': (0.0041, 0.01), 'most': (1.5 * 5e-4 / 0.02, 0.01)},
         'modes_observable': {'margin': (0.20, 0.02)},

@@ -58,11 +58,7 @@ def test_result_file_configures_the_plant(tmp_path: Path) -> None:
 @pytest.mark.parametrize('what', ['friction', 'stiffness'])
 @pytest.mark.parametrize(
     ('content', 'complaint'),
-    [
-        (None, 'does not exist'),
-        (b'not a bag at all', 'MCAP'),
-        (b'', 'MCAP'),
-    ],
+    [(None, 'does not exist'), (b'not a bag at all', 'MCAP'), (b'', 'MCAP')],
     ids=['missing', 'corrupt', 'empty'],
 )
 def test_unreadable_bags_are_reported_in_one_line(
@@ -163,9 +159,7 @@ def test_copies_of_a_bag_are_used_once(capsys: pytest.CaptureFixture[str], tmp_p
     assert len([line for line in out.splitlines() if 'friction_01' in line or 'copy' in line]) == 1
 
 
-def test_unwritable_outputs_are_reported_in_one_line(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_unwritable_outputs_are_reported_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     """An error of the operating system is reported in one line."""
     assert main(['demo', '-o', '/dev/null/demo']) == 2
     assert capsys.readouterr().err.count('\n') == 1

@@ -12,13 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.errors import InsertionDepthError
 from needle_ros.errors import ParameterError, ShapeError
-from needle_study.gym.insertion import (
-    DRAWN,
-    InsertionEnv,
-    InsertionVectorEnv,
-    SPREAD,
-    TARGETS,
-)
+from needle_study.gym.insertion import DRAWN, InsertionEnv, InsertionVectorEnv, SPREAD, TARGETS
 from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
 from needle_study.gym.steering import SteeringEnv
 import numpy as np

@@ -48,9 +48,7 @@ def miss(steered: SteeringModel, target: tuple[float, float], seed: int) -> floa
     """Steer the true needle to a target; return the distance of its tip [m]."""
     tissue = tissue_of(NEEDLE.bending_stiffness, TRUTH.length)
     steering = SteeringParameters(
-        free_length=TRUTH.free,
-        skin_stiffness=TRUTH.skin * tissue,
-        path_noise=TRUTH.path_noise,
+        free_length=TRUTH.free, skin_stiffness=TRUTH.skin * tissue, path_noise=TRUTH.path_noise
     )
     true = replace(NEEDLE, tissue_stiffness=tissue)
     needle = SteeredNeedle(true, steering, tilt=TRUTH.tilt, seed=seed)

@@ -49,9 +49,7 @@ def test_failed_job_is_reported() -> None:
     assert stream.getvalue().splitlines()[-1] == 'insertion: failed, 0 s'
 
 
-def test_terminal_line_is_updated_during_the_job(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_terminal_line_is_updated_during_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
     """The line is rewritten while the job is busy."""
     monkeypatch.setattr(progress, '_UPDATE', 0.01)
     stream = Terminal()

@@ -17,11 +17,7 @@ import pytest
 from reproduction import figures, identified, mismatch, results
 from reproduction.claims import judge
 from reproduction.command import RESULTS
-from reproduction.identified import (
-    IdentifiedTable,
-    identify_table,
-    PublishedValue,
-)
+from reproduction.identified import IdentifiedTable, identify_table, PublishedValue
 from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import _stiffness, Coverage, TruthComparison
 from support.pages import look_at

@@ -131,10 +131,7 @@ def test_message_before_disconnect_is_received(desk: Desk, stack: ExitStack) -> 
 @pytest.mark.parametrize(
     ('words', 'line'),
     [
-        (
-            b'GET / HTTP/1.1\r\n' + b'Accept: */*\r\n' * 5,
-            'refused: not OpenIGTLink',
-        ),
+        (b'GET / HTTP/1.1\r\n' + b'Accept: */*\r\n' * 5, 'refused: not OpenIGTLink'),
         (HEADER.pack(1, b'IMAGE', b'', 0, 0, 2**63, 0), 'of 9223372036854775808 bytes'),
     ],
     ids=['HTTP', 'a long image'],

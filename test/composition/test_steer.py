@@ -9,11 +9,7 @@ from typing import Any
 
 from matplotlib.image import imread
 from needle_controller import SteeringPrior
-from needle_controller.steering.simulation import (
-    GroundTruth,
-    SteppedTipErrors,
-    SteppedTipSensor,
-)
+from needle_controller.steering.simulation import GroundTruth, SteppedTipErrors, SteppedTipSensor
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, NEEDLES
 from needle_insertion.cli import main
 from needle_insertion.commands import steer

@@ -292,10 +292,7 @@ def test_default_step_is_converged() -> None:
     ('change', 'complaint'),
     [
         ({'population': {'mu_s': 1}}, "population: unknown parameter 'mu_s'; "),
-        (
-            {'population': {'target': 0.3}},
-            'target must be finite and in [0.001, 0.2] m, and',
-        ),
+        ({'population': {'target': 0.3}}, 'target must be finite and in [0.001, 0.2] m, and'),
         ({'population': {'late': {'choice': [0, -1, 2]}}}, 'finite and in [0, 100] periods'),
         (
             {'settings': {'speed': 1e-9}},

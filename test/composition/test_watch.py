@@ -307,9 +307,7 @@ def stamped(path: Path, times: np.ndarray, received: np.ndarray) -> ShownRecordi
         for time, at in zip(times, received, strict=True):
             stamp = EPOCH + round(1e9 * time)
             bag.write(
-                '/joint_states',
-                write(stamp, 0.01 * time, *[0.0] * 5),
-                EPOCH + round(1e9 * at),
+                '/joint_states', write(stamp, 0.01 * time, *[0.0] * 5), EPOCH + round(1e9 * at)
             )
     return ShownRecording(path)
 

@@ -19,10 +19,7 @@ NOMINAL = Axis.insertion(PHANTOM)
 
 FORCES = st.lists(st.floats(-15.0, 15.0), min_size=1, max_size=60)
 AXES = st.builds(
-    Axis,
-    inertia=st.floats(1e-3, 2.0),
-    viscous=st.floats(0.0, 500.0),
-    coulomb=st.floats(0.0, 2.0),
+    Axis, inertia=st.floats(1e-3, 2.0), viscous=st.floats(0.0, 500.0), coulomb=st.floats(0.0, 2.0)
 )
 
 

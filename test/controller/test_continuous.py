@@ -145,10 +145,7 @@ def test_law_with_another_nominal_needle() -> None:
 
 
 def sampled_end(
-    kind: str,
-    gains: tuple[InverseDynamicsGains | PidGains, ...],
-    period: float,
-    duration: float,
+    kind: str, gains: tuple[InverseDynamicsGains | PidGains, ...], period: float, duration: float
 ) -> FloatArray:
     """Run the sampled loop around the true needle; return its state at the end."""
     p = MODEL.parameters
@@ -186,10 +183,7 @@ def test_sampled_law_converges_to_the_continuous_law(kind: str) -> None:
     law: ContinuousInverseDynamics | ContinuousPid
     if kind == 'inverse_dynamics':
         law = ContinuousInverseDynamics(
-            model=MODEL,
-            kp=np.full(2, 900.0),
-            kv=np.full(2, 60.0),
-            breakaway_speed=1e-4,
+            model=MODEL, kp=np.full(2, 900.0), kv=np.full(2, 60.0), breakaway_speed=1e-4
         )
     else:
         gains = PID_GAINS

@@ -173,10 +173,7 @@ def test_unknown_law_is_rejected_with_valid_names() -> None:
 @pytest.mark.parametrize(
     ('gains', 'reason'),
     [
-        (
-            {'lqr': {'insertion': PidGains()}},
-            'unknown gains lqr.insertion; valid: adaptive',
-        ),
+        ({'lqr': {'insertion': PidGains()}}, 'unknown gains lqr.insertion; valid: adaptive'),
         ({'pid': {'deflection': PidGains()}}, 'with insertion and rotation'),
         ({'pid': {'rotation': InverseDynamicsGains()}}, 'pid.rotation must be PidGains'),
     ],

@@ -10,8 +10,7 @@ import pytest
 
 @pytest.mark.requirement('S-082')
 @pytest.mark.parametrize(
-    ('rate', 'late', 'said'),
-    [(1000, 40, False), (1000, 60, True), (20, 2, False), (20, 10, True)],
+    ('rate', 'late', 'said'), [(1000, 40, False), (1000, 60, True), (20, 2, False), (20, 10, True)]
 )
 def test_more_than_five_percent_late_commands_give_a_warning(
     rate: int, late: int, said: bool

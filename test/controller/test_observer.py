@@ -50,11 +50,7 @@ def ns(time: float) -> int:
 STEP, SPEED = 2e-5, 0.008
 
 #: Needle without a lateral force at the tip, and sensor without offset, as in the plant.
-NO_LOADS: dict[str, Any] = {
-    'tip_force': 0.0,
-    'force_offset': 0.0,
-    'torque_offset': 0.0,
-}
+NO_LOADS: dict[str, Any] = {'tip_force': 0.0, 'force_offset': 0.0, 'torque_offset': 0.0}
 
 #: Least depth at which n modes are distinguishable.
 LEAST_DEPTH = {1: 0.001, 2: 0.001, 3: 0.03}
@@ -943,10 +939,7 @@ readings = st.floats(-1e-3, 1e-3)
 
 
 def watch(
-    tips: list[tuple[float, float]],
-    sign: float = 1.0,
-    origin: int = 0,
-    at_once: bool = True,
+    tips: list[tuple[float, float]], sign: float = 1.0, origin: int = 0, at_once: bool = True
 ) -> Observer:
     """Forty samples with an artificial wrench; tips at their time, or at the end."""
     observer = Observer(phantom(), ObserverSettings(), PERIOD)

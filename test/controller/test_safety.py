@@ -4,13 +4,7 @@
 from math import inf, nan
 from typing import Any
 
-from needle_controller import (
-    ControllerSettings,
-    Guard,
-    InputMonitor,
-    Measurement,
-    SafetyLimits,
-)
+from needle_controller import ControllerSettings, Guard, InputMonitor, Measurement, SafetyLimits
 from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.safety import Safety
 from needle_dynamics import NeedleParameters, ParameterError

@@ -10,13 +10,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_controller import (
-    Controller,
-    ForceCommand,
-    Measurement,
-    ObserverSettings,
-    SafetyLimits,
-)
+from needle_controller import Controller, ForceCommand, Measurement, ObserverSettings, SafetyLimits
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
@@ -206,9 +200,7 @@ def test_valid_measurements_restart_the_motion_after_faults(
 
 
 @given(st.lists(st.sampled_from(EVENTS[:21]), max_size=30))
-def test_zero_force_without_a_target(
-    happens: list[Callable[[Loop], ForceCommand | None]],
-) -> None:
+def test_zero_force_without_a_target(happens: list[Callable[[Loop], ForceCommand | None]]) -> None:
     """For any events except a target or a trajectory; a measurement still has an answer."""
     loop = Loop(target=None)
     assert all(answer.force == 0.0 for event in happens if (answer := event(loop)) is not None)
@@ -495,9 +487,7 @@ def test_force_above_eulers_load_gives_a_warning() -> None:
 
 
 @pytest.mark.parametrize('what', ['target', 'trajectory'])
-def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(
-    what: str,
-) -> None:
+def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(what: str) -> None:
     """The commands are equal if it arrives before or after the sample of its stamp."""
 
     def run(before: int) -> list[ForceCommand | None]:

@@ -15,12 +15,7 @@ from needle_dynamics import (
     ParameterError,
     ShapeError,
 )
-from needle_dynamics.analysis import (
-    analyze,
-    controllability,
-    controllability_map,
-    observability,
-)
+from needle_dynamics.analysis import analyze, controllability, controllability_map, observability
 from needle_dynamics.linearization import linearize, LinearSystem, operating_point, StuckError
 import numpy as np
 from numpy.testing import assert_allclose

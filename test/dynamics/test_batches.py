@@ -137,9 +137,7 @@ def test_keep_false_returns_only_the_final_state() -> None:
 
 
 @pytest.mark.parametrize('workers', [1, 2])
-def test_run_outside_its_range_is_nan_without_effect_on_others(
-    workers: int,
-) -> None:
+def test_run_outside_its_range_is_nan_without_effect_on_others(workers: int) -> None:
     """One run is pulled out of the tissue; its earlier samples and the other runs stay valid."""
     p = preset('paper_si')
     states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004, 0.06)])

@@ -304,12 +304,7 @@ def test_tare_requires_100_ms_at_rest(rate: float, needed: int) -> None:
 
 @pytest.mark.parametrize(
     ('own', 'rate', 'fits'),
-    [
-        (8000.0, 3000.0, 6000),
-        (8000.0, 300.0, 7800),
-        (500.0, 1000.0, 8000),
-        (1e-9, 1.0, 8000),
-    ],
+    [(8000.0, 3000.0, 6000), (8000.0, 300.0, 7800), (500.0, 1000.0, 8000), (1e-9, 1.0, 8000)],
 )
 def test_internal_rate_must_be_a_multiple_of_the_reading_rate(
     own: float, rate: float, fits: int

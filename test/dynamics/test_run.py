@@ -26,15 +26,9 @@ import pytest
 #: A stamp with more digits than a float can hold to the nanosecond.
 BEGIN = 1_700_000_000_123_456_789
 #: The period is not a whole number of nanoseconds.
-VALUES: dict[str, Any] = {
-    'needle': 'phantom',
-    'depth': 0.1,
-    'rate': 300.0,
-    'sensor.rate': 6000.0,
-}
+VALUES: dict[str, Any] = {'needle': 'phantom', 'depth': 0.1, 'rate': 300.0, 'sensor.rate': 6000.0}
 COURSE = Event(
-    TRAJECTORY,
-    {'joints': ['insertion'], 'times': [0.1], 'positions': [[0.101]], 'efforts': [[]]},
+    TRAJECTORY, {'joints': ['insertion'], 'times': [0.1], 'positions': [[0.101]], 'efforts': [[]]}
 )
 
 

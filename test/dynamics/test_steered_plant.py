@@ -8,13 +8,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import (
-    Insertion,
-    InsertionDepthError,
-    JobError,
-    ParameterError,
-    SteeredNeedle,
-)
+from needle_dynamics import Insertion, InsertionDepthError, JobError, ParameterError, SteeredNeedle
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.measured import Measurement
@@ -46,12 +40,7 @@ def course(seconds: float, **ends: float) -> Event:
     """Return a trajectory of one point."""
     return Event(
         TRAJECTORY,
-        {
-            'joints': [*ends],
-            'times': [seconds],
-            'positions': [[*ends.values()]],
-            'efforts': [[]],
-        },
+        {'joints': [*ends], 'times': [seconds], 'positions': [[*ends.values()]], 'efforts': [[]]},
     )
 
 

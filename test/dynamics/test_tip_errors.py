@@ -122,10 +122,7 @@ def test_rms_of_each_field_in_a_large_space() -> None:
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    point=st.tuples(*[st.floats(-0.2, 0.2)] * 3),
-    step=st.tuples(*[st.floats(-1e-5, 1e-5)] * 3),
-)
+@given(point=st.tuples(*[st.floats(-0.2, 0.2)] * 3), step=st.tuples(*[st.floats(-1e-5, 1e-5)] * 3))
 def test_distortion_is_fixed_and_smooth(
     point: tuple[float, float, float], step: tuple[float, float, float]
 ) -> None:

@@ -371,10 +371,7 @@ def test_break_away_threshold_is_exact(
 ) -> None:
     """At rest friction balances the break-away force of its direction, but not 1e-9 more."""
     p = preset(
-        'paper_si',
-        friction_law=law,
-        breakaway_friction=breakaway,
-        withdrawal_friction=withdrawal,
+        'paper_si', friction_law=law, breakaway_friction=breakaway, withdrawal_friction=withdrawal
     )
     model = NeedleModel(p)
     bound = sign * 0.56 * breakaway * (withdrawal if sign < 0.0 else 1.0)

@@ -21,17 +21,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
-from support.samples import (
-    EPOCH,
-    header,
-    joint_states,
-    MOTION,
-    STORE,
-    TEXT,
-    text,
-    WRENCH,
-    wrench,
-)
+from support.samples import EPOCH, header, joint_states, MOTION, STORE, TEXT, text, WRENCH, wrench
 
 MILLISECOND = 1_000_000
 POSE = 'geometry_msgs/msg/PoseStamped'

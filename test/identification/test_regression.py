@@ -28,10 +28,7 @@ def problem(
 
 
 def extras(n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)) -> dict[str, Any]:
-    return {
-        'groups': np.arange(n) % 4,
-        'regressor_noise': np.array(noise),
-    }
+    return {'groups': np.arange(n) % 4, 'regressor_noise': np.array(noise)}
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)

@@ -56,9 +56,7 @@ def test_unknown_argument_is_rejected(ros_graph: RosGraph) -> None:
     assert 'unknown: rate:=500; set parameters with --ros-args -p NAME:=VALUE' in said
 
 
-def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(
-    ros_graph: RosGraph,
-) -> None:
+def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(ros_graph: RosGraph) -> None:
     """One line has needle, rate and topics. The exit status is 0 for any number of Ctrl-C."""
     came = ros_graph.listen(ros_graph.node('probe'), JointState, 'joint_states', SENSOR)
     node = started(ros_graph, 'plant', '--ros-args', '-p', 'rate:=500.0')

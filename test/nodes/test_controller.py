@@ -294,9 +294,7 @@ def test_zero_force_for_stale_future_and_missing_stamps(
 
 
 @pytest.mark.requirement('S-069')
-def test_target_is_discarded_if_the_needle_moved_during_a_fault(
-    ros_graph: RosGraph,
-) -> None:
+def test_target_is_discarded_if_the_needle_moved_during_a_fault(ros_graph: RosGraph) -> None:
     """A needle at another depth is not pushed towards the previous target."""
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
@@ -711,12 +709,7 @@ def test_motion_continues_without_optional_sensors(ros_graph: RosGraph) -> None:
 @pytest.mark.requirement('S-073')
 def test_missing_required_sensors_cause_a_stop(ros_graph: RosGraph) -> None:
     bench = Bench(
-        ros_graph,
-        **{
-            'safety.sensor_timeout': 0.3,
-            'safety.sensors_required': True,
-            **LIGHT,
-        },
+        ros_graph, **{'safety.sensor_timeout': 0.3, 'safety.sensors_required': True, **LIGHT}
     )
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -755,9 +748,7 @@ def test_commands_have_the_stamp_of_the_measurement(ros_graph: RosGraph) -> None
     assert (last.sec, last.nanosec) > (stamp.sec, stamp.nanosec)
 
 
-def test_repeated_measurement_after_a_stop_gets_zero_force(
-    ros_graph: RosGraph,
-) -> None:
+def test_repeated_measurement_after_a_stop_gets_zero_force(ros_graph: RosGraph) -> None:
     """The previous force is not sent again."""
     bench = Bench(ros_graph, measurement_timeout=5.0)
     bench.aim(0.1)

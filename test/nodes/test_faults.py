@@ -169,8 +169,7 @@ def test_lost_and_reordered_measurements_are_tolerated(
 @pytest.mark.requirement('S-073')
 @pytest.mark.parametrize('topic', ['base_wrench', 'tip_deflection'])
 @pytest.mark.parametrize(
-    ('kind', 'values'),
-    [('drop', {}), ('freeze', {}), ('nan', {}), ('delay', {'delay': 5.0})],
+    ('kind', 'values'), [('drop', {}), ('freeze', {}), ('nan', {}), ('delay', {'delay': 5.0})]
 )
 def test_motion_continues_without_bending_sensors(
     ros_graph: RosGraph, kind: str, values: dict[str, float], topic: str
@@ -322,10 +321,7 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     loop.until(lambda: list(bag.glob('*.mcap')) and loop.depth, 'the bag')
     size = 200_000
     resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
-    loop.until(
-        lambda: any('File too large' in one.failure for one in reports),
-        'the report',
-    )
+    loop.until(lambda: any('File too large' in one.failure for one in reports), 'the report')
     recorder.check()
     (file,) = bag.glob('*.mcap')
     read = Bag(file)

@@ -352,10 +352,7 @@ def test_position_robot_holds_its_measured_position_after_a_stop(ros_graph: RosG
 def test_wrong_frame_is_reported(ros_graph: RosGraph) -> None:
     """With the expected frame."""
     bench = Bench(ros_graph, hardware__wrench_frame='tool0')
-    bench.until(
-        lambda: bench.input('base_wrench').rejected.get('frame'),
-        'the rejection',
-    )
+    bench.until(lambda: bench.input('base_wrench').rejected.get('frame'), 'the rejection')
     assert bench.taken('base_wrench') == 0
 
 
@@ -600,10 +597,7 @@ def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
 @pytest.mark.requirement('S-111')
 @pytest.mark.parametrize(
     ('stamps', 'said'),
-    [
-        ('header', 'joint_states is stale: it is not stamped'),
-        ('receive', 'active'),
-    ],
+    [('header', 'joint_states is stale: it is not stamped'), ('receive', 'active')],
 )
 def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, said: str) -> None:
     """They are rejected unless the time of arrival is configured."""

@@ -134,8 +134,7 @@ def test_node_parses_any_message(
     assert node.invalid['words'] == len(JUNK)
     reports = ros_graph.statuses(teller, NodeStatus)
     ros_graph.spin_until(
-        lambda: any(one.invalid_messages == {'words': len(JUNK)} for one in reports),
-        'the count',
+        lambda: any(one.invalid_messages == {'words': len(JUNK)} for one in reports), 'the count'
     )
 
 

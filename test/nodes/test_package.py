@@ -166,13 +166,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folders = ('config', 'description', 'launch', 'resource', 'scripts', 'test', 'tools')
     for name in (*OWN, *folders):
         shutil.copytree(ROOT / name, folder / name)
-    for name in (
-        'README.md',
-        'package.xml',
-        'setup.py',
-        'pyproject.toml',
-        'colcon.pkg',
-    ):
+    for name in ('README.md', 'package.xml', 'setup.py', 'pyproject.toml', 'colcon.pkg'):
         shutil.copy(ROOT / name, folder)
     return folder
 

@@ -304,10 +304,7 @@ def test_invalid_parameters_end_the_process(
             {'lockstep': True, 'mode': 'robot'},
             'lockstep must be false except in mode simulation, where commands answer samples, got',
         ),
-        (
-            {'rate': 5.0},
-            'command_timeout must be at least a period, 0.2 s, got 0.1 s',
-        ),
+        ({'rate': 5.0}, 'command_timeout must be at least a period, 0.2 s, got 0.1 s'),
         ({'fault.kind': 'bad luck'}, 'fault.kind must be one of none, drop, delay, duplicate'),
         ({'fault.topic': 'clock'}, 'fault.topic must be one of joint_states, base_wrench'),
         (

@@ -404,8 +404,7 @@ def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     reports = ros_graph.statuses(probe, RecorderStatus)
     publish(ros_graph, probe, 50)
     ros_graph.spin_until(
-        lambda: any(one.recorded.get('/text') == 50 for one in reports),
-        'messages',
+        lambda: any(one.recorded.get('/text') == 50 for one in reports), 'messages'
     )
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()

@@ -39,10 +39,7 @@ MISTAKES = [
     ('pause now', 'pause takes nothing, got now'),
     ('set controller force_limit', 'set takes NODE NAME VALUE, got controller force_limit'),
     ('set nobody x 1', 'nobody x = 1: no node nobody'),
-    (
-        'set controller force_limt 3',
-        "unknown parameter 'force_limt'; did you mean 'force_limit'?",
-    ),
+    ('set controller force_limt 3', "unknown parameter 'force_limt'; did you mean 'force_limit'?"),
     ('set controller force_limit 3', 'force_limit: cannot change while configured'),
     ("target '0.05", 'no closing quotation'),
     ('set plant fault.kind "[1, {"', 'is not a value in YAML'),
@@ -142,10 +139,7 @@ def test_script_ends_at_a_rejected_target(ros_graph: RosGraph, tmp_path: Path) -
 def test_robot_replaces_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
     ros_graph.add(PlantNode, parameters={'rate': 200.0, 'depth': 0.02})
     status, said, complained = told(
-        ros_graph,
-        tmp_path / 'run',
-        ['target 22mm', 'wait 100'],
-        '--hardware',
+        ros_graph, tmp_path / 'run', ['target 22mm', 'wait 100'], '--hardware'
     )
     assert (status, complained) == (0, ''), said
     assert 'starting recorder, controller\n' in said

@@ -64,10 +64,7 @@ class Watcher:
         self.graph = graph
         self.samples: list[Sample] = []
         graph.node('watcher').create_subscription(
-            JointState,
-            'joint_states',
-            lambda message: self.samples.append(read(message)),
-            SENSOR,
+            JointState, 'joint_states', lambda message: self.samples.append(read(message)), SENSOR
         )
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
@@ -350,11 +347,7 @@ CAUSES: Mapping[str, tuple[Callable[[Session], object], int, str]] = {
     ),
     'killed plant': (kill('plant'), 1, r'error: plant ended early with status -9.*'),
     'killed recorder': (kill('recorder'), 1, r'error: recorder ended early with status -9.*'),
-    'full disk': (
-        fill_disk,
-        1,
-        r'error: recorder: recording to .* stopped: File too large',
-    ),
+    'full disk': (fill_disk, 1, r'error: recorder: recording to .* stopped: File too large'),
 }
 
 

@@ -383,9 +383,7 @@ def test_faults_may_be_set_and_cleared_while_active(ros_graph: RosGraph) -> None
     assert bench.status.sensor_fault == ''
 
 
-def test_delayed_reading_keeps_its_stamp_after_a_stall(
-    ros_graph: RosGraph,
-) -> None:
+def test_delayed_reading_keeps_its_stamp_after_a_stall(ros_graph: RosGraph) -> None:
     """A stall drops samples, and time jumps: stamps follow."""
     bench = Bench(ros_graph, **{'tip.delay': 0.1})
     bench.further(40)

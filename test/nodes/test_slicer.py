@@ -15,13 +15,7 @@ from typing import Any
 
 from benchmarks.igtl_peer import free_port, Peer, Told
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import (
-    PointStamped,
-    Pose,
-    PoseArray,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-)
+from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.slicer.needle import LINE, MEASURED
 from needle_insertion.slicer.registration import Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
@@ -34,13 +28,7 @@ from sensor_msgs.msg import JointState
 from support.ros_graph import RosGraph
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
-PLANT = {
-    'needle': 'bending_35mm',
-    'steered': True,
-    'mode': 'robot',
-    'rate': 200.0,
-    'depth': 0.06,
-}
+PLANT = {'needle': 'bending_35mm', 'steered': True, 'mode': 'robot', 'rate': 200.0, 'depth': 0.06}
 HALF = float(np.sqrt(0.5))
 REGISTRATION = Registration(rotation=(HALF, 0.0, 0.0, HALF), translation=(0.01, -0.02, 0.03))
 IMAGES = {

@@ -125,8 +125,7 @@ class Bench:
         """Send a target when the sensors are available, and wait for the answer."""
         self.until(lambda: self.target.get_subscription_count() >= self.takers, 'the subscriber')
         self.until(
-            lambda: all(map(self.accepted, ('joint_states', 'tip_deflection'))),
-            'the sensors',
+            lambda: all(map(self.accepted, ('joint_states', 'tip_deflection'))), 'the sensors'
         )
         self.send(point)
         self.until(
@@ -235,8 +234,7 @@ def test_steered_controller_follows_the_node(ros_graph: RosGraph, continuous: bo
     )
     bench.takers = 2
     bench.until(
-        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING,
-        'the controller',
+        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING, 'the controller'
     )
     bench.aim()
     assert bench.end() is SteeringPhase.DONE
@@ -333,9 +331,7 @@ def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
     bench.until(lambda: job.done, 'the end of the thread')
 
 
-def test_rejected_motion_stops_the_insertion(
-    ros_graph: RosGraph,
-) -> None:
+def test_rejected_motion_stops_the_insertion(ros_graph: RosGraph) -> None:
     """The controller allows 10 mm/s, and `steering` requests 50 mm/s."""
     time: dict[str, Any] = {'use_sim_time': True}
     bench = Bench(ros_graph, mode='simulation', **time)
@@ -351,8 +347,7 @@ def test_rejected_motion_stops_the_insertion(
     )
     bench.takers = 2
     bench.until(
-        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING,
-        'the controller',
+        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING, 'the controller'
     )
     bench.aim()
     assert bench.end() is SteeringPhase.STOPPED

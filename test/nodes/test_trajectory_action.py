@@ -403,10 +403,7 @@ ENDS: dict[str, tuple[Callable[[ActionBench], object], str]] = {
         lambda b: _transition(b, Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP),
         'is not active',
     ),
-    'shutdown': (
-        lambda b: _transition(b, Transition.TRANSITION_ACTIVE_SHUTDOWN),
-        'is not active',
-    ),
+    'shutdown': (lambda b: _transition(b, Transition.TRANSITION_ACTIVE_SHUTDOWN), 'is not active'),
 }
 
 

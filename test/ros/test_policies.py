@@ -102,10 +102,7 @@ def test_goals_are_accepted_from_operator_and_steering_only() -> None:
         'recorder'
     }
     called = {node: profile.call for node, profile in POLICY.items() if profile.call}
-    assert called == {
-        OPERATOR: frozenset().union(*offered.values()),
-        'steering': offered['plant'],
-    }
+    assert called == {OPERATOR: frozenset().union(*offered.values()), 'steering': offered['plant']}
 
 
 @pytest.mark.requirement('S-241')

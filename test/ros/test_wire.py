@@ -99,9 +99,7 @@ def test_template_round_trip_matches_rosbags(
 
 
 DESCRIPTIONS = strategies.tuples(
-    TEXTS,
-    strategies.lists(TEXTS, max_size=3),
-    strategies.tuples(*[strategies.integers(0, 3)] * 3),
+    TEXTS, strategies.lists(TEXTS, max_size=3), strategies.tuples(*[strategies.integers(0, 3)] * 3)
 )
 
 

@@ -23,15 +23,7 @@ from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from support.steered_robot import (
-    CONTINUOUS,
-    NAMES,
-    PERIOD,
-    Robot,
-    SECOND,
-    SETTINGS,
-    TARGET,
-)
+from support.steered_robot import CONTINUOUS, NAMES, PERIOD, Robot, SECOND, SETTINGS, TARGET
 
 
 @settings(max_examples=50, deadline=None)
@@ -307,11 +299,7 @@ def test_faults_stop_a_continuous_insertion_with_a_message(
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    speed=st.floats(1e-3, 0.05),
-    acceleration=st.floats(0.01, 1.0),
-    way=st.floats(5e-4, 0.1),
-)
+@given(speed=st.floats(1e-3, 0.05), acceleration=st.floats(0.01, 1.0), way=st.floats(5e-4, 0.1))
 def test_axis_law_with_the_same_limits_accepts_every_motion(
     speed: float, acceleration: float, way: float
 ) -> None:
@@ -587,8 +575,7 @@ numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)
     continuous=st.booleans(),
 )
 def test_motions_stay_within_limits_for_any_input(
-    said: list[tuple[str, tuple[float, float, float]]],
-    continuous: bool,
+    said: list[tuple[str, tuple[float, float, float]]], continuous: bool
 ) -> None:
     """Each motion ends within guide limit and target depth, never NaN."""
     robot = Robot(

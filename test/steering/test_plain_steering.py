@@ -35,12 +35,7 @@ MODELS = {
 class Plain:
     """The formulas of the controller in NumPy; without detection of faults."""
 
-    def __init__(
-        self,
-        model: SteeringModel,
-        target: FloatArray,
-        limits: SteeringLimits,
-    ) -> None:
+    def __init__(self, model: SteeringModel, target: FloatArray, limits: SteeringLimits) -> None:
         limit = limits.guide_limit
         self.model, self.goal, self.limit = model, complex(*target), limit
         self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0

@@ -21,13 +21,7 @@ from needle_controller.steering.planning import (
 )
 from needle_ros.contract import INSERTION, JOINT_TRAJECTORY, Stamp, TARGET, TOPICS
 from needle_ros.errors import JobError
-from needle_ros.requests import (
-    Acknowledgement,
-    PendingRequest,
-    RequestLog,
-    RequestStatus,
-    Verdict,
-)
+from needle_ros.requests import Acknowledgement, PendingRequest, RequestLog, RequestStatus, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.system_state import Mode, PAUSE, RESUME, STOP
 import numpy as np
@@ -445,7 +439,7 @@ def test_stale_request_is_rejected(age: float, frame: str, reason: str) -> None:
         ),
         max_size=20,
         unique_by=lambda one: one[0],
-    ),
+    )
 )
 def test_status_values_round_trip(answers: list[tuple[int, Verdict, str]]) -> None:
     """Its latest answers, for any reasons; other values are ignored."""

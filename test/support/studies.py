@@ -13,10 +13,7 @@ import yaml
 
 
 def check_refused(
-    document: Mapping[str, Any],
-    complaint: str,
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
+    document: Mapping[str, Any], complaint: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Check that a study is rejected in one line with the file name, without output files."""
     file = folder / 'study.yaml'

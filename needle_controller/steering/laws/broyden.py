@@ -12,8 +12,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from math import sin
 from typing import Final
 
@@ -25,8 +23,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.optimize import lsq_linear
 
-#: Fraction of a prediction error that corrects the matrix.
-_ALPHA: Final = 0.65
+_ALPHA: Final = 0.65  #: Fraction of a prediction error that corrects the matrix.
 
 #: Depth from which tissue holds the needle [m]; the guide is fixed before.
 _FIXED_BELOW: Final = 0.02

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of laws that compute the guide from the newest tip measurement."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
@@ -31,11 +29,7 @@ class GuideLaw(ABC):
     warning = ''
 
     def __init__(
-        self,
-        model: SteeringModel,
-        target: ArrayLike,
-        limits: SteeringLimits,
-        roll: float = 0.0,
+        self, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
     ) -> None:
         self.depths, self.limits = model.depths, limits
         self.turns, self.roll = limits.turns, checked_roll(roll)

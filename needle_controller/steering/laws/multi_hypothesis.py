@@ -29,8 +29,6 @@ own roll of the tip, :math:`\max(\phi - d, \min(\phi + d, \varphi))` after a rol
 to :math:`\phi`, with the previous roll of the tip :math:`\varphi` and the lag :math:`d`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from math import cos, nan, sin
 from typing import NamedTuple
@@ -139,11 +137,7 @@ class MultiHypothesisLaw(SteeringLaw):
     """
 
     def __init__(
-        self,
-        model: SteeringModel,
-        target: ArrayLike,
-        limits: SteeringLimits,
-        roll: float = 0.0,
+        self, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
     ) -> None:
         roll, limit, turns = checked_roll(roll), limits.guide_limit, limits.turns
         if limit == 0.0 and turns == 0:

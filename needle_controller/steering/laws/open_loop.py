@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steering law with a fixed guide, for comparison."""
 
-from __future__ import annotations
-
 from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_dynamics.arrays import FloatArray
 

@@ -12,8 +12,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from math import atan2, pi, remainder, tau
 
 from needle_controller.steering.laws.guide_law import GuideLaw

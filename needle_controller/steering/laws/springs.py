@@ -11,8 +11,6 @@ References
 
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from needle_controller.steering.laws.guide_law import GuideLaw
@@ -21,8 +19,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.steering.reference_models import springs
 import numpy as np
 
-#: Least response of the springs that is inverted.
-_LEAST: Final = 1e-3
+_LEAST: Final = 1e-3  #: Least response of the springs that is inverted.
 
 
 class SpringsLaw(GuideLaw):
