@@ -49,7 +49,7 @@ class NeedleModel(NeedleStatics):
     Attributes
     ----------
     parameters : NeedleParameters
-        Constants, SI units. To pass friction or tissue objects, see `NeedleParameters.using`.
+        Constants, SI units.
 
     Examples
     --------
@@ -238,44 +238,6 @@ class NeedleModel(NeedleStatics):
         drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else forces[0]
         forces[0] = -forces[0] + self.friction.force(-now.d_rate, drive)
         return np.asarray(forces)
-
-    def base_reaction(
-        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
-    ) -> FloatArray:
-        """
-        Return the base reaction on the needle from the momentum balance of the inserted part.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        force : float
-            Insertion force on the carriage [N], positive into the tissue.
-        torque : float
-            Torque on the carriage [N m].
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (3,)
-            Axial force along y [N], lateral force along z [N], moment about x at the base [N m].
-
-        """
-        p, tissue, now = self.parameters, self.tissue, self._instant(state, time)
-        acceleration = self._acceleration(now, force, torque)
-        layer, layers = tissue.layer(now.depth), self.layers
-        integrals = np.array([now.at.area, now.at.moment])
-        above = np.array([layers.area[layer], layers.moment[layer]])
-        elastic = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
-        # The entering part carries the momentum of the tip, with the depth as lever arm.
-        entering = -now.d_rate * (now.at.value @ now.rate) * np.array([1.0, now.depth])
-        inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
-        lateral, about_entry = (
-            inertia + elastic @ now.modal + p.tissue_damping * integrals @ now.rate
-        )
-        axial = force + p.carriage_mass * acceleration[0]
-        return np.array([axial, lateral, about_entry + now.state[0] * lateral + torque])
 
     def derivative(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0

@@ -162,23 +162,6 @@ class ModeShapes:
         mode_integrals(tables, float(depth), np.empty(tables.series.shape[1] + 4 * n), at)
         return at
 
-    def condition(self, depth: float) -> float:
-        """
-        Return the condition number of G, which measures how well the modes are distinguishable.
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth s [m].
-
-        Returns
-        -------
-        float
-            cond(G), 1 for a fully inserted needle.
-
-        """
-        return float(np.linalg.cond(self.integrals(depth).gram))
-
     @cached_property
     def tables(self) -> ModeTables:
         """Series and constants for the compiled evaluation of the integrals."""

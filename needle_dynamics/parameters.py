@@ -228,61 +228,6 @@ class NeedleParameters:
 
         return from_values(cls, {**asdict(find_needle(name).needle), **changes})
 
-    def using(
-        self, *, friction: Friction | None = None, tissue: Tissue | None = None
-    ) -> NeedleParameters:
-        """
-        Return these constants with another friction or tissue object.
-
-        Parameters
-        ----------
-        friction : Friction, optional
-            Friction along the insertion axis.
-        tissue : Tissue, optional
-            Tissue along the needle.
-
-        Returns
-        -------
-        NeedleParameters
-            Constants whose `friction` and `tissue` equal the given objects.
-
-        Raises
-        ------
-        ParameterError
-            If an object has another class. The integrator step is compiled: it supports only the
-            laws of `Friction` and the layers of `Tissue`, and cannot call Python objects.
-
-        Examples
-        --------
-        >>> from needle_dynamics import Friction
-        >>> measured = Friction(law='stribeck', coulomb=0.4, viscous=120.0, breakaway=1.5)
-        >>> NeedleParameters.preset('phantom').using(friction=measured).breakaway_friction
-        1.5
-
-        """
-        changes: dict[str, Any] = {}
-        if friction is not None:
-            if not isinstance(friction, Friction):
-                raise ParameterError(
-                    f'friction must be a Friction, since only its laws '
-                    f'({", ".join(LAW_NUMBERS)}) are compiled, got {friction!r}'
-                )
-            changes = {name: getattr(friction, of) for of, name in _FRICTION_FIELDS.items()}
-        if tissue is not None:
-            if not isinstance(tissue, Tissue):
-                raise ParameterError(
-                    f'tissue must be a Tissue, since only its layers are compiled, got {tissue!r}'
-                )
-            changes |= {
-                'tissue_stiffness': tissue.stiffnesses[0],
-                'layer_depths': tissue.starts[1:],
-                'layer_stiffnesses': tissue.stiffnesses[1:],
-                'tissue_damping': tissue.damping,
-                'swelling': tissue.swelling,
-                'swelling_time': tissue.swelling_time,
-            }
-        return replace(self, **changes)
-
 
 #: Field of `NeedleParameters` by field of `Friction`.
 _FRICTION_FIELDS: Final = {

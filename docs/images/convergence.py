@@ -70,7 +70,7 @@ def models_at(depth: float) -> list[NeedleModel]:
     return [
         NeedleModel(NeedleParameters(modes=n, minimum_depth=least))
         for n in range(1, MOST_MODES + 1)
-        if mode_shapes(P.length, n).condition(least) <= LARGEST_CONDITION
+        if np.linalg.cond(mode_shapes(P.length, n).integrals(least).gram) <= LARGEST_CONDITION
     ]
 
 

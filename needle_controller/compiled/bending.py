@@ -115,9 +115,8 @@ def base_impulse(needle: CompiledNeedle, f: Frozen, velocity: float, rows: Float
     """
     Compute the impulse of force and moment at the base per change of c and b, shape (2, 2 n).
 
-    It follows from the balance of momentum over the inserted part, as in
-    `needle_dynamics.model.NeedleModel.base_reaction`: the integral of the state over a time
-    follows from the change of the state. ``velocity`` is the insertion velocity [m/s].
+    It follows from the balance of momentum over the inserted part: the integral of the state over
+    a time follows from the change of the state. ``velocity`` is the insertion velocity [m/s].
     """
     n = f.modes.squares.shape[0]
     rho, damping = needle.linear_density, needle.tissue_damping

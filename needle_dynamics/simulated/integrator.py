@@ -11,12 +11,12 @@ problems).
 """
 
 from dataclasses import dataclass, field
-from math import copysign, inf, isfinite, isnan, sqrt
+from math import copysign, inf, isfinite, isnan
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.step import advance, Inputs, Sums
-from needle_dynamics.errors import InsertionDepthError, ToleranceError
+from needle_dynamics.compiled.step import advance, Inputs
+from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError
@@ -26,8 +26,7 @@ from numpy.typing import ArrayLike
 #: Default step [s], for a tip deflection error of 2e-4 in the open-loop run of the source.
 DEFAULT_STEP: Final = 1e-5
 
-#: Shortest step [s], below which a tolerance is not met: rounding errors dominate far above it.
-SHORTEST_STEP: Final = 1e-9
+SHORTEST_STEP: Final = 1e-9  #: shortest step [s]; rounding errors dominate far above it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,14 +74,11 @@ class Integrator:
     Parameters
     ----------
     parameters : NeedleParameters
-        Constants. To pass friction or tissue objects, see `NeedleParameters.using`.
+        Constants.
     state : array_like, shape (2 (2 + n),)
         Initial state, see `NeedleModel.state_at`.
     step : float
         Longest step [s].
-    tolerance : float, optional
-        If given, the step is halved until the estimated error of each call to `advance` is less
-        than this fraction of the state in the energy norm, and of the needle length.
     graded : bool
         Let the step grow with the insertion depth once it exceeds a tenth of the needle length:
         the modal frequencies decrease with its square.
@@ -96,12 +92,8 @@ class Integrator:
 
     Raises
     ------
-    ParameterError
-        If ``step`` or ``tolerance`` is not positive and finite.
-    ShapeError, InsertionDepthError
-        If the state is not valid.
-    ToleranceError
-        From `advance`, if the tolerance cannot be met.
+    ParameterError, ShapeError, InsertionDepthError
+        If the step or the state is not valid.
 
     Examples
     --------
@@ -119,17 +111,12 @@ class Integrator:
         parameters: NeedleParameters,
         state: ArrayLike,
         step: float = DEFAULT_STEP,
-        tolerance: float | None = None,
         *,
         graded: bool = False,
     ) -> None:
         self.step = checked_step(step)
-        if tolerance is not None and not 0.0 < tolerance < inf:
-            raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
-        self.tolerance = tolerance
         self.graded = graded
         self.time = 0.0
-        self._refinement = 1.0
         self._state = np.array(state)
         self.change(parameters)
 
@@ -195,8 +182,6 @@ class Integrator:
             If the duration is not positive, or an input is not finite.
         InsertionDepthError
             If the insertion depth left its range; the state is the last valid one.
-        ToleranceError
-            If the tolerance cannot be met.
 
         """
         return self._run(duration, Inputs(float(force), float(torque), 0.0, False), parts)
@@ -218,7 +203,7 @@ class Integrator:
 
         Raises
         ------
-        ParameterError, InsertionDepthError, ToleranceError
+        ParameterError, InsertionDepthError
             As `advance`.
 
         """
@@ -242,7 +227,7 @@ class Integrator:
 
         Raises
         ------
-        ParameterError, InsertionDepthError, ToleranceError
+        ParameterError, InsertionDepthError
             As `advance`.
 
         """
@@ -271,10 +256,13 @@ class Integrator:
                 raise ParameterError(f'{name} must be finite, got {getattr(inputs, name)!r}')
         # An integer would cause the step to be compiled for another type.
         duration, loads = float(duration), np.empty((parts, 3))
-        if self.tolerance is None:
-            sums = self._take(duration, inputs, self.step, loads)
-        else:
-            sums = self._refine(duration, inputs, loads, self.tolerance)
+        left, sums = advance(
+            self._needle, self._state, self.time, inputs, self.step, self.graded, duration, loads
+        )
+        if left != 0.0:
+            if left > 0.0:
+                self.time += duration - left
+            raise not_completed(self.model, self._state, left)
         self.time += duration
         axial, lateral, moment = (np.add.reduce(loads) / parts).tolist()
         return Interval(
@@ -289,68 +277,6 @@ class Integrator:
             impact_loss=sums.impact_loss,
             contact_time=sums.contact_time if sums.contact_time >= 0.0 else None,
         )
-
-    def _take(self, duration: float, inputs: Inputs, longest: float, loads: FloatArray) -> Sums:
-        """Integrate over the duration under constant inputs."""
-        left, sums = advance(
-            self._needle, self._state, self.time, inputs, longest, self.graded, duration, loads
-        )
-        if left != 0.0:
-            if left > 0.0:
-                self.time += duration - left
-            raise not_completed(self.model, self._state, left)
-        return sums
-
-    def _refine(
-        self, duration: float, inputs: Inputs, loads: FloatArray, tolerance: float
-    ) -> Sums:
-        """Halve the step until the state at the end of the interval has converged."""
-        start, clock = self._state.copy(), self.time
-        longest = min(duration, self.step / self._refinement)
-
-        def attempt(longest: float) -> Sums | InsertionDepthError:
-            self._state[:], self.time = start, clock
-            try:
-                return self._take(duration, inputs, longest, loads)
-            except InsertionDepthError as error:
-                return error
-
-        outcome = attempt(longest)
-        while True:
-            coarse, before = self._state.copy(), outcome
-            longest *= 0.5
-            if longest < SHORTEST_STEP:
-                self._state[:], self.time = start, clock
-                raise ToleranceError(f'tolerance {tolerance:g} cannot be met at any step')
-            outcome = attempt(longest)
-            # The finer run is kept; at second order its error is a third of the difference.
-            change = self._distance(coarse, self._state) / 3.0
-            if change <= tolerance and isinstance(outcome, Sums) == isinstance(before, Sums):
-                break
-        if isinstance(outcome, InsertionDepthError):
-            raise outcome
-        # The next interval starts with the second last step, or a longer one if the error permits:
-        # twice the step has four times the error.
-        growth = 4.0 if change < tolerance / 32.0 else 2.0
-        self._refinement = max(1.0, self.step / (growth * longest))
-        return outcome
-
-    def _distance(self, one: FloatArray, two: FloatArray) -> float:
-        """Return the distance of two states: energy of the difference, and depth."""
-        model, m = self.model, self.model.coordinates
-        depth = model.parameters.length - two[0]
-        gram = model.parameters.linear_density * model.modes.integrals(depth).gram
-        stiffness = model.stiffness_matrix(depth, self.time)
-        mass = model.parameters.moving_mass
-
-        def energy(x: FloatArray) -> float:
-            rate = x[m + 2 :]
-            elastic = x[2:m] @ stiffness @ x[2:m]
-            return float(0.5 * (elastic + rate @ gram @ rate + mass * x[m] ** 2))
-
-        scale = max(energy(one), energy(two))
-        part = sqrt(energy(two - one) / scale) if scale > 0.0 else 0.0
-        return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
 
 
 def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:

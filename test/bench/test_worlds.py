@@ -21,12 +21,12 @@ from needle_controller.steering.law import GuideSetpoint
 from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.needles import NEEDLES
-from needle_dynamics.steering.reference_models import bicycle
 from needle_ros.errors import ParameterError
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+from support.reference_models import bicycle
 
 DEPTHS = 5e-3 * np.arange(21.0)
 

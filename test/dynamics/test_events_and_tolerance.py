@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 from needle_dynamics import (
@@ -239,89 +238,18 @@ def test_times_outside_the_run_are_rejected(time: float) -> None:
 # --- tolerance ------------------------------------------------------------------------------
 
 
-def reference(model: NeedleModel, start: FloatArray, *times: float) -> FloatArray:
-    """Return states from an ODE solver, with an error below all tested tolerances."""
-    return np.asarray(
-        solve_ivp(
-            lambda _, x: model.derivative(x, PUSH),
-            (0.0, times[-1]),
-            start,
-            method='DOP853',
-            rtol=1e-12,
-            atol=1e-16,
-            t_eval=times,
-        ).y.T
-    )
-
-
-@cache
-def insertion() -> tuple[NeedleModel, FloatArray, FloatArray]:
-    """Return the model, the start, and exact states after 15 and 20 ms of an insertion."""
-    p = preset('paper_si')
-    model, start = NeedleModel(p), moving(p, 0.02, 5e-4, 1.0)
-    return model, start, reference(model, start, 0.015, 0.02)
-
-
-@pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
-def test_each_call_meets_the_tolerance(formulation: str) -> None:
-    """One call to `advance` ends within the tolerance of the exact state, in energy and depth."""
-    p = preset('paper_si', formulation=formulation)
-    model = NeedleModel(p)
-    start = moving(p, 0.05, 1e-3, 1.0)
-    exact = reference(model, start, 5e-3)[0]
-    before = np.inf
-    for tolerance in 10.0 ** -np.arange(3.0, 9.0):
-        it = Integrator(p, start, 1e-4, tolerance)
-        it.advance(5e-3, PUSH)
-        error = max(distance(model, it.state, exact), abs(it.state[0] - exact[0]) / LENGTH)
-        # The estimate is a third of the difference of two runs, correct at second order. The step
-        # is a power of two, so that the error is at least 1/16 of the tolerance.
-        assert error < 1.1 * tolerance
-        assert error <= before
-        before = error
-
-
-def test_halving_the_tolerance_reduces_the_error_of_a_run() -> None:
-    """Over many calls errors accumulate; a smaller tolerance never increases the error."""
-    model, start, (exact, _) = insertion()
-    errors = []
-    for tolerance in 1e-4 / 4.0 ** np.arange(6):
-        it = Integrator(model.parameters, start, tolerance=tolerance)
-        for _ in range(50):
-            it.advance(3e-4, PUSH)
-        errors.append(distance(model, it.state, exact))
-    # The step is a power of two: an error may be equal, but not larger.
-    assert np.all(np.diff(errors) <= 1e-9)
-    assert errors[-1] < 1e-2 * errors[0]
-    # Fifty calls, each within its tolerance; measured 5e-9, since errors have both signs.
-    assert errors[-1] < 50 * 1e-4 / 4.0**5
-
-
-def test_step_adapts_to_the_depth() -> None:
-    """Steps are refined at shallow depth, where modes are fast, and enlarged at larger depth."""
-    p = preset('paper_si')
-    shallow, deep = (
-        Integrator(p, moving(p, depth, 1e-3, 0.0), 1e-4, 1e-6) for depth in (0.01, 0.19)
-    )
-    for it in (shallow, deep):
-        for _ in range(10):
-            it.advance(1e-4, PUSH)
-    fixed = [Integrator(p, moving(p, depth, 1e-3, 0.0), 1e-4) for depth in (0.01, 0.19)]
-    for it in fixed:
-        for _ in range(10):
-            it.advance(1e-4, PUSH)
-    gaps = [
-        distance(one.model, two.state, one.state)
-        for one, two in zip((shallow, deep), fixed, strict=True)
-    ]
-    # A step of 0.1 ms is inaccurate at 1 cm, where the first mode has 9 kHz, and fair at 19 cm.
-    assert gaps[0] > 1e-2
-    assert gaps[1] < 1e-2
-
-
 def test_graded_steps_are_of_second_order() -> None:
     """Graded steps converge like even steps, to the same state, with fewer steps."""
-    model, start, (_, exact) = insertion()
+    p = preset('paper_si')
+    model, start = NeedleModel(p), moving(p, 0.02, 5e-4, 1.0)
+    exact = solve_ivp(
+        lambda _, x: model.derivative(x, PUSH),
+        (0.0, 0.02),
+        start,
+        method='DOP853',
+        rtol=1e-12,
+        atol=1e-16,
+    ).y[:, -1]
     errors: dict[bool, list[float]] = {}
     for graded in (False, True):
         errors[graded] = []
@@ -340,25 +268,18 @@ def test_graded_steps_are_of_second_order() -> None:
 def test_tolerance_is_met_through_rest_and_impact() -> None:
     """Sticking and hub contact, where the motion is not smooth, do not stall the step control."""
     p = preset('paper_si')
-    it = Integrator(p, moving(p, 0.15, 1e-3, 0.0), tolerance=1e-8)
-    assert it.advance(5e-3, 0.3).friction_work == 0.0
-    assert it.depth == LENGTH - moving(p, 0.15, 0.0, 0.0)[0]
-    times = [it.advance(1e-3, PUSH).contact_time for _ in range(20)]
-    assert it.depth == LENGTH
-    fine = Integrator(p, moving(p, 0.15, 1e-3, 0.0), 1e-7)
-    fine.advance(5e-3, 0.3)
-    landed = fine.advance(0.02, PUSH).contact_time
-    assert landed is not None
-    found = [time for time in times if time is not None]
-    assert len(found) == 1
-    assert_allclose(found[0], landed, atol=1e-8)
+    start = moving(p, 0.15, 1e-3, 0.0)
+    options = {'duration': 0.025, 'interval': 1e-3}
+    seen, fine = (
+        simulate(p, start, lambda t: 0.3 if t < 5e-3 else PUSH, **options, **accuracy)
+        for accuracy in ({'tolerance': 1e-6}, {'step': 1e-7})
+    )
+    assert np.all(seen.depth[:6] == seen.depth[0])
+    assert seen.depth[-1] == LENGTH
+    assert_allclose(seen.depth, fine.depth, atol=1e-6 * LENGTH)
 
 
 @pytest.mark.parametrize('tolerance', [0.0, -1e-6, np.nan, np.inf])
 def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
-    """It is checked at construction; the message contains name and value."""
-    p = preset('paper_si')
-    with pytest.raises(ParameterError, match='tolerance must be positive and finite, got'):
-        Integrator(p, NeedleModel(p).state_at(0.05), tolerance=tolerance)
     with pytest.raises(ParameterError, match='tolerance must be positive and finite, got'):
         run(tolerance=tolerance)

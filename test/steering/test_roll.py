@@ -11,10 +11,10 @@ from needle_controller.steering.law import SteeringLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.simulation import simulate_steering
 from needle_dynamics import NEEDLES
-from needle_dynamics.steering.reference_models import bicycle
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from support.reference_models import bicycle
 
 NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 STEERING = replace(_STEERING, bevel_load=(0.8,))
