@@ -154,25 +154,15 @@ def _hautus(a: FloatArray, b: FloatArray) -> tuple[ComplexArray, FloatArray, Com
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Analysis:
-    """
-    Controllability and observability of a linear system.
+    """Controllability and observability of a linear system."""
 
-    Attributes
-    ----------
-    state, observed : Structure
-        State controllability; observability from the tip deflection.
-    output_controllable : bool
-        Whether the tip deflection is output controllable. With one output the matrix
-        [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
-    output_gain : float
-        Tip deflection per base travel, the slope ``|w'(s)|`` of the needle at its tip: the effect
-        of a base displacement on the output before the bending responds.
-
-    """
-
-    state: Structure
-    observed: Structure
+    state: Structure  #: state controllability
+    observed: Structure  #: observability from the tip deflection
+    #: Whether the tip deflection is output controllable. With one output the matrix
+    #: [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
     output_controllable: bool
+    #: Tip deflection per base travel, the slope ``|w'(s)|`` of the needle at its tip: the effect
+    #: of a base displacement on the output before the bending responds.
     output_gain: float
 
 

@@ -12,20 +12,10 @@ _PINNED: Final = 4.493409457909064
 
 
 class EulerLoads(NamedTuple):
-    """
-    Euler buckling loads of the part outside the tissue, clamped at the base [N].
+    """Euler buckling loads of the part outside the tissue, clamped at the base [N]."""
 
-    Attributes
-    ----------
-    free : float
-        Free end, as before the tip has entered.
-    pinned : float
-        Pinned at the entry point: rotation is free, lateral displacement is zero.
-
-    """
-
-    free: float
-    pinned: float
+    free: float  #: free end, as before the tip has entered
+    pinned: float  #: pinned at the entry point: rotation is free, lateral displacement is zero
 
 
 def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:

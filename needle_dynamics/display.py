@@ -32,15 +32,7 @@ class Displayed:
     __slots__ = ()
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """
-        Return the data by name.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n,)
-            Columns by name with unit, such as ``depth [m]``; the abscissa of figures is first.
-
-        """
+        """Return arrays (n,) by name with unit, such as ``depth [m]``; the abscissa is first."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -66,20 +58,7 @@ class Displayed:
         )
 
     def to_dataframe(self) -> DataFrame:
-        """
-        Return the columns as a DataFrame of pandas, which is optional.
-
-        Returns
-        -------
-        DataFrame
-            One row per sample, columns as in `columns`.
-
-        Raises
-        ------
-        ParameterError
-            If pandas is not installed.
-
-        """
+        """Return the columns as a DataFrame of pandas; ParameterError if it is missing."""
         try:
             from pandas import DataFrame
         except ModuleNotFoundError as error:
@@ -90,18 +69,9 @@ class Displayed:
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
         """
-        Draw the columns over the first one; components share axes, and zeros are left out.
+        Draw the columns over the first one, by default in a new figure, and return all axes.
 
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure, optional
-            Figure to draw in; by default a new one of ``matplotlib.pyplot``.
-
-        Returns
-        -------
-        list of matplotlib.axes.Axes
-            Axes, from top to bottom.
-
+        Components share axes, and zeros are left out.
         """
         drawn = ((name, one) for name, one in self.columns().items() if one.dtype.kind in 'fb')
         (name, abscissa), *others = drawn

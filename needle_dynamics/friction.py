@@ -159,39 +159,17 @@ class Friction:
 
     def force(self, velocity: float, drive: float) -> float:
         """
-        Evaluate the friction force on the needle.
+        Return the friction force [N], positive against insertion, at an insertion velocity [m/s].
 
-        Parameters
-        ----------
-        velocity : float
-            Insertion velocity s_dot [m/s], positive into the tissue.
-        drive : float
-            Sum of the other forces [N], positive into the tissue; used at rest.
-
-        Returns
-        -------
-        float
-            Force [N], positive against insertion.
-
+        At rest it balances ``drive``, the sum of the other forces [N], positive into the tissue.
         """
         return friction_force(self.constants, float(velocity), float(drive))
 
     def slope(self, velocity: float, direction: float) -> float:
         """
-        Evaluate the derivative of the friction force with respect to the insertion velocity.
+        Return the derivative of the force with respect to the insertion velocity [N s/m].
 
-        Parameters
-        ----------
-        velocity : float
-            Insertion velocity [m/s].
-        direction : float
-            Side of zero velocity: positive for insertion, otherwise withdrawal.
-
-        Returns
-        -------
-        float
-            Derivative [N s/m].
-
+        At rest a positive ``direction`` is for insertion, otherwise for withdrawal.
         """
         dry = dry_slope(self.constants, float(self.coulomb), abs(float(velocity)))
         return (1.0 if direction > 0.0 else self.withdrawal) * (self.viscous + dry)

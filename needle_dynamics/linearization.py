@@ -33,42 +33,18 @@ class LinearSystem:
 
     With the deviations x of the state, u = [f_y, tau] of the inputs and y of the tip deflection,
     x_dot = drift + A x + B u and y = C x + D u. The order N is 2 (2 + n).
-
-    Attributes
-    ----------
-    A : ndarray, shape (N, N)
-        State matrix.
-    B : ndarray, shape (N, 2)
-        Input matrix.
-    C : ndarray, shape (1, N)
-        Output matrix.
-    D : ndarray, shape (1, 2)
-        Feedthrough, zero.
-    drift : ndarray, shape (N,)
-        X_dot at the operating point; zero at an equilibrium.
-    names : tuple of str
-        Names of the states: d, theta, q1, ..., qn, d_dot, ...
-    frequencies : ndarray, shape (n,)
-        Natural frequencies of the inserted part, ascending [rad/s].
-    transform : ndarray, shape (N, N)
-        The state is ``transform`` times the state in natural units, see `scaled`.
-    input_scales : ndarray, shape (2,)
-        Natural units of force [N] and torque [N m].
-    output_scale : float
-        Natural unit of the tip deflection [m].
-
     """
 
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    drift: FloatArray
-    names: tuple[str, ...]
-    frequencies: FloatArray
-    transform: FloatArray
-    input_scales: FloatArray
-    output_scale: float
+    A: FloatArray  #: state matrix, shape (N, N)
+    B: FloatArray  #: input matrix, shape (N, 2)
+    C: FloatArray  #: output matrix, shape (1, N)
+    D: FloatArray  #: feedthrough, zero, shape (1, 2)
+    drift: FloatArray  #: X_dot at the operating point; zero at an equilibrium, shape (N,)
+    names: tuple[str, ...]  #: names of the states: d, theta, q1, ..., qn, d_dot, ...
+    frequencies: FloatArray  #: natural frequencies of the inserted part, ascending [rad/s]
+    transform: FloatArray  #: the state is this (N, N) times the state in natural units
+    input_scales: FloatArray  #: natural units of force [N] and torque [N m], shape (2,)
+    output_scale: float  #: natural unit of the tip deflection [m]
 
     @property
     def scaled_names(self) -> tuple[str, ...]:
@@ -78,19 +54,13 @@ class LinearSystem:
 
     def scaled(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        Return A, B and C in natural (dimensionless) units.
+        Return A (N, N), B (N, 2) and C (1, N) in natural (dimensionless) units.
 
         The unit of time is 1 / omega_1 of the slowest mode of the inserted part. The unit of d and
         of the tip deflection is the insertion depth s. Angles are in radians. One unit of force or
         torque moves the needle or the rotor by one unit within the unit of time. The bending is
         decomposed into its normal modes, displacement and rate in the energy norm: the state of
         mode 1 is its root mean square deflection over s.
-
-        Returns
-        -------
-        tuple of ndarray, shapes (N, N), (N, 2) and (1, N)
-            A, B, C.
-
         """
         slowest = self.frequencies[0]
         back = np.linalg.inv(self.transform)
@@ -105,31 +75,9 @@ def operating_point(
     model: NeedleModel, depth: float, tip_deflection: float = 0.0, velocity: float = 0.0
 ) -> FloatArray:
     """
-    Return the state of a needle that moves without a change of shape.
+    Return the state of a needle that moves without a change of shape, at a velocity [m/s].
 
-    Parameters
-    ----------
-    model : NeedleModel
-        The model.
-    depth : float
-        Insertion depth s [m].
-    tip_deflection : float
-        Tip deflection w(s) [m]; shape as in `NeedleModel.state_at`.
-    velocity : float
-        Insertion velocity s_dot [m/s], positive into the tissue.
-
-    Returns
-    -------
-    ndarray, shape (2 (2 + n),)
-        State.
-
-    Raises
-    ------
-    InsertionDepthError
-        If ``depth`` is outside its range.
-    ShapeError
-        If a number is not finite.
-
+    Depth and tip deflection [m] give the shape as in `NeedleModel.state_at`.
     """
     state = model.state_at(depth, tip_deflection)
     state[model.coordinates] = -velocity

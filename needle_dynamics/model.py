@@ -44,7 +44,10 @@ class NeedleModel(NeedleStatics):
     """
     Lagrangian model of needle and tissue for one set of constants.
 
-    Its states and shapes, such as `state_at` and `shape`, are methods of `NeedleStatics`.
+    A state is X = [d, theta, q1, ..., qn] and its rates, shape (2 (2 + n),), in SI units.
+    ``depth`` is the insertion depth s [m], ``time`` [s] counts for swelling tissue only. ``force``
+    is the insertion force f_y at the base [N], positive into the tissue, ``torque`` is tau about x
+    [N m]. The methods raise ShapeError or InsertionDepthError if a state is not valid.
 
     Attributes
     ----------
@@ -94,7 +97,6 @@ class NeedleModel(NeedleStatics):
         )
 
     def _instant(self, state: ArrayLike, time: float = 0.0) -> _Instant:
-        """Check a state and evaluate the modes and stiffness at it."""
         x, m = self.checked_state(state), self.coordinates
         depth = self.parameters.length - x[0]
         at = self.modes.integrals(depth)
@@ -103,20 +105,7 @@ class NeedleModel(NeedleStatics):
         return _Instant(x, depth, x[m], x[2:m], x[m + 2 :], at, tip_stiffness, stiffness)
 
     def mass_matrix(self, state: ArrayLike) -> FloatArray:
-        """
-        Mass matrix M(q) of (13): symmetric, positive definite, block diagonal.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-
-        Returns
-        -------
-        ndarray, shape (2 + n, 2 + n)
-            Mass matrix.
-
-        """
+        """Return the mass matrix M(q) of (13), shape (2 + n, 2 + n): block diagonal."""
         return self._mass(self._instant(state).at)
 
     def _mass(self, at: ModeIntegrals) -> FloatArray:
@@ -128,22 +117,7 @@ class NeedleModel(NeedleStatics):
         return matrix
 
     def bias_forces(self, state: ArrayLike, time: float = 0.0) -> FloatArray:
-        """
-        Bias forces N(q, q_dot) of (13): elastic, inertial and tissue damping.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (2 + n,)
-            N in M q_ddot + N = F - F_f.
-
-        """
+        """Return the bias forces N(q, q_dot) of (13), shape (2 + n,)."""
         return self._bias(self._instant(state, time))
 
     def _bias(self, now: _Instant) -> FloatArray:
@@ -162,33 +136,7 @@ class NeedleModel(NeedleStatics):
     def acceleration(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:
-        """
-        Forward dynamics, equations (16)-(17).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        force : float
-            Insertion force f_y at the base [N], positive into the tissue.
-        torque : float
-            Torque tau about x [N m].
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (2 + n,)
-            q_ddot.
-
-        Raises
-        ------
-        ParameterError
-            If an input is not finite.
-        ShapeError, InsertionDepthError
-            If the state is not valid.
-
-        """
+        """Return the acceleration q_ddot, shape (2 + n,), by forward dynamics (16)-(17)."""
         return self._acceleration(self._instant(state, time), force, torque)
 
     def _acceleration(self, now: _Instant, force: float, torque: float) -> FloatArray:
@@ -205,29 +153,11 @@ class NeedleModel(NeedleStatics):
         self, state: ArrayLike, acceleration: ArrayLike, time: float = 0.0
     ) -> FloatArray:
         """
-        Inverse dynamics, equation (16): return the forces that produce an acceleration.
+        Return the forces, shape (2 + n,), that produce an acceleration q_ddot, equation (16).
 
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        acceleration : array_like, shape (2 + n,)
-            q_ddot. From rest, friction opposes the starting motion. If the needle stays at rest,
-            friction takes the value within its bounds that minimizes the required force.
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (2 + n,)
-            Insertion force f_y [N], positive into the tissue, torque tau [N m], and the
-            generalized force on each modal coordinate.
-
-        Raises
-        ------
-        ShapeError
-            If a shape is wrong or a number is not finite.
-
+        They are f_y [N], tau [N m], and the generalized force on each modal coordinate. From rest,
+        friction opposes the starting motion; if the needle stays at rest, friction takes the value
+        within its bounds that minimizes the required force.
         """
         now, m = self._instant(state, time), self.coordinates
         wanted = np.array(acceleration, dtype=float)
@@ -242,81 +172,21 @@ class NeedleModel(NeedleStatics):
     def derivative(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:
-        """
-        Right-hand side of the state equation (18), for any ODE solver.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        force, torque : float
-            Insertion force f_y [N], positive into the tissue; torque tau about x [N m].
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            X_dot.
-
-        """
+        """Return X_dot of the state equation (18), for any ODE solver."""
         x = np.asarray(state, dtype=float)
         return np.concatenate([x[self.coordinates :], self.acceleration(x, force, torque, time)])
 
     def kinetic_energy(self, state: ArrayLike) -> float:
-        """
-        Kinetic energy T of (12).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-
-        Returns
-        -------
-        float
-            Energy [J].
-
-        """
+        """Return the kinetic energy T of (12) [J]."""
         now = self._instant(state)
         rate = now.state[self.coordinates :]
         return float(0.5 * rate @ self._mass(now.at) @ rate)
 
     def potential_energy(self, state: ArrayLike, time: float = 0.0) -> float:
-        """
-        Potential energy V of needle and tissue, from (12).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        float
-            Energy [J].
-
-        """
+        """Return the potential energy V of needle and tissue [J], from (12)."""
         now = self._instant(state, time)
         return float(0.5 * now.modal @ now.stiffness @ now.modal)
 
     def energy(self, state: ArrayLike, time: float = 0.0) -> float:
-        """
-        Total energy T + V.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        time : float
-            Time [s], for swelling tissue.
-
-        Returns
-        -------
-        float
-            Energy [J].
-
-        """
+        """Return the total energy T + V [J]."""
         return self.kinetic_energy(state) + self.potential_energy(state, time)

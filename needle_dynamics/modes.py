@@ -80,20 +80,7 @@ class ModeShapes:
         return np.asarray(1.0 / (self.ratios * np.sqrt(self.length)))
 
     def values(self, y: ArrayLike) -> FloatArray:
-        """
-        Evaluate the mode shapes phi_i(y), equation (11) with the sign for phi_i(0) = 0.
-
-        Parameters
-        ----------
-        y : array_like, shape (...)
-            Distance from the entry point [m].
-
-        Returns
-        -------
-        ndarray, shape (..., n)
-            phi_i [m^-1/2].
-
-        """
+        """Return phi_i(y) [m^-1/2], shape (..., n), by (11) with the sign for phi_i(0) = 0."""
         x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
         # `derivatives` of order 0, arranged so that it is exactly zero at the clamped end.
         mu, rest, end = self.ratios, self._rests, self.arguments
@@ -104,20 +91,9 @@ class ModeShapes:
 
     def derivatives(self, y: ArrayLike, order: int) -> FloatArray:
         """
-        Evaluate derivatives of the modes in y, without cancellation for high modes.
+        Return derivatives of phi_i in y [m^(-1/2 - order)], shape (..., n).
 
-        Parameters
-        ----------
-        y : array_like, shape (...)
-            Distance from the entry point [m].
-        order : int
-            Order of the derivative, at least 0; 2 for the curvatures phi_i''.
-
-        Returns
-        -------
-        ndarray, shape (..., n)
-            Derivatives [m^(-1/2 - order)].
-
+        There is no cancellation for high modes. Order 2 are the curvatures.
         """
         x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
         sine, cosine = np.sin(x), np.cos(x)
@@ -134,25 +110,7 @@ class ModeShapes:
         return np.asarray(self.scales * self.wavenumbers**order * (turned + grow + fall))
 
     def integrals(self, depth: float) -> ModeIntegrals:
-        """
-        Evaluate the modes at the tip and their integrals over the inserted part.
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth s [m], in [0, reach l].
-
-        Returns
-        -------
-        ModeIntegrals
-            Values at s.
-
-        Raises
-        ------
-        ParameterError
-            If ``depth`` is outside this range.
-
-        """
+        """Return modes and integrals at an insertion depth [m] in [0, reach l]."""
         high = self.reach * self.length
         if not 0.0 <= depth <= high:
             raise ParameterError(f'insertion depth must be in [0, {high:g}] m, got {depth!r}')

@@ -24,23 +24,11 @@ _PREFIXES: Final = ('model.', 'steering.')  #: Prefixes of the constants in a RO
 
 
 class NeedlePreset(NamedTuple):
-    """
-    Constants of a needle in tissue, with their source.
+    """Constants of a needle in tissue, with their source."""
 
-    Attributes
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        Additional constants of a needle that bends about the path that it cuts.
-    source : str
-        Source of the constants.
-
-    """
-
-    needle: NeedleParameters
-    steering: SteeringParameters
-    source: str
+    needle: NeedleParameters  #: needle and tissue
+    steering: SteeringParameters  #: constants of a needle that bends about the path that it cuts
+    source: str  #: source of the constants
 
     @property
     def bends(self) -> bool:
@@ -48,25 +36,7 @@ class NeedlePreset(NamedTuple):
         return self.steering != SteeringParameters()
 
     def changed(self, values: Mapping[str, Any]) -> NeedlePreset:
-        """
-        Return these constants with changed values by name.
-
-        Parameters
-        ----------
-        values : Mapping[str, Any]
-            Fields of `needle` and `steering` to replace; one number may replace a tuple.
-
-        Returns
-        -------
-        NeedlePreset
-            The changed constants.
-
-        Raises
-        ------
-        ParameterError
-            If a name is unknown or a value is not valid.
-
-        """
+        """Return these constants with other values by name; one number may replace a tuple."""
         known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
         for name in values:
             if name not in known:
@@ -80,7 +50,6 @@ class NeedlePreset(NamedTuple):
 
 
 def _tube(outer: float, inner: float, modulus: float, tissue: float) -> NeedleParameters:
-    """Return a round needle with outer and inner diameter [m]."""
     return replace(
         PRESETS['phantom'],
         youngs_modulus=modulus,

@@ -36,19 +36,28 @@ class NeedleParameters:
     """
     Constants of a flexible needle in soft tissue, SI units.
 
-    The defaults are Table 3 and section 3.2.8 of [Boroomand2014]_ with Table 1 read as
-    0.3 N s/m (the preset `paper_si`).
+    The defaults are Table 3 and section 3.2.8 of [Boroomand2014]_ with Table 1 read as 0.3 N s/m
+    (the preset `paper_si`).
 
     Raises
     ------
     ParameterError
-        If a constant is not a number or is outside its range. The message contains the name, the
-        value and the valid range.
+        With the name, the value and the valid range of a constant.
 
     References
     ----------
     .. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
        and controllability analysis of a flexible needle in soft tissue", 2014.
+
+    Examples
+    --------
+    >>> parameters = NeedleParameters.preset('phantom', tissue_stiffness=600.0)
+    >>> parameters.tissue_stiffness, parameters.viscous_friction
+    (600.0, 300.0)
+    >>> NeedleParameters.preset('phantom', length=-0.2)
+    Traceback (most recent call last):
+        ...
+    needle_ros.errors.ParameterError: length must be finite, > 0 m, got -0.2
 
     """
 
@@ -189,40 +198,7 @@ class NeedleParameters:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> NeedleParameters:
-        """
-        Return the constants of a needle by name, with changed fields.
-
-        Parameters
-        ----------
-        name : str
-            Name or file of a needle, as `needle_dynamics.find_needle`.
-        **changes : Any
-            Fields to replace.
-
-        Returns
-        -------
-        NeedleParameters
-            The constants.
-
-        Raises
-        ------
-        ParameterError
-            If the needle or a field is unknown, or a value is not valid.
-
-        Examples
-        --------
-        >>> parameters = NeedleParameters.preset('phantom', tissue_stiffness=600.0)
-        >>> parameters.tissue_stiffness, parameters.viscous_friction
-        (600.0, 300.0)
-
-        An invalid value is rejected:
-
-        >>> NeedleParameters.preset('phantom', length=-0.2)
-        Traceback (most recent call last):
-            ...
-        needle_ros.errors.ParameterError: length must be finite, > 0 m, got -0.2
-
-        """
+        """Return the constants of a needle of `find_needle` by name, with changed fields."""
         # Imported here: the needles that bend are above this module.
         from needle_dynamics.needles import find_needle
 

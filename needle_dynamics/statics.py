@@ -28,15 +28,7 @@ ROUNDING: Final = 1e-12  #: rounding tolerance of an insertion depth, relative t
 
 @dataclass(frozen=True)
 class NeedleStatics:
-    """
-    Shape modes and tissue of a needle, its states, and their shapes.
-
-    Attributes
-    ----------
-    parameters : NeedleParameters
-        Constants, SI units.
-
-    """
+    """Shape modes and tissue of a needle, its states, and their shapes, in SI units."""
 
     parameters: NeedleParameters
 
@@ -67,27 +59,7 @@ class NeedleStatics:
         return ('d', 'theta', *(f'q{i + 1}' for i in range(self.parameters.modes)))
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
-        """
-        Check a state and return it as an array.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            X = [d, theta, q1, ..., qn] and its rates, SI units.
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            Copy of the state.
-
-        Raises
-        ------
-        ShapeError
-            If the shape is wrong or a number is not finite.
-        InsertionDepthError
-            If the insertion depth is outside its range.
-
-        """
+        """Return a copy of a state, or raise ShapeError or InsertionDepthError."""
         try:
             checked = np.array(state, dtype=float)
         except (TypeError, ValueError):
@@ -119,35 +91,11 @@ class NeedleStatics:
         self, depth: float, tip_deflection: float = 0.0, modal: Sequence[float] = ()
     ) -> FloatArray:
         """
-        Return the state at rest with a given insertion depth and tip deflection or shape.
+        Return the state at rest at an insertion depth [m], with a tip deflection [m] or shape.
 
-        With a tip deflection, the shape is the static shape under a lateral force at the tip,
+        With a tip deflection w(s), the shape is the static shape under a lateral force at the tip,
         which has the least elastic energy for that deflection. (The source gives only the tip
-        deflection.)
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth s [m].
-        tip_deflection : float
-            w(s) [m].
-        modal : sequence of float, shape (n,) or (0,)
-            q1 to qn [m^3/2], instead of a tip deflection.
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            State.
-
-        Raises
-        ------
-        InsertionDepthError
-            If ``depth`` is outside its range.
-        ShapeError
-            If a number is not finite, or the number of modal coordinates is not n.
-        ParameterError
-            If both a tip deflection and modal coordinates are given.
-
+        deflection.) ``modal``, q1 to qn [m^3/2], gives the shape instead.
         """
         state = np.zeros(2 * self.coordinates)
         state[0] = self.parameters.length - depth
@@ -168,80 +116,21 @@ class NeedleStatics:
         return self.checked_state(state)
 
     def stiffness_matrix(self, depth: float, time: float = 0.0) -> FloatArray:
-        """
-        Modal stiffness E I_y H + k_a G of needle and tissue, from (12).
-
-        Parameters
-        ----------
-        depth, time : float
-            Insertion depth s [m]; time [s], for swelling tissue.
-
-        Returns
-        -------
-        ndarray, shape (n, n)
-            Stiffness [N/m] for modal coordinates in m^3/2.
-
-        """
+        """Return the modal stiffness E I_y H + k_a G [N/m] from (12), shape (n, n)."""
         return self._stiffness(self.modes.integrals(depth), depth, time)
 
     def tip_deflection(self, state: ArrayLike) -> float:
-        """
-        Deflection of the tip Y = w(s, t), the model's output.
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-
-        Returns
-        -------
-        float
-            Deflection [m] along z.
-
-        """
+        """Return the deflection of the tip Y = w(s, t) along z [m], the output of the model."""
         return float(self.tip_deflections(self.checked_state(state)[np.newaxis])[0])
 
     def tip_deflections(self, states: ArrayLike) -> FloatArray:
-        """
-        Deflection of the tip for many states at once.
-
-        Parameters
-        ----------
-        states : array_like, shape (..., 2 (2 + n))
-            Valid states, or NaN.
-
-        Returns
-        -------
-        ndarray, shape (...)
-            Deflections [m] along z; NaN where a state is NaN.
-
-        """
+        """Return the tip deflections [m], shape (...), of many valid states; NaN for NaN."""
         x = np.ascontiguousarray(states, dtype=float)
         rows = x.reshape(-1, 2 * self.coordinates)
         return tip_deflections(self.modes.tables, rows).reshape(x.shape[:-1])
 
     def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
-        """
-        Points of the inserted needle from the entry point to the tip, equation (10).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-        points : int
-            Number of points, at least 2.
-
-        Returns
-        -------
-        ndarray, shape (points, 2)
-            y and w(y) [m].
-
-        Raises
-        ------
-        ShapeError
-            If there are fewer than two points.
-
-        """
+        """Return points y and w(y) [m] from entry point to tip, equation (10); (points, 2)."""
         x = self.checked_state(state)
         if not isinstance(points, int) or points < 2:
             raise ShapeError(f'points must be an integer >= 2, got {points!r}')

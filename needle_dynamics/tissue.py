@@ -64,78 +64,21 @@ class Tissue:
             )
 
     def growth(self, time: float) -> float:
-        """
-        Return the stiffness factor due to swelling.
-
-        Parameters
-        ----------
-        time : float
-            Time [s], at least 0.
-
-        Returns
-        -------
-        float
-            Ratio of the stiffness to its value at time 0.
-
-        Raises
-        ------
-        ParameterError
-            If the time is negative or not finite.
-
-        """
+        """Return the factor of the stiffness by swelling at a time of at least 0 [s]."""
         if not 0.0 <= time < inf:
             raise ParameterError(f'time must be finite and >= 0 s, got {time!r}')
         return 1.0 - self.swelling * expm1(-time / self.swelling_time)
 
     def layer(self, depth: float) -> int:
-        """
-        Return the index of the layer at a depth; at a boundary the deeper layer.
-
-        Parameters
-        ----------
-        depth : float
-            Distance y from the entry point [m].
-
-        Returns
-        -------
-        int
-            Index into `starts`.
-
-        """
+        """Return the index of the layer at a depth [m]; at a boundary the deeper layer."""
         return max(int(np.searchsorted(self.starts, depth, side='right')) - 1, 0)
 
     def stiffness(self, depth: float, time: float = 0.0) -> float:
-        """
-        Evaluate the stiffness k(y, t) of (7).
-
-        Parameters
-        ----------
-        depth, time : float
-            Distance y from the entry point [m]; time [s].
-
-        Returns
-        -------
-        float
-            Stiffness per length [N/m^2].
-
-        """
+        """Return the stiffness per length k(y, t) of (7) [N/m^2] at a depth [m] and time [s]."""
         return self.stiffnesses[self.layer(depth)] * self.growth(time)
 
     def layers(self, modes: ModeShapes) -> Layers:
-        """
-        Return the layers with the contributions of the layers above to the mode integrals.
-
-        Parameters
-        ----------
-        modes : ModeShapes
-            Shape modes.
-
-        Returns
-        -------
-        Layers
-            Arrays in the layout of the compiled functions.
-
-        """
+        """Return the layers, with the contributions of the layers above to the mode integrals."""
         n, m = modes.count, len(self.starts)
         gram, area, moment = np.zeros((m, n, n)), np.zeros((m, n)), np.zeros((m, n))
         for i in range(1, m):

@@ -28,26 +28,14 @@ _CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vect
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Batch:
-    """
-    Result of many simulated runs.
+    """Result of many simulated runs."""
 
-    Attributes
-    ----------
-    parameters : tuple of NeedleParameters
-        Constants of each run, or one for all.
-    time : ndarray, shape (k + 1,), or (1,) for final states only
-        Time of the samples [s].
-    states : ndarray, shape (runs, k + 1, 2 (2 + n)), or (runs, 1, ...) for final states only
-        States; NaN after a run has left its range.
-    completed : ndarray, shape (runs,)
-        End of the valid part of each run [s].
-
-    """
-
-    parameters: tuple[NeedleParameters, ...]
+    parameters: tuple[NeedleParameters, ...]  #: constants of each run, or one for all
+    #: Time of the k + 1 samples [s], and states, shape (runs, k + 1, 2 (2 + n)), NaN after a run
+    #: has left its range; one sample for final states only.
     time: FloatArray
     states: FloatArray
-    completed: FloatArray
+    completed: FloatArray  #: end of the valid part of each run [s], shape (runs,)
 
     def __repr__(self) -> str:
         samples = f'{len(self.time)} samples' if len(self.time) > 1 else 'state at the end'

@@ -101,20 +101,7 @@ class ForceSensorParameters:
         return tuple(self.rate / (16.0 * 4.0**k) for k in range(self.filter))
 
     def per_axis(self, name: str) -> FloatArray:
-        """
-        Return a constant for each axis.
-
-        Parameters
-        ----------
-        name : str
-            Field name without ``force_`` or ``torque_``, for example ``noise``.
-
-        Returns
-        -------
-        ndarray, shape (6,)
-            Value for the forces x y z and the torques x y z.
-
-        """
+        """Return a constant, such as ``noise``, for the forces and torques x y z; shape (6,)."""
         pair = (getattr(self, f'{kind}_{name}') for kind in ('force', 'torque'))
         return np.concatenate([np.broadcast_to(value, 3) for value in pair], dtype=np.float64)
 
@@ -123,41 +110,9 @@ class ForceSensor:
     """
     Force-torque sensor at the needle base: converts true wrenches to readings.
 
-    The internal sample rate is a multiple of the reading rate. Offset and noise are added to each
-    sample, which then saturates and passes a cascade of second-order Butterworth filters. A
-    reading is the last sample, minus the tare value, rounded to counts.
-
-    Parameters
-    ----------
-    parameters : ForceSensorParameters
-        Constants.
-    rate : float
-        Readings per second [Hz].
-    seed : int
-        Seed of the noise: the same seed gives the same noise.
-
-    Attributes
-    ----------
-    samples : int
-        Internal samples per reading.
-
-    Raises
-    ------
-    ParameterError
-        If the internal rate is not a whole multiple of the reading rate.
-
-    Examples
-    --------
-    The mean of a thousand readings of 2 N along y:
-
-    >>> import numpy as np
-    >>> from needle_dynamics import ForceSensor, ForceSensorParameters
-    >>> sensor = ForceSensor(ForceSensorParameters(), rate=1000.0, seed=1)
-    >>> wrench = np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
-    >>> readings = [sensor.measure(wrench) for _ in range(1000)]
-    >>> print(f'{np.mean(readings, axis=0)[1]:.2f} N')
-    2.00 N
-
+    The internal sample rate is a multiple of the reading rate [Hz]. Offset and noise, of a seed,
+    are added to each sample, which then saturates and passes a cascade of second-order Butterworth
+    filters. A reading is the last sample, minus the tare value, rounded to counts.
     """
 
     _DRAWN = 16384  #: size of a block of random numbers
@@ -171,7 +126,7 @@ class ForceSensor:
                 f'rate of the force sensor must be a whole multiple of {rate:g} Hz, got '
                 f'{p.rate:g} Hz; {fits:g} Hz would do'
             )
-        self.samples = samples
+        self.samples = samples  #: internal samples per reading
         self._wrenches = np.empty((samples, 6))
         self._rng = np.random.default_rng(seed)
         self._constants = np.array(
@@ -197,29 +152,11 @@ class ForceSensor:
         self, wrench: FloatArray, *, start: FloatArray | None = None, moving: bool = False
     ) -> FloatArray:
         """
-        Return the next reading.
+        Return the next reading, shape (6,): force [N] and torque [N m], x y z each.
 
-        Parameters
-        ----------
-        wrench : ndarray, shape (samples, 6) or (6,)
-            True force [N] and torque [N m], x y z each. Two-dimensional: mean wrench of each
-            sample. One-dimensional: wrench of the last sample, with a linear change from the
-            previous reading.
-        start : ndarray, shape (6,), optional
-            Wrench just after the previous reading, in case of a jump; for a linear change.
-        moving : bool
-            Whether the needle moves; such a reading is not used for the tare.
-
-        Returns
-        -------
-        ndarray, shape (6,)
-            The reading.
-
-        Raises
-        ------
-        ShapeError
-            If the number of samples is wrong.
-
+        ``wrench`` has the mean of each internal sample, shape (samples, 6), or the last sample,
+        shape (6,), with a linear change from the previous reading, or from ``start`` after a jump.
+        A reading of a ``moving`` needle is not used for the tare.
         """
         wrenches = np.array(wrench, dtype=np.float64)
         if wrenches.ndim == 2 and len(wrenches) != self.samples:
@@ -259,11 +196,7 @@ class ForceSensor:
         """
         Zero the sensor on the mean of the readings of the last tenth of a second.
 
-        Raises
-        ------
-        JobError
-            If there are not as many readings at rest since the last motion or tare.
-
+        JobError if there are not as many readings at rest since the last motion or tare.
         """
         found, needed = len(self._resting), self._resting.maxlen
         if found != needed:

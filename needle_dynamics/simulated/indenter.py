@@ -104,21 +104,7 @@ class Indenter(SimulatedPlant):
     Indent the tissue with a commanded force in the plane, one sample at a time.
 
     A trajectory has efforts of the joints `x` and `z` [N] and no positions; it is linear in time
-    from the present force.
-
-    Parameters
-    ----------
-    parameters : IndenterParameters
-        Tissue and robot.
-    sensor : ForceSensor
-        Sensor at the end-effector.
-    rate : float
-        Samples per second [Hz].
-    seed : int
-        Seed of the position noise: the same seed gives the same noise.
-    force_limit : float
-        Largest force along each axis [N].
-
+    from the present force. The force limit is for each axis [N], the rate is in Hz.
     """
 
     depth = 0.0  #: insertion depth; there is no needle
@@ -192,20 +178,7 @@ class Indenter(SimulatedPlant):
         """Return None: there is no needle to display."""
 
     def displacement(self, force: FloatArray) -> FloatArray:
-        """
-        Return the tissue displacement under a force, ``F = K(|F|) d``.
-
-        Parameters
-        ----------
-        force : ndarray, shape (2,)
-            Force on the tissue along x and z [N].
-
-        Returns
-        -------
-        ndarray, shape (3,)
-            Displacement x y z [m]; y is out of the plane.
-
-        """
+        """Return the displacement x y z [m] under a force x, z [N], ``F = K(|F|) d``."""
         x, z = force
         size = hypot(x, z)
         xx, xz, zx, zz = (np.interp(size, self._levels, row) for row in self._entries)
@@ -219,15 +192,7 @@ class Indenter(SimulatedPlant):
         )
 
     def advance(self) -> Press:
-        """
-        Advance by one sample interval.
-
-        Returns
-        -------
-        Press
-            Measurements at the end of the interval.
-
-        """
+        """Advance by one sample interval and return the measurements at its end."""
         p = self._parameters
         self._count += 1
         wanted = np.array([np.interp(self.time, self._times, f) for f in self._forces.T])

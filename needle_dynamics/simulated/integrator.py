@@ -31,40 +31,21 @@ SHORTEST_STEP: Final = 1e-9  #: shortest step [s]; rounding errors dominate far 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
-    """
-    Mean values and work over an interval, for sensors that average over the interval.
+    """Mean values and work over an interval, for sensors that average over the interval."""
 
-    Attributes
-    ----------
-    tip_deflection : float
-        Mean tip deflection [m].
-    axial_force : float
-        Mean force of the base on the needle along y [N], positive into the tissue.
-    lateral_force : float
-        Mean force of the base on the needle along z [N], from the momentum balance.
-    moment : float
-        Mean moment of the base on the needle about x at the base [N m], including the torque.
-    loads : ndarray, shape (parts, 3)
-        These three loads for each of the equal parts of the interval. Not compared by ``==``.
-    friction_work, damping_work : float
-        Energy dissipated by friction and tissue damping [J].
-    input_work, impact_loss : float
-        Work of force and torque [J]; energy dissipated by impacts of the hub [J].
-    contact_time : float or None
-        Time of the last hub contact [s], on the clock of the integrator.
-
-    """
-
-    tip_deflection: float
+    tip_deflection: float  #: mean tip deflection [m]
+    #: Mean forces of the base on the needle along y (positive into the tissue) and z [N], and mean
+    #: moment about x at the base [N m], including the torque; from the momentum balance.
     axial_force: float
     lateral_force: float
     moment: float
-    loads: FloatArray = field(compare=False)
+    loads: FloatArray = field(compare=False)  #: these loads in each part, shape (parts, 3)
+    #: Energy dissipated by friction and tissue damping, and work of force and torque [J].
     friction_work: float
     damping_work: float
     input_work: float
-    impact_loss: float
-    contact_time: float | None
+    impact_loss: float  #: energy dissipated by impacts of the hub [J]
+    contact_time: float | None  #: time of the last hub contact [s], on the clock of the integrator
 
 
 class Integrator:
@@ -89,11 +70,6 @@ class Integrator:
         The needle.
     time : float
         Time [s], initially 0; used for swelling tissue.
-
-    Raises
-    ------
-    ParameterError, ShapeError, InsertionDepthError
-        If the step or the state is not valid.
 
     Examples
     --------
@@ -124,16 +100,7 @@ class Integrator:
         """
         Change the constants and continue from the present state.
 
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Constants.
-
-        Raises
-        ------
-        ShapeError, InsertionDepthError
-            If the state is invalid for the new constants; the old constants are kept.
-
+        If the state is not valid for the new constants, the old constants are kept.
         """
         model = NeedleModel(parameters)
         self._state = model.checked_state(self._state)
@@ -159,77 +126,27 @@ class Integrator:
         self, duration: float, force: float = 0.0, torque: float = 0.0, parts: int = 1
     ) -> Interval:
         """
-        Advance under a constant force and torque at the base.
+        Advance for a duration [s] under a constant force f_y [N] and torque tau [N m] at the base.
 
-        Parameters
-        ----------
-        duration : float
-            Time to advance [s], divided into steps no longer than ``step``.
-        force, torque : float
-            Insertion force f_y [N], positive into the tissue; torque tau about x [N m].
-        parts : int
-            Number of equal parts of the interval for which base loads are returned. Steps end at
-            the part boundaries.
-
-        Returns
-        -------
-        Interval
-            Mean values and work over the interval.
-
-        Raises
-        ------
-        ParameterError
-            If the duration is not positive, or an input is not finite.
-        InsertionDepthError
-            If the insertion depth left its range; the state is the last valid one.
-
+        Loads are returned for ``parts`` of equal duration, at whose ends steps end.
+        InsertionDepthError if the depth left its range; the state is then the last valid one.
         """
         return self._run(duration, Inputs(float(force), float(torque), 0.0, False), parts)
 
     def advance_moved(self, duration: float, velocity: float) -> Interval:
         """
-        Advance with a linear change of the base velocity, without a force limit.
+        Advance for a duration [s] with a linear change of the base velocity to ``velocity`` [m/s].
 
-        Parameters
-        ----------
-        duration, velocity : float
-            Time to advance [s]; insertion velocity at the end [m/s], positive into the tissue.
-
-        Returns
-        -------
-        Interval
-            Mean values over the interval; the axial force is the force required by the motion. At
-            rest, friction takes the value within its bounds that minimizes this force.
-
-        Raises
-        ------
-        ParameterError, InsertionDepthError
-            As `advance`.
-
+        The axial force is the force required by the motion, without a limit. At rest, friction
+        takes the value within its bounds that minimizes this force.
         """
         return self._run(duration, Inputs(0.0, 0.0, float(velocity), True), 1)
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
         """
-        Advance under a constant base force with a speed limit of the base.
+        Advance for a duration [s] under a constant base force [N], up to a speed [m/s].
 
-        Parameters
-        ----------
-        duration, force : float
-            Time to advance [s]; insertion force of the base below the speed limit [N].
-        speed_limit : float
-            Highest speed of the base at the end [m/s].
-
-        Returns
-        -------
-        Interval
-            Mean values; at the limit the axial force is the force required by the motion.
-
-        Raises
-        ------
-        ParameterError, InsertionDepthError
-            As `advance`.
-
+        At the limit the axial force is the force required by the motion.
         """
         before, clock, depth = self._state.copy(), self.time, self.depth
         direction = force

@@ -77,35 +77,15 @@ class SimulatedPlant(ABC):
         self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
         """
-        Follow a trajectory from now on, linear in time between its points.
+        Follow a trajectory, linear between its points at times from now on [s].
 
-        Parameters
-        ----------
-        joints : sequence of str
-            Names of the joints.
-        times : sequence of float
-            Time of each point from now [s].
-        positions, efforts : sequence of sequence of float
-            Position [m or rad] of each joint at each point, or its force [N] at the end of a push.
-
-        Raises
-        ------
-        ParameterError
-            If the plant has no such joint, or a joint cannot follow; then no joint moves.
-
+        Positions [m or rad], or forces at the end of a push [N], are by point and joint.
+        ParameterError if a joint is unknown or cannot follow; then no joint moves.
         """
 
     @abstractmethod
     def references(self) -> dict[str, JointReference]:
-        """
-        Return the reference of the joints at the newest sample.
-
-        Returns
-        -------
-        dict of str to JointReference
-            Reference by joint; empty if no joint follows trajectories.
-
-        """
+        """Return the reference at the newest sample by joint; empty without trajectories."""
 
     def tare(self) -> None:
         """Zero the force sensor on the mean of its latest readings; JobError unless it rests."""
@@ -121,40 +101,18 @@ class SimulatedPlant(ABC):
     @abstractmethod
     def change(self, parameters: NeedleParameters) -> None:
         """
-        Change the constants of the needle and continue from the present state.
+        Change the constants of the needle, if there is one, and continue from the present state.
 
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Constants; ignored without a needle.
-
-        Raises
-        ------
-        ShapeError, InsertionDepthError
-            If the state is invalid for the new constants; the old constants are kept.
-
+        If the state is not valid for the new constants, the old constants are kept.
         """
 
     @abstractmethod
     def take(self, force: float, torque: float) -> list[Measurement]:
         """
-        Advance by one sample interval and return the measurements to publish.
+        Advance by one interval under force [N] and torque [N m]; return a measurement per topic.
 
-        Parameters
-        ----------
-        force, torque : float
-            Commanded force and torque [N, N m], for a needle without a robot.
-
-        Returns
-        -------
-        list of Measurement
-            One per topic, `joint_states` last, so that a responding node has all of them.
-
-        Raises
-        ------
-        InsertionDepthError
-            If the needle left the tissue.
-
+        `joint_states` is last, so that a responding node has all of them. InsertionDepthError if
+        the needle left the tissue.
         """
 
     @abstractmethod

@@ -61,19 +61,8 @@ class Plant(SimulatedPlant):
     """
     The needle under a commanded wrench, or moved by a base that follows the joint `insertion`.
 
-    Parameters
-    ----------
-    integrator : Integrator
-        Needle in its tissue.
-    sensor : ForceSensor
-        Sensor at the needle base.
-    rate : float
-        Samples per second [Hz].
-    base : BaseMotion, optional
-        Robot that moves the base; by default the commanded wrench acts.
-    tip : TipSensor, optional
-        Tip sensor; ideal by default.
-
+    The rate is in Hz; without a ``base`` the commanded wrench acts, without a ``tip`` sensor the
+    tip deflection is exact.
     """
 
     def __init__(
@@ -148,25 +137,9 @@ class Plant(SimulatedPlant):
 
     def advance(self, force: float = 0.0, torque: float = 0.0) -> PlantSample:
         """
-        Advance by one sample interval.
+        Advance by one interval and return the measurements at its end.
 
-        Parameters
-        ----------
-        force : float
-            Commanded insertion force [N]; ignored when a base moves the needle.
-        torque : float
-            Commanded torque about x [N m]; likewise.
-
-        Returns
-        -------
-        PlantSample
-            Measurements at the end of the interval.
-
-        Raises
-        ------
-        InsertionDepthError
-            If the needle left the tissue.
-
+        The force [N] and the torque about x [N m] are ignored if a base moves the needle.
         """
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0

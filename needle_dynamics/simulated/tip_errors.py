@@ -105,15 +105,7 @@ class TipErrors:
     """
     Errors of a tip sensor in time and space, independent of its white noise.
 
-    Parameters
-    ----------
-    parameters : TipErrorParameters
-        Sizes, times and lengths of the errors; sizes of zero change no measurement.
-    random : numpy.random.Generator
-        Random numbers of slow noise and distortion.
-    losses : numpy.random.Generator
-        Random numbers of lost samples, one per sample.
-
+    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each.
     """
 
     def __init__(
@@ -131,20 +123,9 @@ class TipErrors:
 
     def shifted(self, x: float, y: float, z: float, interval: float) -> tuple[float, float, float]:
         """
-        Return a tip position with slow noise and distortion.
+        Return a tip position x, y, z [m] with slow noise and distortion.
 
-        Parameters
-        ----------
-        x, y, z : float
-            Position of the tip in the frame of the sensor [m].
-        interval : float
-            Time since the previous sample [s].
-
-        Returns
-        -------
-        tuple of float
-            Position with errors, x, y and z [m].
-
+        It is in the frame of the sensor; the interval is the time since the previous sample [s].
         """
         if not (self._distorted or self._is_slow):
             return x, y, z

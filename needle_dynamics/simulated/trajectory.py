@@ -96,25 +96,7 @@ class Trajectory(Displayed):
         }
 
     def at(self, time: float) -> FloatArray:
-        """
-        Return the state at any time, integrated from the previous sample (dense output).
-
-        Parameters
-        ----------
-        time : float
-            Time [s].
-
-        Returns
-        -------
-        ndarray, shape (2 (2 + n),)
-            State.
-
-        Raises
-        ------
-        ParameterError
-            If the time is outside the run.
-
-        """
+        """Return the state at a time [s], integrated from the previous sample (dense output)."""
         if not self.time[0] <= time <= self.time[-1]:
             raise ParameterError(f'time must be in [0, {self.time[-1]:g}] s, got {time!r}')
         k = int(np.searchsorted(self.time, time, side='right')) - 1

@@ -141,20 +141,7 @@ class Insertion(Displayed):
         return tuple(bool(one) for one in self._punctured)
 
     def change(self, needle: NeedleParameters) -> None:
-        """
-        Change the constants along the axis, such as friction.
-
-        Parameters
-        ----------
-        needle : NeedleParameters
-            Needle and tissue; the lateral model is not changed.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid.
-
-        """
+        """Change the constants along the axis, such as friction, but not the lateral model."""
         self.axis = axis_of(needle, self.needle.steering)
 
     def push(
@@ -169,31 +156,12 @@ class Insertion(Displayed):
         tissue: Sequence[float] | None = None,
     ) -> float:
         """
-        Advance under a constant force.
+        Advance for a duration [s] under a constant force; return the mean force of the base [N].
 
-        Parameters
-        ----------
-        duration, force : float
-            Time [s]; insertion force [N], positive into the tissue.
-        speed_limit : float
-            Speed limit of the pushing device [m/s]; a needle that would move faster is carried at
-            this speed.
-        guide, tilt, roll, tissue : optional
-            Values at the end, as in `SteeredNeedle.move`. The tissue moves linearly in time, guide
-            and roll linearly with the depth.
-
-        Returns
-        -------
-        float
-            Mean force of the base on the needle [N].
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid.
-        InsertionDepthError
-            If the needle left the tissue.
-
+        A needle faster than the ``speed_limit`` [m/s] of the pushing device is carried at this
+        speed. ``guide``, ``tilt``, ``roll`` and ``tissue`` are values at the end, as in
+        `SteeredNeedle.move`; the tissue moves linearly in time, guide and roll with the depth.
+        InsertionDepthError if the needle left the tissue.
         """
         self._check(duration, 'force', force)
         placement = self.needle.checked(guide, tilt, roll, tissue)
@@ -222,29 +190,11 @@ class Insertion(Displayed):
         tissue: Sequence[float] | None = None,
     ) -> float:
         """
-        Advance with a linear change of the base velocity, without a force limit.
+        Advance for a duration [s] with a linear change of the base velocity to ``velocity`` [m/s].
 
-        Parameters
-        ----------
-        duration, velocity : float
-            Time [s]; insertion velocity at the end [m/s].
-        forces : ndarray, shape (parts,), optional
-            Overwritten with the mean force over each of the equal parts of the duration [N].
-        guide, tilt, roll, tissue : optional
-            As in `push`.
-
-        Returns
-        -------
-        float
-            Mean force of the base on the needle [N], positive into the tissue.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid.
-        InsertionDepthError
-            If the needle left the tissue or the hub reached the guide.
-
+        Return the mean force of the base on the needle [N], without a limit, and write the mean
+        over each of equal parts into ``forces``. Other arguments and errors are those of `push`;
+        it is also an error if the hub reaches the guide.
         """
         self._check(duration, 'velocity', velocity)
         placement = self.needle.checked(guide, tilt, roll, tissue)

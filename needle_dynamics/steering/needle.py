@@ -40,38 +40,18 @@ _SPARE: Final = 2  #: nodes per element of the needle: a restarted path uses an 
 
 
 class NeedleShape(NamedTuple):
-    """
-    Shape of the needle from the guide to the tip.
+    """Shape of the needle from the guide at -L0 to the tip."""
 
-    Attributes
-    ----------
-    depths : ndarray, shape (k,)
-        Distance y from the entry point [m], from the guide at -L0 to the tip.
-    deflections, slopes : ndarray, shape (k, 2)
-        Deflections in x and z [m]; derivatives of the deflections in y.
-
-    """
-
-    depths: FloatArray
-    deflections: FloatArray
-    slopes: FloatArray
+    depths: FloatArray  #: distance from the entry point [m], shape (k,)
+    deflections: FloatArray  #: deflections in x and z [m], shape (k, 2)
+    slopes: FloatArray  #: derivatives of the deflections in y, shape (k, 2)
 
 
 class NeedlePath(NamedTuple):
-    """
-    Path cut by the tip.
+    """Path cut by the tip."""
 
-    Attributes
-    ----------
-    depths : ndarray, shape (k,)
-        Distance y from the entry point [m].
-    deflections : ndarray, shape (k, 2)
-        Path position in x and z [m].
-
-    """
-
-    depths: FloatArray
-    deflections: FloatArray
+    depths: FloatArray  #: distance from the entry point [m], shape (k,)
+    deflections: FloatArray  #: path position in x and z [m], shape (k, 2)
 
 
 class Placement(NamedTuple):
@@ -244,28 +224,11 @@ class SteeredNeedle(Displayed):
         tissue: ArrayLike | None = None,
     ) -> None:
         """
-        Move the needle to a new pose; omitted values are kept.
+        Move to a depth of the tip [m], and guide position [m], tilt and roll [rad], if given.
 
         Guide and roll change linearly with the depth. To move the guide before the insertion, call
-        this method twice.
-
-        Parameters
-        ----------
-        depth : float, optional
-            Depth s of the tip [m].
-        guide, tilt : sequence of float, optional
-            Position [m] and tilt of the guide in x and z.
-        roll : float, optional
-            Roll of the base [rad].
-        tissue : array_like, optional
-            Displacement of the tissue with its path in x, y and z [m]; it precedes the needle
-            motion.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not finite, or the depth is out of range.
-
+        this method twice. ``tissue`` is the displacement of the tissue with its path in x, y and z
+        [m], which precedes the motion. ParameterError if a value is not valid.
         """
         to = self.depth if depth is None else _finite('depth', depth)
         placement = self.checked(guide, tilt, roll, tissue)
@@ -278,17 +241,7 @@ class SteeredNeedle(Displayed):
         self.bring(to, placement)
 
     def bring(self, depth: float, placement: Placement) -> None:
-        """
-        Move the needle to a valid pose.
-
-        Parameters
-        ----------
-        depth : float
-            Depth s of the tip [m], within the reach of the needle.
-        placement : Placement
-            Return value of `checked`.
-
-        """
+        """Move to a depth of the tip [m] within reach, and a placement of `checked`."""
         shift, before = placement.tissue, self._placement
         if shift is not before.tissue and (shift != before.tissue).any():
             here = self.depth
@@ -307,25 +260,7 @@ class SteeredNeedle(Displayed):
         roll: float | None,
         tissue: ArrayLike | None,
     ) -> Placement:
-        """
-        Check the arguments of `move` except the depth.
-
-        Parameters
-        ----------
-        guide, tilt, roll, tissue : optional
-            As in `move`.
-
-        Returns
-        -------
-        Placement
-            The values, present values where omitted.
-
-        Raises
-        ------
-        ShapeError, ParameterError
-            If a value is not valid.
-
-        """
+        """Check arguments of `move`, and return them with the present values for None."""
         now = self._placement
         if guide is None and tilt is None and roll is None and tissue is None:
             return now

@@ -34,12 +34,6 @@ class SteeringParameters:
     Constants of a needle that cuts its path, in addition to `NeedleParameters`, SI units.
 
     A tuple has one value for each tissue layer, or a single value for all layers.
-
-    Raises
-    ------
-    ParameterError
-        If a constant is not a number or is outside its range.
-
     """
 
     free_length: float = constant(0.02, 'm', 'length L0 of the needle between guide and skin')
@@ -90,22 +84,7 @@ class SteeringParameters:
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> SteeringParameters:
-        """
-        Return the constants of a needle by name, with changed fields.
-
-        Parameters
-        ----------
-        name : str
-            Name or file of a needle, as `needle_dynamics.find_needle`.
-        **changes : Any
-            Fields to replace.
-
-        Returns
-        -------
-        SteeringParameters
-            The constants.
-
-        """
+        """Return the constants of a needle of `find_needle` by name, with changed fields."""
         # Imported here: the needles are above this module.
         from needle_dynamics.needles import find_needle
 
