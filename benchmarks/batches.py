@@ -17,8 +17,9 @@ from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
-from needle_dynamics import Batch, FloatArray, NeedleModel, NeedleParameters, simulate_batch
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.compiled.step import run
+from needle_dynamics.simulated.batch import Batch
 import numpy as np
 
 #: Number of insertions.

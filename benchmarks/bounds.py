@@ -12,7 +12,9 @@ from collections.abc import Mapping
 from math import atan2, pi, sqrt
 from typing import Final, TypeAlias
 
-from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters, NeedleParameters
+from needle_dynamics import FloatArray, NeedleParameters
+from needle_dynamics.simulated.force_sensor import ForceSensorParameters
+from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_identification import FrictionSettings, StiffnessSettings
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np

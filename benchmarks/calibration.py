@@ -21,18 +21,10 @@ from unittest import mock
 from benchmarks.bounds import friction_truth, RATE, stiffness_truth, Truth
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
-from needle_dynamics import (
-    FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
-    Indenter,
-    IndenterParameters,
-    Integrator,
-    NeedleModel,
-    NeedleParameters,
-    ParameterError,
-)
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.plant import Plant
 from needle_identification import (
     ESTIMATORS,

@@ -185,7 +185,7 @@ def analyze(system: LinearSystem) -> Analysis:
     The two inputs move depth and rotation; neither bends a straight needle.
 
     >>> from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
-    >>> from needle_dynamics import operating_point
+    >>> from needle_dynamics.linearization import operating_point
     >>> model = NeedleModel(NeedleParameters.preset('phantom'))
     >>> found = analyze(linearize(model, operating_point(model, 0.05, velocity=5e-3)))
     >>> found.state.rank, found.observed.rank

@@ -140,7 +140,7 @@ def linearize(
     A straight needle that is inserted at 5 mm/s: neither input steers its deflection.
 
     >>> from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
-    >>> from needle_dynamics import operating_point
+    >>> from needle_dynamics.linearization import operating_point
     >>> model = NeedleModel(NeedleParameters.preset('phantom'))
     >>> system = linearize(model, operating_point(model, depth=0.05, velocity=5e-3))
     >>> system.A.shape

@@ -11,11 +11,12 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
-from needle_dynamics import JobError, ParameterError
+from needle_dynamics import ParameterError
 from needle_identification import message_counts, read_topic, RecordingError
 from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document
+from needle_ros.errors import JobError
 from needle_ros.timing import seconds
 import numpy as np
 from rclpy.duration import Duration

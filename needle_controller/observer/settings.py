@@ -7,8 +7,8 @@ from math import nan
 from typing import Final
 
 from needle_controller.compiled.filter import LowPass, Noise
-from needle_dynamics import FloatArray, ForceSensorParameters
-from needle_dynamics.simulated.force_sensor import low_pass
+from needle_dynamics import FloatArray
+from needle_dynamics.simulated.force_sensor import ForceSensorParameters, low_pass
 from needle_dynamics.simulated.tip_sensor import TipParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant

@@ -25,10 +25,9 @@ from needle_dynamics import (
     find_needle,
     FloatArray,
     NeedleParameters,
-    NeedlePath,
-    NeedleShape,
     SteeringParameters,
 )
+from needle_dynamics.steering.needle import NeedlePath, NeedleShape
 from needle_insertion.commands.common import (
     add_constants,
     add_needle,

@@ -9,16 +9,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
 
-from needle_dynamics import (
-    Analysis,
-    analyze,
-    linearize,
-    LinearSystem,
-    NeedleModel,
-    NeedleParameters,
-    operating_point,
-)
-from needle_dynamics.analysis import controllability_map, ControllabilityMap, Structure
+from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
+from needle_dynamics.analysis import Analysis, controllability_map, ControllabilityMap, Structure
+from needle_dynamics.linearization import LinearSystem, operating_point
 from needle_insertion.report.content import png
 from needle_ros.files import write_whole
 import numpy as np

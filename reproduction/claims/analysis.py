@@ -3,7 +3,7 @@
 
 from functools import cache
 
-from needle_dynamics import Analysis
+from needle_dynamics.analysis import Analysis
 from needle_insertion.report.controllability import analyze_points
 from reproduction.claims.claim import Finding, finding
 from reproduction.controllability import DEFLECTIONS, DEPTHS, SPEED

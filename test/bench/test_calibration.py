@@ -9,12 +9,9 @@ from typing import Any
 
 from benchmarks import bounds, calibration
 from benchmarks.calibration import CalibrationResult
-from needle_dynamics import (
-    ForceSensor,
-    ForceSensorParameters,
-    IndenterParameters,
-    NeedleParameters,
-)
+from needle_dynamics import NeedleParameters
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_identification import FrictionSettings
 from needle_insertion.cli import main
 import numpy as np

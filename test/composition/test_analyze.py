@@ -11,14 +11,8 @@ import re
 from typing import Any
 
 from matplotlib.image import imread
-from needle_dynamics import (
-    analyze,
-    linearize,
-    NeedleError,
-    NeedleModel,
-    NeedleParameters,
-    operating_point,
-)
+from needle_dynamics import analyze, linearize, NeedleError, NeedleModel, NeedleParameters
+from needle_dynamics.linearization import operating_point
 from needle_insertion.commands.analyze import COMMAND
 from needle_insertion.report import controllability
 import numpy as np

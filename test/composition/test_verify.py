@@ -13,15 +13,9 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
-from needle_dynamics import (
-    FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
-    Integrator,
-    NeedleModel,
-    NeedleParameters,
-)
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor

@@ -15,11 +15,8 @@ from needle_controller import Consistency, Measurement, Observer, ObserverSettin
 from needle_controller.load_estimator import LoadEstimator
 from needle_dynamics import (
     FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
     InsertionDepthError,
     Integrator,
-    Interval,
     NeedleError,
     NeedleModel,
     NeedleParameters,
@@ -28,6 +25,8 @@ from needle_dynamics import (
 )
 from needle_dynamics.analysis import observability
 from needle_dynamics.linearization import linearize, operating_point
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.simulated.integrator import Interval
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 import numpy as np

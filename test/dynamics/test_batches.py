@@ -6,7 +6,6 @@ from __future__ import annotations
 from typing import Any
 
 from needle_dynamics import (
-    Batch,
     FloatArray,
     InsertionDepthError,
     Integrator,
@@ -18,6 +17,7 @@ from needle_dynamics import (
     simulate,
     simulate_batch,
 )
+from needle_dynamics.simulated.batch import Batch
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from numpy.testing import assert_allclose

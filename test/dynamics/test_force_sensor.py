@@ -5,13 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from needle_dynamics import (
-    FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
-    ParameterError,
-    ShapeError,
-)
+from needle_dynamics import FloatArray, ParameterError, ShapeError
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
 from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose

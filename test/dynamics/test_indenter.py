@@ -7,14 +7,9 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics import (
-    FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
-    Indenter,
-    IndenterParameters,
-    ParameterError,
-)
+from needle_dynamics import FloatArray, ParameterError
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose

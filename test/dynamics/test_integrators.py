@@ -14,7 +14,6 @@ from needle_dynamics import (
     FloatArray,
     InsertionDepthError,
     Integrator,
-    Interval,
     NeedleModel,
     NeedleParameters,
     ParameterError,
@@ -23,7 +22,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.compiled.friction import slide
 from needle_dynamics.compiled.oscillator import decay_means
-from needle_dynamics.simulated.integrator import DEFAULT_STEP
+from needle_dynamics.simulated.integrator import DEFAULT_STEP, Interval
 import numpy as np
 from numpy.testing import assert_allclose
 from numpy.typing import ArrayLike

@@ -8,16 +8,10 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import (
-    Batch,
-    FloatArray,
-    NeedleModel,
-    NeedleParameters,
-    simulate,
-    simulate_batch,
-)
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate, simulate_batch
 from needle_dynamics.compiled.lanes import _decay_means, _sine_cosine, LANES
 from needle_dynamics.compiled.oscillator import decay_means
+from needle_dynamics.simulated.batch import Batch
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -8,7 +8,8 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import FloatArray, mode_shapes, ModeIntegrals, ModeShapes, ParameterError
+from needle_dynamics import FloatArray, mode_shapes, ModeShapes, ParameterError
+from needle_dynamics.compiled.integrals import ModeIntegrals
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -13,8 +13,6 @@ from needle_controller.steering.motion import duration_of, smooth
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics import (
     FloatArray,
-    ForceSensor,
-    ForceSensorParameters,
     InsertionDepthError,
     Integrator,
     NeedleModel,
@@ -25,6 +23,7 @@ from needle_dynamics import (
 from needle_dynamics.parameters import PRESETS
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.contract import INSERTION

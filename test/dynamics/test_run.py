@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from needle_dynamics import JobError, NeedleModel, NeedleParameters, ParameterError
+from needle_dynamics import NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.measured import Measurement
@@ -21,6 +21,7 @@ from needle_dynamics.simulated.run import (
     TIME,
     TRAJECTORY,
 )
+from needle_ros.errors import JobError
 import pytest
 
 #: A stamp with more digits than a float can hold to the nanosecond.

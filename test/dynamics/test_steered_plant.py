@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import Insertion, InsertionDepthError, JobError, ParameterError, SteeredNeedle
+from needle_dynamics import Insertion, InsertionDepthError, ParameterError, SteeredNeedle
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.measured import Measurement
@@ -16,6 +16,7 @@ from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TA
 from needle_dynamics.simulated.steered import SteeredPlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_ros.contract import STEERING_JOINTS
+from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

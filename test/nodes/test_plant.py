@@ -13,8 +13,10 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
-from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters
+from needle_dynamics import FloatArray
 from needle_dynamics.plant_node import PlantNode
+from needle_dynamics.simulated.force_sensor import ForceSensorParameters
+from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_insertion.graph.node_process import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict

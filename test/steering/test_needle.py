@@ -16,12 +16,12 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
     NEEDLES,
-    NeedleShape,
     ParameterError,
     ShapeError,
     SteeredNeedle,
     SteeringParameters,
 )
+from needle_dynamics.steering.needle import NeedleShape
 from needle_dynamics.steering.parameters import tissue_of
 import numpy as np
 from numpy.testing import assert_allclose

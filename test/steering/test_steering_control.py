@@ -30,7 +30,6 @@ from needle_controller.steering.laws.springs import SpringsLaw
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import (
     FloatArray,
-    JobError,
     NeedleParameters,
     NEEDLES,
     ParameterError,
@@ -38,6 +37,7 @@ from needle_dynamics import (
     SteeredNeedle,
     SteeringParameters,
 )
+from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest

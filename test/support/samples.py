@@ -8,7 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from needle_dynamics import ForceSensor, ForceSensorParameters, Integrator, NeedleParameters
+from needle_dynamics import Integrator, NeedleParameters
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
 from needle_identification import BagWriter, Recording
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
