@@ -71,8 +71,7 @@ def controllability(
     """
     Find the controllable states of (A, B), shapes (N, N) and (N, M), and the PBH distances.
 
-    The units of the pair are those of `LinearSystem.scaled`; ``names`` are of its states times
-    ``transform`` (N, N), ``scaled_names`` of its states.
+    The pair is in units of `LinearSystem.scaled`; ``names`` are of the states times ``transform``.
     """
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     order = len(names)

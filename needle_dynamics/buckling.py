@@ -36,11 +36,6 @@ def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
     EulerLoads
         Both loads [N]; infinite if the needle is fully inserted.
 
-    Raises
-    ------
-    InsertionDepthError
-        If the insertion depth is negative or not finite.
-
     Examples
     --------
     >>> from needle_dynamics import euler_loads, NeedleParameters

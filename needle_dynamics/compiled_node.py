@@ -15,12 +15,6 @@ class CompiledNode(BaseNode):
 
     Compiling or loading a function while the node is active is an error and is logged as such,
     because messages wait during that time.
-
-    Attributes
-    ----------
-    late : list of str
-        Functions that were compiled or loaded while the node was active.
-
     """
 
     #: Modules that numba imports at the conversion of the first array.
@@ -31,6 +25,7 @@ class CompiledNode(BaseNode):
 
     def __init__(self, name: str, **node_options: Any) -> None:
         self._compiled = 0
+        #: Functions that were compiled or loaded while the node was active.
         self.late: list[str] = []
         super().__init__(name, **node_options)
         self._listening = reports(self._on_function)

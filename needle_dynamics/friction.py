@@ -46,11 +46,6 @@ def add_friction_law(name: str, law: Callable[[float, float], float]) -> None:
         the friction must be positive at every speed. Viscous friction and the ratio on withdrawal
         are added by the model.
 
-    Raises
-    ------
-    ParameterError
-        If the name is not valid, or the function cannot be compiled or returns an invalid value.
-
     Examples
     --------
     >>> from needle_dynamics import add_friction_law, NeedleModel, NeedleParameters, simulate
@@ -116,11 +111,6 @@ class Friction:
         Speed scale over which friction decreases to mu_s [m/s] (``stribeck``).
     smoothing_speed : float
         Speed scale over which friction changes sign [m/s] (``tanh``).
-
-    Raises
-    ------
-    ParameterError
-        If the law is unknown or a constant is outside its range.
 
     """
 

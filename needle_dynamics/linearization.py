@@ -130,10 +130,6 @@ def linearize(
     ------
     StuckError
         If the needle is at rest, friction there has no derivative, and ``sliding`` is not given.
-    ParameterError
-        If an input is not finite or ``sliding`` is unknown.
-    ShapeError, InsertionDepthError
-        If the state is not valid.
 
     Examples
     --------
@@ -229,7 +225,7 @@ def linearize(
 def _friction(
     law: Friction, velocity: float, drive: float, sliding: str | None
 ) -> tuple[float, float]:
-    """Return the friction force [N] and its derivative with respect to velocity [N s/m]."""
+    """Return the friction force [N] and its derivative in the velocity [N s/m]."""
     if sliding is not None:
         check_choice('sliding', sliding, SLIDING)
     if velocity != 0.0:

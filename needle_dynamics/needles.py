@@ -112,11 +112,6 @@ def find_needle(name: str) -> NeedlePreset:
     NeedlePreset
         The constants.
 
-    Raises
-    ------
-    ParameterError
-        If the needle is unknown, or the file is not valid.
-
     Examples
     --------
     >>> find_needle('bending_35mm').steering.free_length

@@ -39,11 +39,6 @@ class NeedleParameters:
     The defaults are Table 3 and section 3.2.8 of [Boroomand2014]_ with Table 1 read as 0.3 N s/m
     (the preset `paper_si`).
 
-    Raises
-    ------
-    ParameterError
-        With the name, the value and the valid range of a constant.
-
     References
     ----------
     .. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling

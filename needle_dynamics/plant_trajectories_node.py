@@ -90,11 +90,7 @@ class PlantTrajectories:
         self._forget(self._moved)
 
     def pause(self, *, withdraws: bool = False) -> None:
-        """
-        Hold the joints that move, and begin no motion that awaits its start.
-
-        `withdraws` is whether the plant withdraws the needle, which is no trajectory.
-        """
+        """Hold the joints that move, or all if the plant withdraws; begin no motion."""
         self._paused = self._sampled
         self._held = [
             one

@@ -31,11 +31,6 @@ class Tissue:
     swelling_time : float
         Time constant of the swelling [s].
 
-    Raises
-    ------
-    ParameterError
-        If the layer depths do not increase from 0, or a constant is outside its range.
-
     """
 
     starts: tuple[float, ...]

@@ -80,9 +80,9 @@ class BaseMotion:
         """
         Start a new trajectory at a time and depth, linear in time between its points.
 
-        A point without a depth (None) ends a push: until its time the force changes linearly from
-        the force at the previous point, zero if that was no push. A motion after a push starts at
-        the actual position of the base, a new trajectory with the force of the active push.
+        A point without a depth (None) ends a push, during which the force changes linearly from
+        that of the previous point, zero if that was no push. A motion after a push starts at the
+        actual position of the base, a new trajectory with the force of the active push.
         """
         check_times(times)
         low, high = self._range
@@ -122,11 +122,7 @@ class BaseMotion:
         return float(self._times[-1])
 
     def reference(self, time: float) -> JointReference:
-        """
-        Return the reference at a time [s], on the clock of `velocity`.
-
-        A push has no position and velocity, a motion no effort.
-        """
+        """Return the reference at a time [s]; a push has no position, a motion no effort."""
         times, last = self._times, len(self._times) - 1
         # Clock rounding must not delay the end.
         arrived = time >= self.end - _ROUNDING

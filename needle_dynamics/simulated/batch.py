@@ -107,13 +107,6 @@ def simulate_batch(
     Batch
         Results.
 
-    Raises
-    ------
-    ShapeError
-        If the numbers of runs are inconsistent.
-    ParameterError, InsertionDepthError
-        If a value is not valid.
-
     Examples
     --------
     A hundred forces in parallel:

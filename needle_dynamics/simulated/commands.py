@@ -147,10 +147,9 @@ class Commands:
 
     def count_commanders(self, number: int) -> bool:
         """
-        Update the number of command publishers; return whether the conflict state changed.
+        Update the number of command publishers; return whether a conflict has begun or ended.
 
-        The conflict state changes from one publisher to several or back; then no force acts until
-        the next command.
+        Then no force acts until the next command.
         """
         duplicates = max(0, number - 1)
         if number != self._number:

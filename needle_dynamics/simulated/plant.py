@@ -34,8 +34,7 @@ def _friction_gained(friction: Friction, before: float, after: float) -> float:
     """
     Return the difference of friction between the end and the middle of an interval [N].
 
-    The velocity changes linearly. The mean friction over the interval would be delayed by half an
-    interval with respect to the velocity at its end.
+    The mean friction would be delayed by half an interval with respect to the velocity at the end.
     """
     if after == 0.0:
         return 0.0

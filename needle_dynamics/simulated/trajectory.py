@@ -158,8 +158,6 @@ def simulate(
 
     Raises
     ------
-    ParameterError, ShapeError
-        If an argument is not valid.
     InsertionDepthError
         If the needle leaves its range.
     ToleranceError

@@ -57,13 +57,6 @@ def insert_batch(
     ndarray, shape (runs, k, 3)
         Tip positions in x, y and z [m].
 
-    Raises
-    ------
-    ShapeError
-        If the numbers of runs or poses are inconsistent.
-    ParameterError
-        If a value is not valid.
-
     Examples
     --------
     >>> import numpy as np

@@ -80,11 +80,6 @@ class Insertion(Displayed):
     time : float
         Time [s], initially 0.
 
-    Raises
-    ------
-    ParameterError
-        If a value is not valid.
-
     Examples
     --------
     >>> from needle_dynamics import Insertion, NeedleParameters, SteeringParameters

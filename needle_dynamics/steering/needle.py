@@ -152,11 +152,6 @@ class SteeredNeedle(Displayed):
     seed : int
         Seed of the path noise.
 
-    Raises
-    ------
-    ParameterError
-        If a value is not valid.
-
     Examples
     --------
     >>> from needle_dynamics import NeedleParameters, SteeredNeedle, SteeringParameters

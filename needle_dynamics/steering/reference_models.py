@@ -18,10 +18,10 @@ def springs(
     needle: NeedleParameters, steering: SteeringParameters, depth: float
 ) -> tuple[FloatArray, FloatArray]:
     """
-    Return tip response and tip compliance of a needle on springs that pull it to the axis.
+    Return tip response and tip compliance at a tip depth [m], without memory of a path.
 
     The response (2, 2) is deflection [m] and slope of the tip per guide position [m] and tilt, the
-    compliance (2, 2) per lateral force [N] and moment [N m] at the tip, at a tip depth [m].
+    compliance (2, 2) per lateral force [N] and moment [N m] at the tip.
     """
     one = SteeredNeedle(needle, replace(steering, bevel_load=(0.0,), path_noise=0.0))
     # A straight path coincides with the axis.
