@@ -137,14 +137,9 @@ class Friction:
     @property
     def constants(self) -> FrictionConstants:
         """Constants in the layout of the compiled functions."""
+        names = FrictionConstants._fields[1:]
         return FrictionConstants(
-            LAW_NUMBERS[self.law],
-            float(self.coulomb),
-            float(self.viscous),
-            float(self.withdrawal),
-            float(self.breakaway),
-            float(self.stribeck_speed),
-            float(self.smoothing_speed),
+            LAW_NUMBERS[self.law], *(float(getattr(self, name)) for name in names)
         )
 
     def force(self, velocity: float, drive: float) -> float:

@@ -168,7 +168,15 @@ class NeedleParameters:
     @property
     def friction(self) -> Friction:
         """Friction along the insertion axis."""
-        return Friction(**{of: getattr(self, name) for of, name in _FRICTION_FIELDS.items()})
+        return Friction(
+            law=self.friction_law,
+            coulomb=self.coulomb_friction,
+            viscous=self.viscous_friction,
+            withdrawal=self.withdrawal_friction,
+            breakaway=self.breakaway_friction,
+            stribeck_speed=self.stribeck_speed,
+            smoothing_speed=self.smoothing_speed,
+        )
 
     @property
     def linear_density(self) -> float:
@@ -199,17 +207,6 @@ class NeedleParameters:
 
         return from_values(cls, {**asdict(find_needle(name).needle), **changes})
 
-
-#: Field of `NeedleParameters` by field of `Friction`.
-_FRICTION_FIELDS: Final = {
-    'law': 'friction_law',
-    'coulomb': 'coulomb_friction',
-    'viscous': 'viscous_friction',
-    'withdrawal': 'withdrawal_friction',
-    'breakaway': 'breakaway_friction',
-    'stribeck_speed': 'stribeck_speed',
-    'smoothing_speed': 'smoothing_speed',
-}
 
 _PAPER_SI = NeedleParameters()
 _PAPER_MM = replace(_PAPER_SI, viscous_friction=300.0)

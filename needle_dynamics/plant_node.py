@@ -15,8 +15,13 @@ from needle_dynamics.plant_display_node import PlantDisplay
 from needle_dynamics.plant_reports_node import SampleReports
 from needle_dynamics.plant_samples_node import SamplePublishers
 from needle_dynamics.plant_trajectories_node import PlantTrajectories
-from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
-from needle_dynamics.simulated.clock import build_sample_clock
+from needle_dynamics.simulated.assembly import (
+    build_sample_clock,
+    defaults_of,
+    LARGEST_SEED,
+    MODES,
+    SETTINGS,
+)
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE
 from needle_ros import contract

@@ -8,6 +8,7 @@ from math import expm1, inf
 from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.modes import ModeShapes
 from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
 import numpy as np
 
 
@@ -18,44 +19,24 @@ class Tissue:
 
     A single layer without swelling is the homogeneous tissue (8) of the source.
 
-    Attributes
-    ----------
-    starts : tuple of float
-        Depths at which the layers begin [m]; the first is 0.
-    stiffnesses : tuple of float
-        Stiffness of each layer per length [N/m^2].
-    damping : float
-        Damping c_a per length (Kelvin-Voigt) [N s/m^2].
-    swelling : float
-        Final relative increase of the stiffness over its value at time 0.
-    swelling_time : float
-        Time constant of the swelling [s].
-
     """
 
-    starts: tuple[float, ...]
-    stiffnesses: tuple[float, ...]
-    damping: float = 0.0
-    swelling: float = 0.0
-    swelling_time: float = 1.0
+    starts: tuple[float, ...] = constant((), 'm', 'depths at which the layers begin, the first 0')
+    stiffnesses: tuple[float, ...] = constant((), 'N/m^2', 'stiffness of each layer per length')
+    damping: float = constant(0.0, 'N s/m^2', 'damping c_a per length (Kelvin-Voigt)')
+    swelling: float = constant(
+        0.0, '1', 'final relative increase of the stiffness over its value at time 0',
+        low=-1.0, open_low=True,
+    )  # fmt: skip
+    swelling_time: float = constant(1.0, 's', 'time constant of the swelling', open_low=True)
 
     def __post_init__(self) -> None:
+        check_constants(self)
         ordered = all(low < high for low, high in pairwise(self.starts))
         if len(self.starts) != len(self.stiffnesses) or self.starts[:1] != (0.0,) or not ordered:
             raise ParameterError(
                 f'layers must start at 0 and go deeper, with one stiffness each, got starts '
                 f'{self.starts} and stiffnesses {self.stiffnesses}'
-            )
-
-        for name, low in (('damping', 0.0), ('swelling', -1.0), ('swelling_time', 0.0)):
-            value = getattr(self, name)
-            # Only damping may equal its lower bound.
-            if not low <= value < inf or (value == low and name != 'damping'):
-                raise ParameterError(f'{name} must be finite and above {low:g}, got {value!r}')
-        if not all(0.0 <= value < inf for value in (*self.starts, *self.stiffnesses)):
-            raise ParameterError(
-                f'layers must have finite starts and stiffnesses >= 0, got {self.starts} and '
-                f'{self.stiffnesses}'
             )
 
     def growth(self, time: float) -> float:
@@ -75,12 +56,10 @@ class Tissue:
     def layers(self, modes: ModeShapes) -> Layers:
         """Return the layers, with the contributions of the layers above to the mode integrals."""
         n, m = modes.count, len(self.starts)
-        gram, area, moment = np.zeros((m, n, n)), np.zeros((m, n)), np.zeros((m, n))
+        above = np.zeros((m, n, n)), np.zeros((m, n)), np.zeros((m, n))
         for i in range(1, m):
             at = modes.integrals(min(self.starts[i], modes.reach * modes.length))
             step = self.stiffnesses[i - 1] - self.stiffnesses[i]
-            gram[i] = gram[i - 1] + step * at.gram
-            area[i] = area[i - 1] + step * at.area
-            moment[i] = moment[i - 1] + step * at.moment
-        starts, stiffnesses = np.array(self.starts), np.array(self.stiffnesses)
-        return Layers(starts, stiffnesses, gram, area, moment)
+            for total, integral in zip(above, (at.gram, at.area, at.moment), strict=True):
+                total[i] = total[i - 1] + step * integral
+        return Layers(np.array(self.starts), np.array(self.stiffnesses), *above)

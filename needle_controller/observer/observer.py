@@ -33,7 +33,7 @@ from needle_controller.laws.axis import require_complete
 from needle_controller.observer.consistency import Consistency
 from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import FloatArray, InsertionDepthError, NeedleModel, NeedleParameters
-from needle_dynamics.statics import ROUNDING
+from needle_dynamics.model import ROUNDING
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
 from needle_ros.timing import NANOSECONDS
 import numpy as np

@@ -12,13 +12,12 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.step import CompiledNeedle, run
-from needle_dynamics.model import NeedleModel
+from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import count_of, floats
-from needle_dynamics.statics import ROUNDING
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -149,11 +148,11 @@ def simulate_batch(
     step = checked_step(step)
     runs = sizes.pop() if sizes else 1
     _check(each, starts)
-    course = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
+    inputs = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
     ends = np.array(np.broadcast_to(starts, (runs, starts.shape[1])))
     workers = thread_count(workers, runs)
     with progress_of(progress, runs, 'runs') as advance:
-        kept, completed = _take(each, ends, course, keep=keep, workers=workers, progress=advance)
+        kept, completed = _take(each, ends, inputs, keep=keep, workers=workers, progress=advance)
     time = np.arange(count + 1, dtype=np.float64) * interval
     return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
 
@@ -168,7 +167,7 @@ def thread_count(workers: int | None, runs: int) -> int:
 def _take(
     each: Sequence[NeedleParameters],
     states: FloatArray,
-    course: lanes.BatchTrajectory,
+    inputs: lanes.BatchTrajectory,
     *,
     keep: bool,
     workers: int,
@@ -176,7 +175,7 @@ def _take(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the states and the completed intervals of all runs; overwrite ``states``."""
     runs, width = states.shape
-    kept = np.full((runs, course.intervals + 1 if keep else 1, width), np.nan)
+    kept = np.full((runs, inputs.intervals + 1 if keep else 1, width), np.nan)
     completed = np.zeros(runs)
 
     @cache
@@ -186,17 +185,17 @@ def _take(
     def alone(some: IntArray) -> None:
         for i in some:
             push, turn = (
-                np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (course.intervals,)))
-                for values in (course.forces, course.torques)
+                np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (inputs.intervals,)))
+                for values in (inputs.forces, inputs.torques)
             )
             completed[i] = run(
-                needle(i % len(each)), states[i], push, turn, course.interval, course.longest,
-                course.graded, kept[i],
+                needle(i % len(each)), states[i], push, turn, inputs.interval, inputs.longest,
+                inputs.graded, kept[i],
             )  # fmt: skip
             progress()
 
     def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
-        lanes.run(needles, table, course, some, states, kept, completed)
+        lanes.run(needles, table, inputs, some, states, kept, completed)
         for _ in some:
             progress()
 
@@ -212,7 +211,7 @@ def _take(
         for done in [pool.submit(job) for job in jobs]:
             done.result()
     if not keep:
-        whole = completed == course.intervals
+        whole = completed == inputs.intervals
         kept[whole, 0] = states[whole]
     return kept, completed
 
@@ -257,19 +256,10 @@ def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
     return np.array(
         [
             lanes.Constants(
-                length=p.length,
-                linear_density=p.linear_density,
-                bending_stiffness=p.bending_stiffness,
-                tissue_stiffness=p.tissue_stiffness,
-                tissue_damping=p.tissue_damping,
-                moving_mass=p.moving_mass,
-                coulomb_friction=p.coulomb_friction,
-                viscous_friction=p.viscous_friction,
-                withdrawal_friction=p.withdrawal_friction,
+                **{name: getattr(p, name) for name in lanes.Constants._fields if hasattr(p, name)},
                 lowest=p.minimum_depth - ROUNDING * p.length,
                 highest=p.reach * p.length,
                 stop=p.length if p.hub_stop else inf,
-                rotary_inertia=p.rotary_inertia,
             )
             for p in each
         ]
