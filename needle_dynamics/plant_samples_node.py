@@ -86,7 +86,7 @@ class SamplePublishers:
             if fault is None or topic != faulty:
                 publish[topic](at, values)
             else:
-                for late, left in fault.leaves(at, values, FAULTY[topic]):
+                for late, left in fault.apply(at, values, FAULTY[topic]):
                     publish[topic](late, left)
 
     def repeat(self) -> None:

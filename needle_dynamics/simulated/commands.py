@@ -104,15 +104,15 @@ class Commands:
         if stamp < self.newest.stamp <= now + self._timeout:
             self.overtaken += 1
             return False, ''
-        complaint = self._complaint(frame, force, torque)
-        if complaint:
+        error = self._error(frame, force, torque)
+        if error:
             self.refused += 1
         # While several nodes publish commands no force acts, and their commands must expire.
-        acts = not complaint and self.may_move(now)
+        acts = not error and self.may_move(now)
         self.newest = AppliedForces(stamp, force, torque) if acts else AppliedForces(stamp)
-        return True, complaint
+        return True, error
 
-    def _complaint(self, frame: str, force: float, torque: float) -> str:
+    def _error(self, frame: str, force: float, torque: float) -> str:
         """Return the error message for an invalid command, or ''."""
         if frame not in ('', BASE):
             return f'a command must be in {BASE}, got {frame!r}; no force is applied'

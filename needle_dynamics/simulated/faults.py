@@ -2,7 +2,7 @@
 """Simulated measurement faults of a sensor, its cable or its driver."""
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, nan
 from typing import Final, TypeAlias
@@ -35,6 +35,10 @@ class FaultParameters(CheckedSettings):
     )  # fmt: skip
 
 
+#: Kinds of faults, see `SensorFault`.
+FAULTS: Final = ('drop', 'delay', 'duplicate', 'reorder', 'freeze', 'bias', 'nan', 'saturate')
+
+
 class SensorFault:
     """
     A fault of one measurement stream, with ``rate`` measurements per second [Hz].
@@ -48,8 +52,7 @@ class SensorFault:
     def __init__(self, kind: str, parameters: FaultParameters, rate: float, seed: int) -> None:
         if kind not in FAULTS:
             raise ParameterError(f'must be one of {", ".join(FAULTS)}, got {kind!r}')
-        self._act = FAULTS[kind]
-        self._parameters = parameters
+        self._kind, self._parameters = kind, parameters
         self._random = np.random.default_rng([seed, 2])
         #: Number of calls until a delayed measurement is published.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
@@ -58,66 +61,45 @@ class SensorFault:
         #: Delayed measurements, with the call at which they are published.
         self._waiting: deque[tuple[int, Reading]] = deque()
 
-    def leaves(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
+    def apply(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
         """
         Process a measurement (stamp in ns) and return the measurements to publish now.
 
         ``biased`` are the indices of the values changed by a bias or saturation.
         """
         self._calls += 1
-        reading = stamp, list(values)
         hit = self._random.random() < self._parameters.probability
-        now = self._act(self, reading, biased) if hit else [reading]
+        now = self._affected(stamp, list(values), biased) if hit else [(stamp, list(values))]
         while self._waiting and self._waiting[0][0] <= self._calls:
             now.append(self._waiting.popleft()[1])
         return now
 
-    def _drop(self, _reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        return []
+    def _affected(self, stamp: int, values: list[float], biased: Sequence[int]) -> list[Reading]:
+        reading = stamp, values
+        match self._kind:
+            case 'drop':
+                return []
+            case 'delay':
+                self._waiting.append((self._calls + self._late, reading))
+                return []
+            case 'duplicate':
+                return [reading, reading]
+            case 'reorder':
+                # A delayed measurement is published after the next one, which is not delayed.
+                if self._waiting:
+                    return [reading]
+                self._waiting.append((self._calls + 1, reading))
+                return []
+        return [(stamp, self._changed(values, biased))]
 
-    def _delay(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        self._waiting.append((self._calls + self._late, reading))
-        return []
-
-    def _duplicate(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        return [reading, reading]
-
-    def _reorder(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        # A delayed measurement is published after the next one, which is not delayed.
-        if self._waiting:
-            return [reading]
-        self._waiting.append((self._calls + 1, reading))
-        return []
-
-    def _freeze(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        if self._frozen is None:
-            self._frozen = reading[1]
-        return [(reading[0], list(self._frozen))]
-
-    def _bias(self, reading: Reading, biased: Sequence[int]) -> list[Reading]:
-        return [_changed(reading, biased, lambda value: value + self._parameters.size)]
-
-    def _nan(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        return [(reading[0], [nan] * len(reading[1]))]
-
-    def _saturate(self, reading: Reading, biased: Sequence[int]) -> list[Reading]:
-        bound = abs(self._parameters.size)
-        return [_changed(reading, biased, lambda value: min(max(value, -bound), bound))]
-
-
-def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], float]) -> Reading:
-    stamp, values = reading
-    return stamp, [change(value) if k in which else value for k, value in enumerate(values)]
-
-
-#: Functions that apply a fault to an affected measurement, by kind.
-FAULTS: Final[Mapping[str, Callable[[SensorFault, Reading, Sequence[int]], list[Reading]]]] = {
-    'drop': SensorFault._drop,
-    'delay': SensorFault._delay,
-    'duplicate': SensorFault._duplicate,
-    'reorder': SensorFault._reorder,
-    'freeze': SensorFault._freeze,
-    'bias': SensorFault._bias,
-    'nan': SensorFault._nan,
-    'saturate': SensorFault._saturate,
-}
+    def _changed(self, values: list[float], biased: Sequence[int]) -> list[float]:
+        size = self._parameters.size
+        if self._kind == 'freeze':
+            self._frozen = self._frozen or values
+            return list(self._frozen)
+        if self._kind == 'nan':
+            return [nan] * len(values)
+        for k in biased:
+            bias = self._kind == 'bias'
+            values[k] = values[k] + size if bias else min(max(values[k], -abs(size)), abs(size))
+        return values

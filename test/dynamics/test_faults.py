@@ -25,7 +25,7 @@ def through(
     """Return the published measurements of each call."""
     parameters = FaultParameters(probability=probability, delay=delay, size=size)
     fault = SensorFault(kind, parameters, 100.0, seed)
-    return [fault.leaves(stamp, values, biased) for stamp, values in STREAM]
+    return [fault.apply(stamp, values, biased) for stamp, values in STREAM]
 
 
 def test_dropped_measurements_are_lost() -> None:
