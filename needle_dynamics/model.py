@@ -85,12 +85,10 @@ class NeedleModel:
 
     @cached_property
     def tissue(self) -> Tissue:
-        """Tissue along the needle."""
         return self.parameters.tissue
 
     @cached_property
     def friction(self) -> Friction:
-        """Friction along the insertion axis."""
         return self.parameters.friction
 
     @cached_property

@@ -156,7 +156,6 @@ class NeedleParameters:
 
     @property
     def tissue(self) -> Tissue:
-        """Tissue along the needle."""
         return Tissue(
             starts=(0.0, *self.layer_depths),
             stiffnesses=(self.tissue_stiffness, *self.layer_stiffnesses),
@@ -167,7 +166,6 @@ class NeedleParameters:
 
     @property
     def friction(self) -> Friction:
-        """Friction along the insertion axis."""
         return Friction(
             law=self.friction_law,
             coulomb=self.coulomb_friction,

@@ -26,7 +26,6 @@ def time_message(stamp: int) -> TimeMessage:
 
 
 def _line(name: str, width: float, shade: float) -> Marker:
-    """Return a line marker."""
     line = Marker(ns=name, type=Marker.LINE_STRIP)
     line.pose.orientation.w = 1.0
     line.scale.x = width
@@ -36,7 +35,6 @@ def _line(name: str, width: float, shade: float) -> Marker:
 
 
 def _transform(shape: MeasuredShape, stamp: int, prefix: str) -> TransformStamped:
-    """Return the transform from the base to the tip, with the prefix of the frames."""
     (x, y, z), (i, j, k, w) = shape.tip
     made = TransformStamped(child_frame_id=prefix + contract.TIP)
     made.header.frame_id, made.header.stamp = prefix + contract.BASE, time_message(stamp)

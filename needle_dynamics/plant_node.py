@@ -217,7 +217,6 @@ class PlantNode(ModelNode):
             self._set_fault(changes)
 
     def _set_fault(self, changes: Mapping[str, Any]) -> None:
-        """Set the fault of the measurements from the parameters."""
         kind = self.text('fault.kind', (_NO_FAULT, *FAULTS), changes)
         topic = self.text('fault.topic', tuple(FAULTY), changes)
         parameters = self.settings('fault.', FaultParameters, changes)
@@ -281,7 +280,6 @@ class PlantNode(ModelNode):
             self._trajectories.displace('joint_commands are followed', self._run.commanded)
 
     def _take_command(self, offer: Callable[[PlantRun, int], tuple[bool, str]]) -> None:
-        """Handle a command from either topic."""
         plant_run = self._run
         if plant_run is None or not self.is_active:
             return
@@ -327,7 +325,6 @@ class PlantNode(ModelNode):
     def _answer(
         self, name: str, act: Callable[[PlantRun, Any], str], request: Any, response: Any
     ) -> Any:
-        """Execute a service request, or report the reason for its rejection."""
         try:
             if self._run is None or not self.is_active:
                 raise JobError('the plant is not active')

@@ -47,18 +47,15 @@ class SampleReports:
         )
 
     def _on_processed(self, message: Header) -> None:
-        """Record that a node has processed a sample."""
         if self._node.is_active:
             self._clock.answered(nanoseconds(message.stamp), message.frame_id)
             self._advance()
 
     def _on_participant(self, event: Any) -> None:
-        """Count the nodes for which each sample waits."""
         self._clock.participants = event.current_count
         self._node.publish_diagnostics()
 
     def _on_recorded(self, message: Header) -> None:
-        """Record the newest sample of a recorder."""
         recorded, stamp = self._clock.recorded, nanoseconds(message.stamp)
         before = len(recorded)
         recorded[message.frame_id] = stamp

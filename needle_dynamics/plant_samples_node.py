@@ -53,12 +53,10 @@ class SamplePublishers:
         self._stamps: deque[int] = deque(maxlen=ceil(constants.tip.delay * rate) + 1)
 
     def offer_clock(self) -> None:
-        """Create the publisher of the time."""
         self._clock = self._node.publisher(contract.CLOCK, always=True)
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Names of the published topics."""
         return tuple(self._publish)
 
     def begin(self) -> None:
@@ -71,7 +69,6 @@ class SamplePublishers:
             self._clock.publish(Clock(clock=time_message(stamp)))
 
     def publish(self, stamp: int, measured: list[Measurement]) -> None:
-        """Publish a sample."""
         self.rate.add(monotonic_ns())
         for value, limit in zip(measured[0][2], self._full_scale, strict=True):
             if abs(value) >= limit:

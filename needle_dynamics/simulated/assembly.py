@@ -161,7 +161,6 @@ class PlantConstants:
         return SteeredPlant(insertion, sensor, tip, own.rate, self.guide, self.base, base)
 
     def _base(self, deepest: float) -> BaseMotion | None:
-        """Return the robot in mode `robot`, otherwise None."""
         if self.mode != 'robot':
             return None
         depths = self.model.minimum_depth, deepest

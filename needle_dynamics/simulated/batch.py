@@ -252,7 +252,6 @@ def _fits(p: NeedleParameters) -> bool:
 
 
 def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
-    """Return the needle constants for `lanes.run`."""
     return np.array(
         [
             lanes.Constants(

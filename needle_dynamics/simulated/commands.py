@@ -113,7 +113,6 @@ class Commands:
         return True, error
 
     def _error(self, frame: str, force: float, torque: float) -> str:
-        """Return the error message for an invalid command, or ''."""
         if frame not in ('', BASE):
             return f'a command must be in {BASE}, got {frame!r}; no force is applied'
         largest, strongest = self._limits
@@ -126,7 +125,6 @@ class Commands:
         return ''
 
     def refuse(self) -> None:
-        """Count an invalid command and set the force to zero."""
         self.refused += 1
         self.newest = AppliedForces(self.newest.stamp)
 

@@ -129,14 +129,9 @@ class ForceSensor:
         self.samples = samples  #: internal samples per reading
         self._wrenches = np.empty((samples, 6))
         self._rng = np.random.default_rng(seed)
-        self._constants = np.array(
-            [
-                p.per_axis('noise'),
-                p.per_axis('drift') / np.sqrt(rate),
-                p.per_axis('range'),
-                p.per_axis('resolution'),
-            ]
-        )
+        names = ('noise', 'drift', 'range', 'resolution')
+        self._constants = np.array([p.per_axis(name) for name in names])
+        self._constants[1] /= np.sqrt(rate)
         self._offset = p.per_axis('bias')
         self._zero = np.zeros(6)
         self._sections = np.array([low_pass(cut, p.rate) for cut in p.cutoffs]).reshape(-1, 6)

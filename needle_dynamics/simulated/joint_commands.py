@@ -109,7 +109,6 @@ class JointCommands:
 
     @staticmethod
     def _by_joint(reading: Reading) -> list[dict[str, float]]:
-        """Return positions, velocities and efforts by joint."""
         names = reading.names
         if len({*names}) < len(names):
             raise ParameterError(f'names a joint twice: {", ".join(names)}')

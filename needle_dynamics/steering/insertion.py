@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from math import copysign, inf, isfinite
+from typing import Any
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, VELOCITY
@@ -158,9 +159,7 @@ class Insertion(Displayed):
         `SteeredNeedle.move`; the tissue moves linearly in time, guide and roll with the depth.
         InsertionDepthError if the needle left the tissue.
         """
-        self._check(duration, 'force', force)
-        placement = self.needle.checked(guide, tilt, roll, tissue)
-        self._drift_to(duration, placement.tissue)
+        placement = self._begin(duration, 'force', force, guide, tilt, roll, tissue)
         state, punctured = self._state.copy(), self._punctured.copy()
         forces = np.full(1, float(force))
         left = push(self.axis, state, punctured, forces[0], float(duration), self._step)
@@ -191,9 +190,7 @@ class Insertion(Displayed):
         over each of equal parts into ``forces``. Other arguments and errors are those of `push`;
         it is also an error if the hub reaches the guide.
         """
-        self._check(duration, 'velocity', velocity)
-        placement = self.needle.checked(guide, tilt, roll, tissue)
-        self._drift_to(duration, placement.tissue)
+        placement = self._begin(duration, 'velocity', velocity, guide, tilt, roll, tissue)
         forces = np.empty(1) if forces is None else forces
         left = self._carry(self._state, self._punctured, duration, velocity, forces)
         self._move_needle(duration, left, placement)
@@ -213,17 +210,17 @@ class Insertion(Displayed):
             carry_on(self.axis, state, punctured, relative, float(duration), self._step, forces)
         )
 
-    def _check(self, duration: float, name: str, value: float) -> None:
+    def _begin(self, duration: float, name: str, value: float, *pose: Any) -> Placement:
+        """Check the arguments of a motion, and move the tissue linearly: the axis is in its frame."""
         if not 0.0 < duration < inf:
             raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
         if not isfinite(value):
             raise ParameterError(f'{name} must be finite, got {value!r}')
-
-    def _drift_to(self, duration: float, shift: FloatArray) -> None:
-        """Move the tissue linearly to its new position: the axis is in the tissue frame."""
-        drift = float(shift[1] - self._tissue[1]) / duration
+        placement = self.needle.checked(*pose)
+        drift = float(placement.tissue[1] - self._tissue[1]) / duration
         self._state[VELOCITY] += self._drift - drift
         self._drift = drift
+        return placement
 
     def _move_needle(self, duration: float, left: float, placement: Placement) -> None:
         """Move the needle to the depth of the axis; an error if the axis has time left [s]."""
