@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from math import copysign, inf, isfinite
 from typing import Any
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.axis import AxisConstants, carry_on, DEPTH, push, VELOCITY
 from needle_dynamics.display import Displayed
 from needle_dynamics.errors import InsertionDepthError
@@ -166,8 +166,10 @@ class Insertion(Displayed):
         velocity = float(state[VELOCITY]) + self._drift
         if abs(velocity) > speed_limit:
             state[:], punctured[:] = self._state, self._punctured
-            limited = copysign(speed_limit, velocity)
-            left = self._carry(state, punctured, duration, limited, forces)
+            velocity = copysign(speed_limit, velocity) - self._drift
+            left = carry_on(
+                self.axis, state, punctured, velocity, float(duration), self._step, forces
+            )
         self._state, self._punctured = state, punctured
         self._move_needle(duration, left, placement)
         return float(forces[0])
@@ -192,26 +194,15 @@ class Insertion(Displayed):
         """
         placement = self._begin(duration, 'velocity', velocity, guide, tilt, roll, tissue)
         forces = np.empty(1) if forces is None else forces
-        left = self._carry(self._state, self._punctured, duration, velocity, forces)
+        left = carry_on(
+            self.axis, self._state, self._punctured, float(velocity) - self._drift,
+            float(duration), self._step, forces,
+        )  # fmt: skip
         self._move_needle(duration, left, placement)
         return float(forces.mean())
 
-    def _carry(
-        self,
-        state: FloatArray,
-        punctured: BoolArray,
-        duration: float,
-        velocity: float,
-        forces: FloatArray,
-    ) -> float:
-        """Carry the axis; return the remaining time when the needle left the tissue [s]."""
-        relative = float(velocity) - self._drift
-        return float(
-            carry_on(self.axis, state, punctured, relative, float(duration), self._step, forces)
-        )
-
     def _begin(self, duration: float, name: str, value: float, *pose: Any) -> Placement:
-        """Check the arguments of a motion, and move the tissue linearly: the axis is in its frame."""
+        """Check the arguments, and begin a linear motion of the tissue, the frame of the axis."""
         if not 0.0 < duration < inf:
             raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
         if not isfinite(value):
