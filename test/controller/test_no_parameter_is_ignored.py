@@ -23,7 +23,6 @@ from needle_controller import (
 from needle_controller.commissioning import CommissioningSettings
 from needle_dynamics import NeedleParameters
 from needle_dynamics.compiled.friction import FrictionConstants
-from needle_dynamics.parameters import _FRICTION_FIELDS
 from needle_dynamics.simulated.tip_sensor import TipParameters
 import pytest
 
@@ -63,8 +62,7 @@ def names_read() -> Iterator[str]:
 def test_every_parameter_is_read(settings: Any) -> None:
     """By its name, in computing code."""
     known: Any = getattr(settings, '_fields', None) or [one.name for one in fields(settings)]
-    # Friction constants are read together.
-    assert set(known) <= {*names_read(), *_FRICTION_FIELDS.values()}
+    assert set(known) <= {*names_read()}
 
 
 def forces(law: str, gains: dict[str, Any], **changes: Any) -> list[float]:
