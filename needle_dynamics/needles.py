@@ -49,20 +49,17 @@ class NeedlePreset(NamedTuple):
         return NeedlePreset(replaced(self.needle), replaced(self.steering), self.source)
 
 
-def _tube(outer: float, inner: float, modulus: float, tissue: float) -> NeedleParameters:
-    return replace(
+def _literature(
+    outer: float, inner: float, modulus: float, tissue: float, source: str
+) -> NeedlePreset:
+    """Return a round needle with outer and inner diameter [m]; other constants are the paper's."""
+    needle = replace(
         PRESETS['phantom'],
         youngs_modulus=modulus,
         area=pi / 4.0 * (outer**2 - inner**2),
         area_moment=pi / 64.0 * (outer**4 - inner**4),
         tissue_stiffness=tissue,
     )
-
-
-def _literature(
-    outer: float, inner: float, modulus: float, tissue: float, source: str
-) -> NeedlePreset:
-    needle = _tube(outer, inner, modulus, tissue)
     twist = needle.bending_stiffness / STEEL
     return NeedlePreset(needle, SteeringParameters(torsional_stiffness=twist), source)
 

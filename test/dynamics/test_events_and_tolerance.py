@@ -269,11 +269,13 @@ def test_tolerance_is_met_through_rest_and_impact() -> None:
     """Sticking and hub contact, where the motion is not smooth, do not stall the step control."""
     p = preset('paper_si')
     start = moving(p, 0.15, 1e-3, 0.0)
-    options = {'duration': 0.025, 'interval': 1e-3}
-    seen, fine = (
-        simulate(p, start, lambda t: 0.3 if t < 5e-3 else PUSH, **options, **accuracy)
-        for accuracy in ({'tolerance': 1e-6}, {'step': 1e-7})
-    )
+    options: dict[str, Any] = {'duration': 0.025, 'interval': 1e-3}
+
+    def force(time: float) -> float:
+        return 0.3 if time < 5e-3 else PUSH
+
+    seen = simulate(p, start, force, tolerance=1e-6, **options)
+    fine = simulate(p, start, force, step=1e-7, **options)
     assert np.all(seen.depth[:6] == seen.depth[0])
     assert seen.depth[-1] == LENGTH
     assert_allclose(seen.depth, fine.depth, atol=1e-6 * LENGTH)
