@@ -2,7 +2,7 @@
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from importlib import import_module
 import traceback
@@ -36,15 +36,20 @@ from std_msgs.msg import String
 
 def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
     """Convert a contract QoS to rclpy; `request` selects the profile of a subscription."""
-    reliable, latched = qos.reliable and not (request and qos.lossy), qos.latched
+    lossy, latched = request and qos.lossy, qos.latched
     lease = {'liveliness_lease_duration': Duration(seconds=qos.lease)} if qos.lease else {}
     return QoSProfile(
         depth=qos.depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        reliability=ReliabilityPolicy.BEST_EFFORT if lossy else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         liveliness=LivelinessPolicy.AUTOMATIC,
         **lease,
     )
+
+
+def key_values(values: Mapping[str, str]) -> list[KeyValue]:
+    """Convert values to those of a DiagnosticStatus."""
+    return [KeyValue(key=key, value=value) for key, value in values.items()]
 
 
 def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
@@ -52,18 +57,14 @@ def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
     return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def message_class(*type_names: str) -> Any:
-    """
-    Import the class of the only message type of a topic, such as ``sensor_msgs/msg/JointState``.
-
-    It raises `MessageError` for several types, and for a package that is not installed.
-    rosidl_runtime_py has the same function, but is not in the wheels.
-    """
+def message_class(*type_names: str, kind: str = 'msg') -> Any:
+    """Import the class of the only type of a topic, such as ``sensor_msgs/msg/JointState``."""
+    # rosidl_runtime_py has the same function, but is not in the wheels.
     if len(type_names) != 1:
         raise MessageError(f'topic has several types: {", ".join(type_names)}')
-    package, _, name = type_names[0].partition('/msg/')
+    package, _, name = type_names[0].partition(f'/{kind}/')
     try:
-        return getattr(import_module(f'{package}.msg'), name)
+        return getattr(import_module(f'{package}.{kind}'), name)
     except (ImportError, AttributeError, TypeError) as error:
         raise MessageError(f'{type_names[0]} is not installed') from error
 
@@ -83,35 +84,23 @@ class BaseNode(ParameterNode):
     """
     Lifecycle node with parameters from dataclasses and diagnostics.
 
-    A subclass declares its parameters in ``__init__`` (`declare_settings`) and overrides
-    `configure`, `activate`, `deactivate` and `diagnose`. It raises `NeedleError` to refuse a
-    transition; the error is logged. Publishers, subscriptions, services, clients and timers that
-    it creates in `configure` or later are destroyed with the configuration. Parameters in `LIVE`
-    may change in the configured node, which then calls `change`.
-
-    Attributes
-    ----------
-    failure : str or None
-        Reason of the last refused transition.
-    failed : bool
-        Whether the node failed at its task: its process then ends with status 1.
-    invalid : Counter
-        Number of invalid messages by topic.
-
+    A subclass declares its parameters in ``__init__`` (`declare_settings`), overrides the hooks,
+    and raises `NeedleError` in them to refuse a transition. Publishers, subscriptions, services,
+    clients and timers of `configure` or later are destroyed with the configuration.
     """
 
-    #: Modules with a slow import, imported before `configure`.
-    IMPORTS: ClassVar[tuple[str, ...]] = ()
+    IMPORTS: ClassVar[tuple[str, ...]] = ()  #: Modules with a slow import, before `configure`.
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
-        self.failure: str | None = None
-        self.failed = False
-        self.invalid: Counter[str] = Counter()
+        self.failure: str | None = None  #: Reason of the last refused transition.
+        self.failed = (
+            False  #: Whether the node failed at its task: its process ends with status 1.
+        )
+        self.invalid: Counter[str] = Counter()  #: Number of invalid messages by topic.
         self._preparation = Preparation(self.preparation())
         self._life_cycle = LifeCycle(self, self._preparation, self._is_valid)
-        #: Publishers, subscriptions and others of the unconfigured node; None in this state.
-        self._lasting: set[Any] | None = None
+        self._lasting: set[Any] | None = None  #: `_entities` before the configuration, if any.
         self.declare_text('autostart', True, 'configure and activate at start')
         self.declare_parameter(
             _PRIORITY,
@@ -131,11 +120,7 @@ class BaseNode(ParameterNode):
     # Hooks of subclasses.
 
     def preparation(self) -> Iterable[PreparationProgress]:
-        """
-        Return the slow steps before `configure`: imports, loading or compiling functions.
-
-        The steps run in a thread, while services are answered.
-        """
+        """Return the slow steps before `configure`, such as imports; a thread runs them."""
         return imports(self.IMPORTS)
 
     def cleanup(self) -> None:
@@ -186,12 +171,7 @@ class BaseNode(ParameterNode):
         take: Callable[[Reading], None],
         matched: Callable[[int], None] | None = None,
     ) -> Subscription:
-        """
-        Subscribe to a high-rate topic of a type in `wire.TYPES`, parsing messages from bytes.
-
-        `matched` receives the number of new publishers, before their first message, and zero after
-        a publisher has left.
-        """
+        """Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0."""
         name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
@@ -223,28 +203,18 @@ class BaseNode(ParameterNode):
         if self._configured:
             self._configuration.publish(String(data=self.configuration()))
 
-    # Lifecycle.
+    # Lifecycle: rclpy calls the methods `on_...`.
 
     @property
     def is_active(self) -> bool:
         return bool(self._state_machine.current_state[1] == 'active')
 
-    @property
-    def _is_finalized(self) -> bool:
-        return bool(self._state_machine.current_state[1] == 'finalized')
-
-    def begin(self, refused: Callable[[], None]) -> None:
+    def begin(self, refused: Callable[[], object]) -> None:
         """Prepare, configure and activate in a spinning executor; `refused` handles a failure."""
-
-        def start() -> None:
-            if not self.start():
-                refused()
-
-        self._life_cycle.when_prepared(start)
+        self._life_cycle.when_prepared(lambda: self.start() or refused())
 
     @property
     def is_preparing(self) -> bool:
-        """Whether the preparation thread is running."""
         return self._preparation.is_running
 
     def start(self) -> bool:
@@ -256,7 +226,6 @@ class BaseNode(ParameterNode):
             self.trigger_deactivate()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `configure`, and publish the configuration; rclpy calls this."""
 
         def configure() -> None:
             self._check_overrides()
@@ -276,7 +245,6 @@ class BaseNode(ParameterNode):
         return self._attempt(configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `activate`, and log the activation; rclpy calls this."""
 
         def activate() -> None:
             # Threads of new timers inherit the priority.
@@ -291,12 +259,10 @@ class BaseNode(ParameterNode):
         return done
 
     def _schedule(self, *, realtime: bool) -> None:
-        """Begin or end the real-time scheduling of the process."""
         if priority := self.get_parameter(_PRIORITY).value:
             set_priority(priority if realtime else 0)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `deactivate`; rclpy calls this."""
         return self._attempt(self._deactivate, super().on_deactivate, state)
 
     def _deactivate(self) -> None:
@@ -304,12 +270,10 @@ class BaseNode(ParameterNode):
         self._schedule(realtime=False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `cleanup`, and unlock the parameters; rclpy calls this."""
         self._configured = False
         return self._attempt(self._clean_up, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `deactivate` if the node is active, and `cleanup`; rclpy calls this."""
 
         def leave() -> None:
             if state.label == 'active':
@@ -319,7 +283,6 @@ class BaseNode(ParameterNode):
         return self._attempt(leave, super().on_shutdown, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Return to unconfigured after an unexpected error; rclpy calls this."""
         self._configured = False
         self._clean_up()
         self._schedule(realtime=False)
@@ -376,16 +339,15 @@ class BaseNode(ParameterNode):
         if self.failure:
             severity, message = Severity.ERROR, self.failure
         self._last_severity = severity
-        status = replace(
-            diagnosis.status, invalid_messages=self.invalid, failure=self.failure or ''
-        )
-        values = status.to_values()
+        failure = self.failure or ''
+        status = replace(diagnosis.status, invalid_messages=self.invalid, failure=failure)
+        finalized = self._state_machine.current_state[1] == 'finalized'
         published = DiagnosticStatus(
-            level=STALE if self._is_finalized else severity.level,
+            level=STALE if finalized else severity.level,
             name=f'{self.get_fully_qualified_name()}: {TASK}',
             message=message,
             hardware_id=self.get_namespace().strip('/') or HARDWARE,
-            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+            values=key_values(status.to_values()),
         )
         array = DiagnosticArray(status=[published])
         array.header.stamp = self.get_clock().now().to_msg()

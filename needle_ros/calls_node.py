@@ -25,23 +25,17 @@ class _Call:
     repeats: int = 0
 
     def send(self) -> None:
-        """Send the request; the first response is used."""
         answer = self.client.call_async(self.request)
+        answer.add_done_callback(lambda done: self.end(done.result()))
 
-        def on_answer(done: Future) -> None:
-            if not self.later.done():
-                self.later.set_result(done.result())
-
-        answer.add_done_callback(on_answer)
+    def end(self, result: Any = None) -> None:
+        """Set the first result: a response, or None without one."""
+        if not self.later.done():
+            self.later.set_result(result)
 
 
 class Calls:
-    """
-    Service client that repeats each call without a response after 1 s, up to three times.
-
-    A request may be executed twice, so only idempotent services may be called; all services of the
-    suite are idempotent. The owner of ``node`` spins it.
-    """
+    """Service client that repeats calls without a response; services must be idempotent."""
 
     def __init__(self, node: Node) -> None:
         self._calls: list[_Call] = []
@@ -55,23 +49,18 @@ class Calls:
         return made.later
 
     def _check(self) -> None:
-        """Repeat calls without a response, and end those after the timeout."""
         now = monotonic()
+        self._calls = [one for one in self._calls if not one.later.done()]
         for one in self._calls:
             elapsed = now - one.begun
-            repeats = min(requests.REPEATS, int(elapsed / requests.REPEAT_AFTER))
-            if one.later.done():
-                continue
             if elapsed > requests.CALL_TIMEOUT:
-                one.later.set_result(None)
-            elif one.repeats < repeats:
+                one.end()
+            elif one.repeats < min(requests.REPEATS, int(elapsed / requests.REPEAT_AFTER)):
                 one.repeats += 1
                 one.send()
-        self._calls = [one for one in self._calls if not one.later.done()]
 
     def abandon(self) -> None:
         """End all calls without a response, before their clients are destroyed."""
         calls, self._calls = self._calls, []
         for one in calls:
-            if not one.later.done():
-                one.later.set_result(None)
+            one.end()

@@ -14,14 +14,12 @@ from typing import Final, NamedTuple
 
 from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 
-#: Frames: fixed at the entry point; at the needle base, parallel to the first.
-ENTRY: Final = 'needle_entry'
-BASE: Final = 'needle_base'
+ENTRY: Final = 'needle_entry'  #: Frame fixed at the entry point.
+BASE: Final = 'needle_base'  #: Frame at the needle base, parallel to `ENTRY`.
 TIP: Final = 'needle_tip'  #: Frame at the tip, y along the needle.
 
-#: Joint along the needle, and joint of the base about x.
-INSERTION: Final = 'insertion'
-ROTATION: Final = 'rotation'
+INSERTION: Final = 'insertion'  #: Joint along the needle.
+ROTATION: Final = 'rotation'  #: Joint of the base about x.
 
 #: Joints of a steering robot: lateral position and tilt of the guide, and roll of the needle.
 GUIDE_X: Final = 'guide_x'
@@ -35,54 +33,38 @@ USER: Final = 'user'
 
 
 class Qos(NamedTuple):
-    """Quality of service that the publishers of a topic offer."""
+    """Quality of service that the publishers of a topic offer; all are reliable."""
 
     name: str  #: Name in the documentation.
-    reliable: bool  #: Whether a lost message is sent again.
-    latched: bool  #: Whether late-joining subscribers receive the previous messages.
-    depth: int  #: Messages kept for a busy or late-joining subscriber.
-    #: Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
-    lossy: bool = False
-    #: Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
-    lease: float = 0.0
+    latched: bool = False  #: Whether late-joining subscribers receive the previous messages.
+    depth: int = 1  #: Messages kept for a busy or late-joining subscriber.
+    lossy: bool = False  #: Whether the nodes of the suite request best effort nevertheless.
+    lease: float = 0.0  #: Liveliness lease [s]; 0: DDS detects a dead publisher after 20 s.
 
 
 class Stamp(Enum):
-    """
-    Meaning of the stamp of a message, which decides whether its age matters.
+    """Meaning of the stamp of a message, which decides whether its age matters."""
 
-    `needle_controller.safety.input_monitor.InputMonitor` checks samples by this rule,
-    `needle_ros.requests.RequestLog` checks requests.
-    """
-
-    #: Time of a sample, or of the sample that a command answers. Older messages and messages
-    #: out of order are discarded; the limit is a parameter of the subscriber
-    #: (``measurement_timeout``, ``sensor_timeout``, ``command_timeout``).
+    #: Time of a sample, or of the sample that a command answers: an `InputMonitor` discards
+    #: messages out of order or older than a parameter of the subscriber.
     SAMPLE = 'sample'
-    #: Time at which the request was sent. It identifies and orders requests: a duplicate is
-    #: answered but not executed again, and a request older than the current request is not
-    #: executed. It is valid for `REQUEST_AGE`. Zero means now.
+    #: Time at which the request was sent: it identifies and orders requests in a `RequestLog`, and
+    #: is valid for `REQUEST_AGE`. Zero means now.
     REQUEST = 'request'
     UNCHECKED = 'unchecked'  #: Not checked: the message is a result, or information for users.
 
 
-#: Maximum age of a request [s]. It covers three repetitions at intervals of 1 s and a delay of
-#: 1 s, and excludes requests of a recording that is played back.
-REQUEST_AGE: Final = 5.0
-
+REQUEST_AGE: Final = 5.0  #: Maximum age of a request [s]: three repetitions, and a delay of 1 s.
 
 #: Compatible with subscribers with default QoS; nodes of the suite do not need retransmission of a
 #: late sample. The depth holds a burst after a stall of the subscriber.
-SENSOR: Final = Qos('reliable or best effort', reliable=True, latched=False, depth=50, lossy=True)
+SENSOR: Final = Qos('reliable or best effort', depth=50, lossy=True)
 
-#: Only the newest message matters, and delivery must be reliable.
-COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
-
-#: No messages: liveliness of a publisher.
-ALIVE: Final = Qos('lease of 0.5 s', reliable=True, latched=False, depth=1, lease=0.5)
-
-#: The last message reaches late-joining subscribers.
-LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
+COMMAND: Final = Qos('reliable')  #: Only the newest message matters.
+ALIVE: Final = Qos('lease of 0.5 s', lease=0.5)  #: No messages: liveliness of a publisher.
+LATCHED: Final = Qos(
+    'latched', latched=True
+)  #: Late-joining subscribers receive the last message.
 
 
 class Joint(NamedTuple):
@@ -116,17 +98,23 @@ _QUANTITIES: Final = {
 class Topic:
     """A topic of the contract."""
 
-    #: Name, relative to the namespace of the node; ``~`` stands for the node.
-    name: str
+    name: str  #: Name, relative to the namespace of the node; ``~`` stands for the node.
     type_name: str
     publisher: str  #: Publishing nodes, `EVERY_NODE`, or `USER`.
-    #: Content of the messages, for the documentation.
-    meaning: str
     qos: Qos = SENSOR
     frame: str = ''  #: Frame of the header, '' without a frame.
-    #: Joints of a JointState.
-    joints: tuple[Joint, ...] = ()
+    joints: tuple[Joint, ...] = ()  #: Joints of a JointState.
     stamp: Stamp = Stamp.UNCHECKED
+    meaning: str = ''  #: Content of the messages, for the documentation.
+
+    def described(self, meaning: str) -> Topic:
+        """Return the topic with a description of its messages."""
+        return replace(self, meaning=meaning)
+
+    def with_joints(self, *joints: Joint, efforts: bool = True) -> Topic:
+        """Return the topic of a JointState with other joints, optionally without efforts."""
+        kept = joints if efforts else (joint._replace(effort='') for joint in joints)
+        return replace(self, joints=tuple(kept))
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -139,339 +127,233 @@ class Topic:
             *(Quantity(f'effort of {j.name}', j.effort) for j in self.joints if j.effort),
         )
 
-    def without_efforts(self) -> Topic:
-        """Return the topic of a JointState without efforts."""
-        return replace(self, joints=tuple(joint._replace(effort='') for joint in self.joints))
-
     def template(self) -> Template:
         """Return a template that writes and reads messages of this topic."""
+        names = [joint.name for joint in self.joints]
         efforts = sum(bool(joint.effort) for joint in self.joints)
-        return Template(
-            self.type_name,
-            self.frame,
-            names=[joint.name for joint in self.joints],
-            counts=(len(self.joints), len(self.joints), efforts),
-        )
+        counts = (len(names), len(names), efforts)
+        return Template(self.type_name, self.frame, names=names, counts=counts)
 
 
-JOINT_STATES: Final = Topic(
-    'joint_states',
-    JOINT_STATE,
-    'plant',
-    'encoders of the robot: insertion depth and rotation; effort: axial force and torque '
-    'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
-    '`guide_tilt_z`, `roll` [rad]',
-    joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
-    stamp=Stamp.SAMPLE,
-)
+_STRING: Final = 'std_msgs/msg/String'
+_DIAGNOSTICS: Final = 'diagnostic_msgs/msg/DiagnosticArray'
 
-#: Joints of a steered needle in addition to `insertion`.
+#: The newest messages of several publishers.
+_COMMANDS: Final = COMMAND._replace(depth=10)
+
+#: Joints of the needle, and joints of a steered needle in addition to `insertion`.
+_NEEDLE_JOINTS: Final = (Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m'))
 STEERING_JOINTS: Final = (
     Joint(GUIDE_X, 'm', 'N'), Joint(GUIDE_Z, 'm', 'N'), Joint(TILT_X, 'rad', 'N m'),
     Joint(TILT_Z, 'rad', 'N m'), Joint(ROLL, 'rad', 'N m'),
 )  # fmt: skip
 
+JOINT_STATES: Final = Topic(
+    'joint_states', JOINT_STATE, 'plant', joints=_NEEDLE_JOINTS, stamp=Stamp.SAMPLE
+).described(
+    'encoders of the robot: insertion depth and rotation; effort: axial force and torque '
+    'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
+    '`guide_tilt_z`, `roll` [rad]'
+)
 
-def steered_states() -> Topic:
+
+def steered_states(*, efforts: bool = True) -> Topic:
     """Return `JOINT_STATES` of a steered needle: `insertion` and the guide joints."""
-    return replace(JOINT_STATES, joints=(JOINT_STATES.joints[0], *STEERING_JOINTS))
+    return JOINT_STATES.with_joints(_NEEDLE_JOINTS[0], *STEERING_JOINTS, efforts=efforts)
 
 
 BASE_WRENCH: Final = Topic(
-    'base_wrench',
-    WRENCH,
-    'plant',
+    'base_wrench', WRENCH, 'plant', frame=BASE, stamp=Stamp.SAMPLE
+).described(
     'force sensor, force of the base on the needle: `force.y` axial, `force.z` lateral '
-    '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
-    frame=BASE,
-    stamp=Stamp.SAMPLE,
+    '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue'
 )
 
 TIP_DEFLECTION: Final = Topic(
-    'tip_deflection',
-    POINT,
-    'plant',
+    'tip_deflection', POINT, 'plant', frame=ENTRY, stamp=Stamp.SAMPLE
+).described(
     'tracker or imager: `point.y` insertion depth, `point.z` deflection of the tip [m]; '
-    'steered: `point.x` too',
-    frame=ENTRY,
-    stamp=Stamp.SAMPLE,
+    'steered: `point.x` too'
 )
 
 GROUND_TRUTH: Final = Topic(
     'ground_truth',
     JOINT_STATE,
     'plant',
-    'simulation only: d (length outside the tissue), theta and q1..qn, the full state; '
-    'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
-    'generalized forces applied since the previous sample',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
     stamp=Stamp.SAMPLE,
+).described(
+    'simulation only: d (length outside the tissue), theta and q1..qn, the full state; '
+    'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
+    'generalized forces applied since the previous sample'
 )
 
 
 def ground_truth(modes: int, *, commanded: bool) -> Topic:
-    """
-    Return `GROUND_TRUTH` with all joints of a plant with a number of shape modes.
-
-    `commanded` adds the efforts of mode `simulation`, in which commands move the needle.
-    """
+    """Return `GROUND_TRUTH` of a number of shape modes, with efforts if commands move it."""
     bending = [Joint(f'q{k + 1}', 'm^1.5', 'N m^-0.5') for k in range(modes)]
-    joints = (Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m'), *bending)
-    truth = replace(GROUND_TRUTH, joints=joints)
-    return truth if commanded else truth.without_efforts()
+    axial = Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m')
+    return GROUND_TRUTH.with_joints(*axial, *bending, efforts=commanded)
 
 
 def steered_truth(*, commanded: bool) -> Topic:
-    """Return `GROUND_TRUTH` of a steered needle; `commanded` adds the efforts."""
+    """Return `GROUND_TRUTH` of a steered needle, with efforts if commands move it."""
     joints = (
         Joint('d', 'm', 'N'), Joint('tip_x', 'm', 'N'), Joint('tip_z', 'm', 'N'),
         Joint('tip_roll', 'rad', 'N m'),
     )  # fmt: skip
-    truth = replace(GROUND_TRUTH, joints=joints)
-    return truth if commanded else truth.without_efforts()
+    return GROUND_TRUTH.with_joints(*joints, efforts=commanded)
 
 
-END_EFFECTOR_POSE: Final = Topic(
-    'end_effector_pose',
-    POSE,
-    'plant',
-    'mode `indenter`: position of the end-effector [m]',
-    frame=ENTRY,
+END_EFFECTOR_POSE: Final = Topic('end_effector_pose', POSE, 'plant', frame=ENTRY).described(
+    'mode `indenter`: position of the end-effector [m]'
 )
 
 NEEDLE_SHAPE: Final = Topic(
-    'needle_shape',
-    'visualization_msgs/msg/Marker',
-    'plant',
-    'the needle as a line, and its cut path, 30 Hz while there is a subscriber',
-    frame=ENTRY,
-)
+    'needle_shape', 'visualization_msgs/msg/Marker', 'plant', frame=ENTRY
+).described('the needle as a line, and its cut path, 30 Hz while there is a subscriber')
 
 NEEDLE_POSES: Final = Topic(
-    'needle_poses',
-    'geometry_msgs/msg/PoseArray',
-    'plant',
-    'poses along the needle, y along it, 30 Hz while there is a subscriber',
-    frame=ENTRY,
-)
+    'needle_poses', 'geometry_msgs/msg/PoseArray', 'plant', frame=ENTRY
+).described('poses along the needle, y along it, 30 Hz while there is a subscriber')
 
+# The depth is that of the subscription of rclpy.
 CLOCK: Final = Topic(
-    '/clock',
-    'rosgraph_msgs/msg/Clock',
-    'plant',
-    'simulated time, with `publish_clock` or `lockstep`',
-    # Like the subscription of rclpy.
-    qos=SENSOR._replace(depth=1),
-)
+    '/clock', 'rosgraph_msgs/msg/Clock', 'plant', SENSOR._replace(depth=1)
+).described('simulated time, with `publish_clock` or `lockstep`')
 
-EVENTS: Final = Topic(
-    '~/events',
-    'diagnostic_msgs/msg/DiagnosticArray',
-    'plant',
+# All events, also for a late-joining subscriber.
+EVENTS: Final = Topic('~/events', _DIAGNOSTICS, 'plant', LATCHED._replace(depth=1000)).described(
     'inputs of the plant other than commands (trajectories, disturbances), with the number of '
-    'their first sample: [replay.md](replay.md)',
-    # All events, also for a late-joining subscriber.
-    qos=LATCHED._replace(depth=1000),
+    'their first sample: [replay.md](replay.md)'
 )
 
 WRENCH_COMMAND: Final = Topic(
-    'wrench_command',
-    WRENCH,
-    'controller',
-    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; stamp of the answered '
-    'sample',
-    qos=COMMAND,
-    frame=BASE,
-    stamp=Stamp.SAMPLE,
+    'wrench_command', WRENCH, 'controller', COMMAND, BASE, stamp=Stamp.SAMPLE
+).described(
+    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; stamp of the answered sample'
 )
 
 JOINT_COMMANDS: Final = Topic(
-    'joint_commands',
-    JOINT_STATE,
-    'ros2_control',
+    'joint_commands', JOINT_STATE, 'ros2_control', COMMAND, '', _NEEDLE_JOINTS, Stamp.SAMPLE
+).described(
     'from the hardware interface of ros2_control, NaN without a command; mode `simulation`: '
     'efforts, in place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
-    'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)',
-    qos=COMMAND,
-    joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
-    stamp=Stamp.SAMPLE,
+    'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)'
 )
 
 COMMANDER: Final = Topic(
-    'wrench_command/alive',
-    'std_msgs/msg/Empty',
-    'controller',
-    'no messages: the end of its lease indicates a dead controller',
-    qos=ALIVE,
-)
+    'wrench_command/alive', 'std_msgs/msg/Empty', 'controller', ALIVE
+).described('no messages: the end of its lease indicates a dead controller')
 
-MEASURER: Final = replace(
-    COMMANDER,
-    name='joint_states/alive',
-    publisher='plant',
-    meaning='no messages: the end of its lease indicates a dead plant',
+MEASURER: Final = Topic('joint_states/alive', 'std_msgs/msg/Empty', 'plant', ALIVE).described(
+    'no messages: the end of its lease indicates a dead plant'
 )
 
 PROCESSED: Final = Topic(
-    'joint_states/_processed',
-    'std_msgs/msg/Header',
-    'steering',
+    'joint_states/_processed', 'std_msgs/msg/Header', 'steering', _COMMANDS
+).described(
     'lockstep: stamp of a sample that a node (named in `frame_id`) has processed, after its '
-    'motions; a plant with `lockstep` waits for all publishers; not recorded',
-    # Several nodes publish.
-    qos=COMMAND._replace(depth=10),
+    'motions; a plant with `lockstep` waits for all publishers; not recorded'
 )
 
-RECORDED: Final = replace(
-    PROCESSED,
-    name='joint_states/_recorded',
-    publisher='recorder',
-    meaning='stamp of the newest recorded sample, zero at the end of recording; a plant with an '
-    'independent time is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
+RECORDED: Final = Topic(
+    'joint_states/_recorded', 'std_msgs/msg/Header', 'recorder', _COMMANDS
+).described(
+    'stamp of the newest recorded sample, zero at the end of recording; a plant with an '
+    'independent time is at most 80 samples ahead of it, with `lockstep` 10; not recorded'
 )
 
 REFERENCE: Final = Topic(
-    'reference',
-    JOINT_STATE,
-    'controller',
-    'insertion depth and velocity of the reference',
-    joints=(Joint(INSERTION, 'm'),),
-)
+    'reference', JOINT_STATE, 'controller', joints=(Joint(INSERTION, 'm'),)
+).described('insertion depth and velocity of the reference')
 
-TRACKING_ERROR: Final = Topic(
-    'tracking_error',
-    JOINT_STATE,
-    'controller',
-    'reference minus measurement',
-    joints=(Joint(INSERTION, 'm'),),
+TRACKING_ERROR: Final = replace(
+    REFERENCE, name='tracking_error', meaning='reference minus measurement'
 )
 
 TARGET: Final = Topic(
-    'target',
-    POINT,
-    f'{USER}, slicer',
+    'target', POINT, f'{USER}, slicer', COMMAND, ENTRY, stamp=Stamp.REQUEST
+).described(
     '`point.y`: target insertion depth [m]; to the node `steering`: target position of the tip, '
-    'x, y, z [m]',
-    qos=COMMAND,
-    frame=ENTRY,
-    stamp=Stamp.REQUEST,
+    'x, y, z [m]'
 )
 
+# Several nodes publish.
 SYSTEM_STATE: Final = Topic(
     'system_state',
     'diagnostic_msgs/msg/DiagnosticStatus',
     'controller, steering, plant',
+    LATCHED._replace(depth=10),
+).described(
     'mode of the system (running, paused, retracting, stopped) with the reason of a stop; on '
-    'change and 1 Hz',
-    # Several nodes publish.
-    qos=LATCHED._replace(depth=10),
+    'change and 1 Hz'
 )
 
-EMERGENCY_STOP: Final = Topic(
-    'emergency_stop',
-    'std_msgs/msg/Bool',
-    USER,
-    'true stops the system, as `~/stop` of any node',
-    qos=COMMAND,
+EMERGENCY_STOP: Final = Topic('emergency_stop', 'std_msgs/msg/Bool', USER, COMMAND).described(
+    'true stops the system, as `~/stop` of any node'
 )
 
 TIP_EXPECTED: Final = Topic(
-    'tip_expected',
-    'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'steering',
-    'predicted tip pose at the target depth, with covariance, after each tip measurement',
-    qos=COMMAND,
-    frame=ENTRY,
-)
+    'tip_expected', 'geometry_msgs/msg/PoseWithCovarianceStamped', 'steering', COMMAND, ENTRY
+).described('predicted tip pose at the target depth, with covariance, after each tip measurement')
 
-INSERTION_RECORD: Final = Topic(
-    'insertion_record',
-    'std_msgs/msg/String',
-    'steering',
+INSERTION_RECORD: Final = Topic('insertion_record', _STRING, 'steering', LATCHED).described(
     'plan and estimate of the latest insertion, as JSON: depths, tip measurements and guide '
-    'setpoints so far, expected tip; a restarted node resumes from it',
-    qos=LATCHED,
+    'setpoints so far, expected tip; a restarted node resumes from it'
 )
 
-TIP_POSE: Final = Topic(
-    'tip_pose',
-    POSE,
-    'slicer',
+# SlicerROS2 requests reliable QoS.
+TIP_POSE: Final = Topic('tip_pose', POSE, 'slicer', COMMAND, ENTRY).described(
     'tip pose, y along the needle, 20 Hz; the direction is measured only if `needle_poses` are '
-    'published',
-    # SlicerROS2 requests reliable QoS.
-    qos=COMMAND,
-    frame=ENTRY,
+    'published'
 )
 
 JOINT_TRAJECTORY: Final = Topic(
     'joint_trajectory',
     'trajectory_msgs/msg/JointTrajectory',
     f'{USER}, steering',
+    COMMAND,
+    stamp=Stamp.REQUEST,
+).described(
     'to the controller: `insertion`, positions [m], and optionally velocities [m/s]; '
     'to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
-    '`z` [N]',
-    qos=COMMAND,
-    stamp=Stamp.REQUEST,
+    '`z` [N]'
 )
 
 ROBOT_DESCRIPTION: Final = Topic(
-    'robot_description',
-    'std_msgs/msg/String',
-    'robot_state_publisher',
-    'URDF of the robot from `description/`, with `ros2_control.launch.py`',
-    qos=LATCHED,
-)
+    'robot_description', _STRING, 'robot_state_publisher', LATCHED
+).described('URDF of the robot from `description/`, with `ros2_control.launch.py`')
 
 TF: Final = Topic(
     '/tf',
     'tf2_msgs/msg/TFMessage',
     'robot_state_publisher; with `publish_tf`: plant',
+    COMMAND._replace(depth=100),
+).described(
     'robot_state_publisher: the joints, with `ros2_control.launch.py`; plant: `needle_tip` in '
-    '`needle_base`, 30 Hz',
-    qos=COMMAND._replace(depth=100),
+    '`needle_base`, 30 Hz'
 )
 
-FRICTION: Final = Topic(
-    'friction',
-    'diagnostic_msgs/msg/DiagnosticArray',
-    'identification',
-    'estimate, interval, unit and number of samples of each coefficient',
-    qos=LATCHED,
+FRICTION: Final = Topic('friction', _DIAGNOSTICS, 'identification', LATCHED).described(
+    'estimate, interval, unit and number of samples of each coefficient'
 )
 
 STIFFNESS: Final = replace(FRICTION, name='stiffness')
 
-CONFIGURATION: Final = Topic(
-    '~/configuration',
-    'std_msgs/msg/String',
-    EVERY_NODE,
-    'all parameters of the node as a parameter file',
-    qos=LATCHED,
+CONFIGURATION: Final = Topic('~/configuration', _STRING, EVERY_NODE, LATCHED).described(
+    'all parameters of the node as a parameter file'
 )
 
-DIAGNOSTICS: Final = Topic(
-    '/diagnostics',
-    'diagnostic_msgs/msg/DiagnosticArray',
-    EVERY_NODE,
-    'state of the node, 1 Hz and on change',
-    qos=COMMAND._replace(depth=10),
+DIAGNOSTICS: Final = Topic('/diagnostics', _DIAGNOSTICS, EVERY_NODE, _COMMANDS).described(
+    'state of the node, 1 Hz and on change'
 )
 
 
-class Action(NamedTuple):
-    """An action of the contract."""
-
-    #: Name, relative to the node.
-    name: str
-    type_name: str
-
-
-#: Offered by the nodes that receive `joint_trajectory`, if its package is installed.
-FOLLOW_JOINT_TRAJECTORY: Final = Action(
-    '~/follow_joint_trajectory', 'control_msgs/action/FollowJointTrajectory'
-)
+#: Action of the nodes that receive `joint_trajectory`, if its package is installed.
+FOLLOW_JOINT_TRAJECTORY: Final = '~/follow_joint_trajectory'
+FOLLOW_JOINT_TRAJECTORY_TYPE: Final = 'control_msgs/action/FollowJointTrajectory'
 
 #: All topics, in the order above.
 TOPICS: Final = tuple(value for value in [*globals().values()] if isinstance(value, Topic))

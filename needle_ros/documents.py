@@ -7,9 +7,8 @@ from typing import Any, Final
 from needle_ros.errors import NeedleError
 import yaml
 
-#: Maximum document length [characters], and maximum nesting depth.
-LARGEST: Final = 2**20
-_DEEPEST: Final = 32
+LARGEST: Final = 2**20  #: Maximum document length [characters].
+_DEEPEST: Final = 32  #: Maximum nesting depth.
 
 
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
@@ -29,12 +28,7 @@ class DocumentError(NeedleError, ValueError):
 
 
 def read_document(text: str) -> Any:
-    """
-    Parse a YAML document of an external author.
-
-    It raises `DocumentError` for a text that is not YAML, has more than 2^20 characters, an alias,
-    or more than 32 levels: a few aliases can expand to more than the memory holds.
-    """
+    """Parse a YAML document of an external author; aliases could expand beyond the memory."""
     if len(text) > LARGEST:
         raise DocumentError(f'has {len(text)} characters, at most {LARGEST} are read')
     depth = 0

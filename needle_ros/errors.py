@@ -5,8 +5,7 @@ from typing import Final
 
 _LONGEST: Final = 500  #: Maximum length of a log line [characters].
 
-#: Endings of the Python modules with the messages of ROS 2, and its other modules.
-_MESSAGES: Final = ('_msgs', '_srvs', '_interfaces')
+#: Python modules of ROS 2 besides those of its messages.
 _ROS: Final = {'rclpy', 'launch', 'launch_ros', 'domain_coordinator', 'ament_index_python'}
 
 
@@ -14,7 +13,7 @@ class NeedleError(Exception):
     """Base class of all intentional errors, each with a one-line message for users."""
 
     def __str__(self) -> str:
-        # The message may quote names from a recording or an external folder.
+        # It may quote names from a recording or an external folder.
         return shown(super().__str__())
 
 
@@ -35,11 +34,7 @@ class ShapeError(NeedleError, ValueError):
 
 
 def shown(text: str) -> str:
-    """
-    Replace line ends by blanks and unprintable characters by question marks.
-
-    Names from a recording or a message cannot insert terminal control sequences.
-    """
+    """Replace line ends by blanks, and characters that could control a terminal by ``?``."""
     if text.isprintable():
         return text
     return ''.join(one if one.isprintable() else ' ' if one.isspace() else '?' for one in text)
@@ -53,7 +48,7 @@ def printable(line: str) -> str:
 def missing_ros(error: ModuleNotFoundError, program: str) -> str:
     """Return how to install the missing module of ROS 2; raise the error of any other module."""
     module = str(error.name).partition('.')[0]
-    if module not in _ROS and not module.endswith(_MESSAGES):
+    if module not in _ROS and not module.endswith(('_msgs', '_srvs', '_interfaces')):
         raise error
     return (
         f'{program} needs ROS 2 (no module {module}): '

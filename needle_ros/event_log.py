@@ -22,7 +22,6 @@ class Severity(IntEnum):
 
     @property
     def level(self) -> bytes:
-        """Level of DiagnosticStatus."""
         return bytes([self])
 
 
@@ -30,24 +29,16 @@ class EventLog:
     """Log lines until the node publishes them; `steady` is the time of a steady clock [s]."""
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
-        #: Number of rejected inputs.
-        self.rejected = 0
-        #: Reason of the last rejection, or last fault of the motion.
-        self.last_rejection = ''
-        #: Whether there are new lines or changes.
-        self.changed = False
+        self.rejected = 0  #: Number of rejected inputs.
+        self.last_rejection = ''  #: Reason of the last rejection, or last fault of the motion.
+        self.changed = False  #: Whether there are new lines or changes.
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []
         self._times: dict[str, float] = {}
         self._left_out: Counter[str] = Counter()
 
     def add(self, severity: Severity, line: str = '', kind: str = '') -> None:
-        """
-        Add a line, and mark /diagnostics as changed; at most once a second per non-empty `kind`.
-
-        The next line of a kind contains the number of suppressed lines. An empty line only marks
-        the change.
-        """
+        """Add a line (if any) and mark the change, at most once a second for a kind (if any)."""
         if kind:
             now = self._steady()
             if now - self._times.get(kind, -inf) < _PAUSE:

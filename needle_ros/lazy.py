@@ -13,8 +13,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
     """
     Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package that is cheap to import.
 
-    The names are those that its ``__init__.py`` imports under ``if TYPE_CHECKING:``, each as
-    itself for type checkers; assign the three in the ``else`` branch.
+    Its ``__init__.py`` imports the names under ``if TYPE_CHECKING:``, and else assigns the three.
     """
     module = sys.modules[package]
     modules = _modules_by_name(Path(str(module.__file__)).read_text(encoding='utf-8'))

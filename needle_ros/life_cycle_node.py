@@ -25,30 +25,22 @@ _TRIGGERS: Final = {
 
 
 class LifeCycle:
-    """
-    Handler of the `change_state` service in place of the rclpy handler.
-
-    A transition that is invalid in the current state is rejected; rclpy raises an error that ends
-    the node. `configure` first runs the preparation while the executor spins; the response follows
-    it. With invalid parameters (`is_valid`) the preparation is skipped, and `configure` fails at
-    once.
-    """
+    """Handler of the `change_state` service; that of rclpy ends at an invalid transition."""
 
     def __init__(
         self, node: LifecycleNode, preparation: Preparation, is_valid: Callable[[], bool]
     ) -> None:
         self._node, self._preparation, self._is_valid = node, preparation, is_valid
-        #: Deferred action, called after the preparation.
-        self._waiting: Callable[[], None] | None = None
-        #: Deferred response, and the header of its request.
-        self._later: ChangeState.Response | None = None
-        self._header: Any = None
+        self._waiting: Callable[[], object] | None = None  #: Called after the preparation.
+        self._later: ChangeState.Response | None = None  #: Deferred response.
+        self._header: Any = None  #: Header of its request.
         service: Any = node._service_change_state
         self._send = service.send_response
         service.callback, service.send_response = self._on_request, self._on_response
 
-    def when_prepared(self, act: Callable[[], None]) -> None:
+    def when_prepared(self, act: Callable[[], object]) -> None:
         """Call `act` after the preparation: immediately if complete, else from the executor."""
+        # With invalid parameters, `configure` fails at once.
         if self._preparation.is_complete or not self._is_valid():
             act()
             return
@@ -73,19 +65,19 @@ class LifeCycle:
     def _on_request(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        machine = self._node._state_machine
+        machine, log = self._node._state_machine, self._node.get_logger()
         valid = {label: number for number, label, *_ in machine.available_transitions}
         asked = request.transition
         number = valid.get(asked.label, 0) if asked.label else asked.id
         if number not in valid.values():
-            self._refuse(
+            log.error(
                 f'transition {asked.label or asked.id} is not valid in state '
                 f'{machine.current_state[1]}; valid are {", ".join(valid) or "none"}'
             )
         elif number != _CONFIGURE or self._preparation.is_complete:
             response.success = self._trigger(number)
         elif self._waiting is not None:
-            self._refuse(f'configure is under way: {self._preparation.progress}')
+            log.error(f'configure is under way: {self._preparation.progress}')
         else:
             self._later = response
             self.when_prepared(self._configure)
@@ -110,6 +102,3 @@ class LifeCycle:
     def _trigger(self, transition: int) -> bool:
         done = _TRIGGERS[transition](self._node)
         return bool(done == TransitionCallbackReturn.SUCCESS)
-
-    def _refuse(self, line: str) -> None:
-        self._node.get_logger().error(line)

@@ -8,8 +8,7 @@ from typing import Final
 
 from needle_ros.errors import JobError, ParameterError
 
-#: Environment variable of ROS 2: range of node discovery.
-RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'  #: Environment variable of ROS 2.
 
 #: Environment variables with the profile file of Fast DDS 2 and 3.
 PROFILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
@@ -34,13 +33,10 @@ OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')  #: Discovery ranges that include oth
 
 
 def stay_local(environment: MutableMapping[str, str]) -> None:
-    """
-    Restrict an environment to this machine, unless `RANGE` has a value of `OPEN`.
-
-    The range OFF, a configured Fast DDS profile, and another middleware are kept.
-    """
+    """Restrict an environment to this machine, unless `RANGE` has a value of `OPEN`."""
     if environment.get(RANGE) in OPEN:
         return
+    # The range OFF, a configured Fast DDS profile, and another middleware are kept.
     fast = 'fastrtps' in (environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp')
     if fast and environment.get(RANGE) != 'OFF' and not any(map(environment.get, PROFILES)):
         environment.update(LOCAL)

@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Parameters of a node: fields of frozen dataclasses.
-
-`constant` gives each field a unit, a description and a range, and the constructor of the dataclass
-checks them. An invalid parameter file therefore fails the `configure` transition, with a one-line
-error that names the parameter.
-"""
+"""Parameters of a node: fields of frozen dataclasses (`settings.py`), which check them."""
 
 from array import array
 from collections.abc import Callable, Collection, Mapping
@@ -48,24 +42,14 @@ def _same(new: Any, old: Any) -> bool:
 
 
 class ParameterNode(LifecycleNode):
-    """
-    Lifecycle node with parameters from dataclasses.
+    """Lifecycle node with parameters from dataclasses."""
 
-    Attributes
-    ----------
-    shared : frozenset of str
-        Names of parameters that a file sets for several nodes; names that this node does not
-        declare are not an error.
-
-    """
-
-    #: Names of the parameters that may change in the configured node.
-    LIVE: ClassVar[frozenset[str]] = frozenset()
+    LIVE: ClassVar[frozenset[str]] = frozenset()  #: Parameters of the configured node to `change`.
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
-        #: Units of the numeric parameters.
-        self._units: dict[str, str] = {}
+        self._units: dict[str, str] = {}  #: Units of the numeric parameters.
+        #: Parameters that a file sets for several nodes: each declares some of them.
         self.shared: frozenset[str] = frozenset()
         self._configured = False
         self.add_on_set_parameters_callback(self._check_change)
@@ -113,9 +97,8 @@ class ParameterNode(LifecycleNode):
             # A range has no infinite bounds.
             if 'low' in meta and not meta['unlimited']:
                 low, high = (min(max(meta[end], -_LARGEST), _LARGEST) for end in ('low', 'high'))
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=low, to_value=high)
-                ]
+                limits = FloatingPointRange(from_value=low, to_value=high)
+                descriptor.floating_point_range = [limits]
             if 'unit' in meta:
                 self._units[prefix + item.name] = meta['unit']
             if isinstance(default, tuple):
@@ -129,7 +112,8 @@ class ParameterNode(LifecycleNode):
         values = {}
         for item in fields(kind):  # type: ignore[arg-type]
             name = f'{prefix}{item.name}'
-            value = self._meant(name, (changes or {}).get(name, self._value(name)))
+            given = (changes or {}).get(name, self.get_parameter(name).value)
+            value = self._meant(name, given)
             if isinstance(value, bool) and isinstance(item.default, str):
                 value = _READ_AS_BOOL[not value]
             values[item.name] = value
@@ -142,14 +126,11 @@ class ParameterNode(LifecycleNode):
                 return quantity(value, self._units[name])
         return value
 
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
-
     def text(
         self, name: str, valid: tuple[str, ...] = (), changes: Mapping[str, Any] | None = None
     ) -> str:
         """Return a text parameter; ``changes`` override it, empty ``valid`` allows any value."""
-        value = (changes or {}).get(name, self._value(name))
+        value = (changes or {}).get(name, self.get_parameter(name).value)
         if isinstance(value, bool):
             value = _READ_AS_BOOL[not value]
         if valid:
@@ -175,7 +156,6 @@ class ParameterNode(LifecycleNode):
         return values
 
     def _is_valid(self) -> bool:
-        """Return whether all parameter overrides are declared."""
         try:
             self._check_overrides()
         except ParameterError:
@@ -186,15 +166,14 @@ class ParameterNode(LifecycleNode):
         known = sorted(self._parameters)
         others = sorted(self.shared - set(known))
         if others:
-            self.get_logger().warning(
-                f'shared parameters that this node does not declare: {", ".join(others)}'
-            )
+            line = f'shared parameters that this node does not declare: {", ".join(others)}'
+            self.get_logger().warning(line)
         unknown = sorted(set(self._parameter_overrides) - set(known) - self.shared)
         if unknown:
             count = len(self._parameter_overrides)
-            complaints = '; '.join(unknown_name(name, known) for name in unknown)
+            reasons = '; '.join(unknown_name(name, known) for name in unknown)
             raise ParameterError(
-                f'{count - len(unknown)} of {count} given parameters are known: {complaints}'
+                f'{count - len(unknown)} of {count} given parameters are known: {reasons}'
             )
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -202,21 +181,15 @@ class ParameterNode(LifecycleNode):
             return SetParametersResult(successful=True)
         # Unchanged values are accepted, so that a whole parameter file can be loaded again.
         now = self.values()
-        parameters = [
-            one
-            for one in parameters
-            if not _same(self._meant(one.name, one.value), now.get(one.name))
-        ]
-        fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
+        given = {one.name: self._meant(one.name, one.value) for one in parameters}
+        changes = {name: new for name, new in given.items() if not _same(new, now.get(name))}
+        fixed = ', '.join(name for name in changes if name not in self.LIVE)
         if fixed:
-            return SetParametersResult(
-                successful=False,
-                reason=f'{", ".join(fixed)}: cannot change while configured; clean up the node '
-                'first',
-            )
+            reason = f'{fixed}: cannot change while configured; clean up the node first'
+            return SetParametersResult(successful=False, reason=reason)
         try:
-            if parameters:
-                self.change({one.name: self._meant(one.name, one.value) for one in parameters})
+            if changes:
+                self.change(changes)
         except NeedleError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -28,20 +28,14 @@ def imports(modules: Iterable[str]) -> Iterator[PreparationProgress]:
 
 
 class Preparation:
-    """
-    Steps that run once, in the thread of the caller or in a separate thread.
-
-    Each iteration of `steps` executes the next step.
-    """
+    """Iteration of `steps`, once, in the thread of the caller or in a separate thread."""
 
     def __init__(self, steps: Iterable[PreparationProgress]) -> None:
         self._steps = iter(steps)
         self.progress = PreparationProgress(0, 1, '')
-        #: Error of a step.
-        self.error: Exception | None = None
+        self.error: Exception | None = None  #: Error of a step.
         self._thread: Thread | None = None
-        #: Whether all steps are done, or a step failed.
-        self.is_complete = False
+        self.is_complete = False  #: Whether all steps are done, or a step failed.
 
     @property
     def is_running(self) -> bool:

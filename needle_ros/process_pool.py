@@ -3,10 +3,8 @@
 Process pool without shared queues, robust against killed workers.
 
 The pools of the standard library and of joblib give all workers one queue: a worker that is killed
-while it holds the lock of the queue, or while it writes a result larger than the pipe buffer,
-blocks the other workers or the parent forever. Here each worker has its own pipe. The kernel
-closes the pipe when the worker ends, at any moment from its first instruction, and the parent
-assigns the job to a new worker.
+while it holds its lock, or writes a long result, blocks the others or the parent forever. Here
+each worker has a pipe, which the kernel closes when the worker ends; a new worker gets the job.
 """
 
 from collections.abc import Callable, Iterator
@@ -52,12 +50,12 @@ class _Worker:
         self._pipe.send_bytes(job)
         return self._pipe.recv_bytes()
 
-    def end(self) -> int | None:
+    def end(self) -> int:
         """Kill the worker; return its exit code."""
         self.process.kill()
         self.process.join()
         self._pipe.close()
-        return self.process.exitcode
+        return self.process.exitcode or 0
 
 
 class _Pool(ThreadPoolExecutor):
@@ -78,7 +76,7 @@ class _Pool(ThreadPoolExecutor):
     def _run(self, *job: Any, **kwargs: Any) -> Any:
         """Execute a job, and repeat it in a new worker after the loss of a worker."""
         data = pickle.dumps((job, kwargs))
-        code = None
+        code = 0
         for _ in range(_TRIES):
             worker = self._take()
             try:
@@ -94,9 +92,9 @@ class _Pool(ThreadPoolExecutor):
             if error is not None:
                 raise error from _WorkerError(trace)
             return result
+        reason = f'by {signal.Signals(-code).name}' if code < 0 else f'with status {code}'
         raise JobError(
-            f'{_TRIES} worker processes ended in a row without a result, the last one '
-            f'{_reason(code)}'
+            f'{_TRIES} worker processes ended in a row without a result, the last one {reason}'
         )
 
     def _take(self) -> _Worker:
@@ -126,10 +124,9 @@ def processes(workers: int) -> Iterator[Executor]:
     """
     Start a pool of at most `workers` processes; each is started when the first job needs it.
 
-    A job must be a pure function: it is executed again if its worker is killed, for example by the
-    kernel. A job whose worker is lost 10 times in a row raises `JobError`. Workers are spawned,
-    ignore SIGINT, and end with this process, also after SIGKILL. At the end of the context,
-    running jobs are killed with their workers, and pending jobs are cancelled.
+    A job must be a pure function: it is executed again if its worker is killed, and raises
+    `JobError` after the loss of 10 workers. Workers are spawned, ignore SIGINT, and end with this
+    process, also after SIGKILL. The end of the context kills or cancels all jobs.
     """
     pool = _Pool(workers)
     try:
@@ -163,9 +160,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-def _reason(code: int | None) -> str:
-    if code is None or code >= 0:
-        return f'with status {code}'
-    return f'by {signal.Signals(-code).name}'

@@ -14,27 +14,19 @@ from rclpy.parameter import Parameter
 
 
 def offer_lease(node: BaseNode, lease: Topic) -> None:
-    """
-    Offer a liveliness lease, before creating the publisher of the topic itself.
-
-    A publisher without a lease never counts as dead. The lease topic follows the remapping of its
-    topic.
-    """
+    """Offer a liveliness lease, before creating the publisher of the topic itself."""
     node.create_publisher(message_class(lease.type_name), _name(node, lease), profile(lease.qos))
 
 
 def _name(node: BaseNode, lease: Topic) -> str:
+    """Return the name of a lease, which follows the remapping of its topic."""
     owner, _, own = lease.name.rpartition('/')
     return f'{node.resolve_topic_name(owner)}/{own}'
 
 
 def request_stamp(node: Node) -> Time:
-    """
-    Return the stamp of a request that is sent now, in the time of the graph.
-
-    The node switches to simulated time if a ``/clock`` exists. Before the first ``/clock`` message
-    the stamp is zero, which means the time of arrival.
-    """
+    """Return the stamp of a request that is sent now, in simulated time if there is a clock."""
+    # Before the first message of /clock it is zero, which means the time of arrival.
     if node.count_publishers(contract.CLOCK.name) and not node.get_parameter('use_sim_time').value:
         node.set_parameters([Parameter('use_sim_time', value=True)])
     stamp: Time = node.get_clock().now().to_msg()
@@ -45,10 +37,8 @@ class Publishers:
     """
     Number of live publishers of a topic.
 
-    A killed node stays in the graph for 20 s. With a lease it no longer counts after the end of
-    the lease, 0.5 s. Publishers without a lease, such as ``ros2 topic pub``, count as long as they
-    are in the graph. `lease` is as in `offer_lease`; `on_change` is called when a lease ends or
-    is renewed.
+    A killed node stays in the graph for 20 s, and with a lease counts for 0.5 s. `lease` is as in
+    `offer_lease`; `on_change` is called when a lease ends or is renewed.
     """
 
     def __init__(
@@ -71,13 +61,9 @@ class Publishers:
             self._notify()
 
     def count(self, topic: Topic, matched: int = 0) -> int:
-        """
-        Return the number of live publishers of a topic, in any lifecycle state.
-
-        `matched` is the number of publishers matched with a subscription, dead publishers
-        included: the graph may be updated later.
-        """
+        """Return the number of live publishers of a topic, of which `matched` are matched."""
         publishers = self._node.get_publishers_info_by_topic(topic.name)
+        # The graph may be updated later than the matches, which include dead publishers.
         number = max(len(publishers), matched)
         if not self._over:
             return number

@@ -10,18 +10,9 @@ from needle_ros.errors import ParameterError
 
 HIGHEST: Final = 99  #: Highest real-time priority of Linux.
 
-_HELP: Final = (
-    'set the limit rtprio of the user in /etc/security/limits.conf, or realtime_priority 0'
-)
-
 
 def set_priority(priority: int) -> None:
-    """
-    Schedule the threads of this process with SCHED_FIFO and a priority; 0 ends it.
-
-    Threads and processes that they create later inherit it. `ParameterError` if the system does
-    not permit it.
-    """
+    """Schedule all threads, which pass it on, with SCHED_FIFO and a priority; 0 ends it."""
     if not hasattr(os, 'sched_setscheduler'):
         if priority:
             raise ParameterError('realtime_priority must be 0: real-time scheduling needs Linux')
@@ -34,7 +25,8 @@ def set_priority(priority: int) -> None:
                 os.sched_setscheduler(int(thread.name), policy, os.sched_param(priority))
     except PermissionError as error:
         raise ParameterError(
-            f'realtime_priority {priority} is not permitted to this user: {_HELP}'
+            f'realtime_priority {priority} is not permitted to this user: set the limit rtprio of '
+            'the user in /etc/security/limits.conf, or realtime_priority 0'
         ) from error
 
 

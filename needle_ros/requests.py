@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Requests on topics, and their acknowledgement in the status of the receiver.
+Requests on topics with stamp `Stamp.REQUEST`, and their acknowledgement.
 
-A request is a message on a topic with stamp `Stamp.REQUEST` in the contract: a target or a
-trajectory. The receiver answers in its status on ``/diagnostics``, immediately and then once a
-second, so that a lost message is replaced. The sender repeats the request until the answer.
+The receiver answers in its status on ``/diagnostics``, immediately and then once a second, so that
+a lost message is replaced. The sender repeats the request until the answer.
 """
 
 from __future__ import annotations
@@ -20,39 +19,26 @@ from needle_ros.errors import NeedleError, printable
 from needle_ros.timing import apart, NANOSECONDS, parse_nanoseconds
 from needle_ros.trajectories import LateTrajectoryError
 
-#: Interval of repetitions without an answer [s], and the maximum number of repetitions.
-REPEAT_AFTER: Final = 1.0
-REPEATS: Final = 3
+REPEAT_AFTER: Final = 1.0  #: Interval of repetitions without an answer [s].
+REPEATS: Final = 3  #: Maximum number of repetitions.
 
-#: Timeout of a request without an answer [s]: a later receiver rejects it as stale, so that it is
-#: not executed after the timeout.
-_GIVE_UP: Final = REQUEST_AGE + 1.0
+_GIVE_UP: Final = REQUEST_AGE + 1.0  #: Timeout without an answer [s]: the request is stale then.
+CALL_TIMEOUT: Final = 10.0  #: Timeout of a service call [s].
 
-#: Timeout of a service call [s], longer than the response time on a slow machine.
-CALL_TIMEOUT: Final = 10.0
-
-#: Number of answers in a status, and number of answers kept to detect duplicates.
-_PUBLISHED: Final = 8
-_KEPT: Final = 64
-
+_PUBLISHED: Final = 8  #: Number of answers in a status.
+_KEPT: Final = 64  #: Number of answers kept to detect duplicates.
 _PAUSE: Final = 0.05  #: Minimum time between two statuses published for an answer [s].
-
-#: Keys and key prefixes in a status.
-_TAKES: Final = 'takes '
-_REQUEST: Final = 'request '
-
+_TAKES, _REQUEST = 'takes ', 'request '  #: Beginnings of keys in a status.
 _MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
 
 
 class Verdict(Enum):
     """Result of a request."""
 
-    #: Received and being checked; another verdict follows.
-    RECEIVED = 'received'
+    RECEIVED = 'received'  #: Received and being checked; another verdict follows.
     ACCEPTED = 'accepted'
     REJECTED = 'rejected'
-    #: Rejected because all its points are in the past: it may be sent again with a new stamp.
-    LATE = 'rejected as late'
+    LATE = 'rejected as late'  #: All its points are in the past: it may be sent again.
     SUPERSEDED = 'superseded'  #: Not executed, because the receiver executes a newer request.
 
 
@@ -61,8 +47,7 @@ class Acknowledgement:
     """Answer of a receiver to a request."""
 
     topic: str  #: Topic of the request, by its name in the contract.
-    #: Stamp of the request [ns]; 0 for a message without a stamp.
-    stamp: int
+    stamp: int  #: Stamp of the request [ns]; 0 for a message without a stamp.
     verdict: Verdict
     reason: str = ''  #: Reason of a rejection, for users.
 
@@ -81,7 +66,6 @@ class RequestStatus:
     answers: tuple[Acknowledgement, ...] = ()  #: The latest answers, the newest last.
 
     def to_values(self) -> dict[str, str]:
-        """Return the fields as values of a DiagnosticStatus."""
         values = {f'{_TAKES}{topic}': ', '.join(joints) for topic, joints in self.takes.items()}
         for one in self.answers:
             key = f'{_REQUEST}{one.topic} {one.stamp}'
@@ -90,9 +74,8 @@ class RequestStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> RequestStatus:
-        """Parse the fields from values of a DiagnosticStatus; other keys are ignored."""
-        takes: dict[str, tuple[str, ...]] = {}
-        answers = []
+        takes, answers = {}, []
+        verdicts = {one.value: one for one in Verdict}
         for key, value in values.items():
             if key.startswith(_TAKES):
                 takes[key[len(_TAKES) :]] = tuple(filter(None, value.split(', ')))
@@ -100,19 +83,14 @@ class RequestStatus:
                 topic, _, stamp = key[len(_REQUEST) :].rpartition(' ')
                 verdict, _, reason = value.partition(': ')
                 time = parse_nanoseconds(stamp)
-                if time is not None and verdict in _VERDICTS:
-                    answers.append(Acknowledgement(topic, time, Verdict(verdict), reason))
+                if time is not None and verdict in verdicts:
+                    answers.append(Acknowledgement(topic, time, verdicts[verdict], reason))
         return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
         """Return the answer to a request with a topic and stamp [ns], or None."""
-        for one in self.answers:
-            if (one.topic, one.stamp) == (topic, stamp):
-                return one
-        return None
-
-
-_VERDICTS: Final = {one.value for one in Verdict}
+        found = (one for one in self.answers if (one.topic, one.stamp) == (topic, stamp))
+        return next(found, None)
 
 
 #: Takes an answer to a request, and the joints that something else moves from then on.
@@ -123,7 +101,7 @@ class _Watched(NamedTuple):
     """A request whose end is reported."""
 
     joints: frozenset[str]
-    tell: Listener
+    report: Listener
 
 
 def is_stale(stamp: int, now: int) -> bool:
@@ -135,8 +113,7 @@ class RequestLog:
     """
     Log of received requests: accept each once, in the order of the stamps, and record answers.
 
-    `takes` are the moved joints by topic of the request, `frames` the valid frames of a request;
-    `steady` returns the time of a steady clock [s].
+    `takes` are the moved joints by topic, `frames` the valid frames, `steady` a steady clock [s].
     """
 
     def __init__(
@@ -151,10 +128,8 @@ class RequestLog:
         self._takes = {topic.name: tuple(joints) for topic, joints in takes.items()}
         self._frames, self._steady = frames, steady
         self._answers: dict[tuple[str, int], Acknowledgement] = {}
-        #: Stamp of the newest request that was accepted, by joint [ns].
-        self._newest: dict[str, int] = {}
-        #: Requests whose end is reported, by topic and stamp.
-        self._watched: dict[tuple[str, int], _Watched] = {}
+        self._newest: dict[str, int] = {}  #: Stamp of the newest accepted request, by joint [ns].
+        self._watched: dict[tuple[str, int], _Watched] = {}  #: By topic and stamp [ns].
         self._changed = False
         self._published = -_PAUSE
 
@@ -170,9 +145,7 @@ class RequestLog:
         """
         Return None for a new request, else its answer; times are in ns.
 
-        The caller executes and answers a new request; a stamp of 0 always counts as new. A
-        duplicate gets its first answer again. A request with a stale stamp or a wrong frame is
-        rejected, and a request older than the current request of one of its joints is superseded.
+        The caller answers a new request; a stamp of 0 always counts as new.
         """
         known = self._answers.get((topic.name, stamp)) if stamp else None
         if known is not None:
@@ -185,14 +158,12 @@ class RequestLog:
         elif frame not in self._frames:
             valid = ' or '.join(map(repr, self._frames))
             reason = f'{topic.name} must be in frame {valid}, got {frame!r}'
-        elif stamp and any(stamp < self._follows(joint, now) for joint in joints):
+        # A much newer request is from before the clock was set back.
+        elif stamp and any(
+            stamp < self._newest.get(joint, 0) <= now + _MOST_AGE for joint in joints
+        ):
             verdict, reason = Verdict.SUPERSEDED, 'a newer request has priority'
         return self.answer(topic, stamp, verdict, reason) if reason else None
-
-    def _follows(self, joint: str, now: int) -> int:
-        newest = self._newest.get(joint, 0)
-        # The clock has been set back.
-        return newest if newest <= now + _MOST_AGE else 0
 
     def answer(
         self,
@@ -216,26 +187,21 @@ class RequestLog:
         watched = self._watched.get((topic.name, stamp))
         if watched is not None:
             if made.refused:
-                del self._watched[topic.name, stamp]
-            watched.tell(made, ())
+                self.unwatch(topic, stamp)
+            watched.report(made, ())
         if verdict is Verdict.ACCEPTED:
             newer = f'a newer {topic.name} is followed'
             self.end(newer, {*joints}, besides=(topic.name, stamp))
         return made
 
-    def watch(self, topic: Topic, stamp: int, joints: Iterable[str], tell: Listener) -> int:
-        """
-        Report the answers to a request of some joints, and the end of its execution.
-
-        Returns the stamp [ns] of the request, made unique.
-        """
+    def watch(self, topic: Topic, stamp: int, joints: Iterable[str], report: Listener) -> int:
+        """Report answers to a request, and its end; return its stamp [ns], made unique."""
         while {(topic.name, stamp)} & (self._answers.keys() | self._watched.keys()):
             stamp += 1
-        self._watched[topic.name, stamp] = _Watched(frozenset(joints), tell)
+        self._watched[topic.name, stamp] = _Watched(frozenset(joints), report)
         return stamp
 
     def unwatch(self, topic: Topic, stamp: int) -> None:
-        """Report nothing more of a request."""
         self._watched.pop((topic.name, stamp), None)
 
     def end(
@@ -245,19 +211,14 @@ class RequestLog:
         *,
         besides: tuple[str, int] | None = None,
     ) -> None:
-        """
-        Report the end of the watched requests, except for one by topic and stamp [ns].
-
-        ``moved`` are the joints that something else moves from now on: only requests of one of
-        them end. Without it all requests end.
-        """
+        """Report the end of the watched requests, of ``moved`` joints or all, `besides` one."""
         for key, watched in [*self._watched.items()]:
             concerned = moved is None or watched.joints & {*moved}
             # A report may end other requests.
             if key != besides and concerned and key in self._watched:
                 del self._watched[key]
                 ended = Acknowledgement(*key, Verdict.SUPERSEDED, printable(reason))
-                watched.tell(ended, moved or ())
+                watched.report(ended, moved or ())
 
     def reject(self, topic: Topic, stamp: int, why: str | NeedleError) -> None:
         """Answer that a request is rejected, for a reason or an error."""
@@ -271,12 +232,7 @@ class RequestLog:
                 self._newest[joint] = max(now, self._newest.get(joint, 0))
 
     def due(self) -> bool:
-        """
-        Return whether the status must be published now because of an unpublished answer.
-
-        Call it after each request and from a timer of at most 0.1 s: this limits the number of
-        statuses for a burst of requests.
-        """
+        """Return whether to publish the status now: call after each request and every 0.1 s."""
         now = self._steady()
         if not self._changed or now - self._published < _PAUSE:
             return False
@@ -284,31 +240,22 @@ class RequestLog:
         return True
 
     def status(self) -> RequestStatus:
-        """Return the status with the latest answers."""
         answers = tuple(self._answers.values())[-_PUBLISHED:]
         return RequestStatus(self._takes, answers)
 
 
 class PendingRequest:
-    """
-    A request that is repeated until it is answered.
-
-    Its stamp [ns] is equal in all repetitions, so that it is executed once. `steady` returns the
-    time of a steady clock [s].
-    """
+    """A request that is repeated with its stamp [ns] until it is answered."""
 
     def __init__(
         self, topic: Topic, stamp: int, node: str, steady: Callable[[], float] = monotonic
     ) -> None:
         self._topic, self._stamp, self._steady = topic.name, stamp, steady
         self._begun, self._repeats = steady(), 0
-        #: The latest answer.
-        self.answer: Acknowledgement | None = None
-        #: Name of the expected receiver, or of the node that has answered.
-        self.node = node
+        self.answer: Acknowledgement | None = None  #: The latest answer.
+        self.node = node  #: Name of the expected receiver, or of the node that has answered.
 
     def take_status(self, node: str, status: RequestStatus) -> None:
-        """Process the status of a node."""
         answer = status.answer_to(self._topic, self._stamp)
         if answer is not None and (self.answer is None or not self.done):
             self.answer, self.node = answer, node

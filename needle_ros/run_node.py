@@ -38,9 +38,8 @@ def run(kind: Callable[[], BaseNode]) -> int:
     """
     Run one node until SIGINT, SIGTERM or SIGHUP, then deactivate it while it can still publish.
 
-    It returns the exit status: 0, 1 if the node `failed`, or 2 if it refused to start; SystemExit
-    follows ``--help`` and unknown arguments. An error in a callback deactivates the node, ends the
-    process and is raised. The function replaces the signal handlers of the process permanently.
+    Return the exit status: 0, 1 if the node `failed`, or 2 if it refused to start. An error in a
+    callback deactivates the node, ends the process and is raised.
     """
     stopping = spinning = False
 

@@ -22,14 +22,11 @@ class SampleClock:
     """
     Simulated time with samples at exact multiples of the period.
 
-    Samples missed in a stall are taken afterwards, up to the backlog. Older samples are dropped if
-    simulated time equals the time of the clock; an independent simulated time waits instead.
-
     `rate` is in Hz of simulated time, `factor` in simulated seconds per second of the clock (0: as
-    fast as possible), and `backlog` the maximum delay that is made up after a stall [s]. `own`
-    makes simulated time independent of the clock; it always is in lockstep, and if the factor is
-    not 1. In lockstep each sample waits for the responses to the sample before, and time starts at
-    zero.
+    fast as possible). `own` makes simulated time independent of the clock; it always is in
+    lockstep, and if the factor is not 1. In lockstep each sample waits for the responses to the
+    sample before, and time starts at zero. After a stall, samples are taken later, up to `backlog`
+    [s]; beyond it an independent time waits, and other samples are dropped.
     """
 
     def __init__(
@@ -38,11 +35,8 @@ class SampleClock:
         self._rate, self._factor = rate, factor
         self._own, self._lockstep = own or lockstep or factor != 1.0, lockstep
         self._backlog = max(1, int(backlog * rate * factor))
-        #: Number of nodes that report processed samples in lockstep: the next sample waits for all
-        #: of them, and for a command.
-        self.participants = 0
-        #: Stamp of the newest sample of each recorder, by name [ns].
-        self.recorded: dict[str, int] = {}
+        self.participants = 0  #: Number of nodes that report processed samples in lockstep.
+        self.recorded: dict[str, int] = {}  #: Stamp of the newest sample of each recorder [ns].
         #: Period of the schedule [s]; with several samples per tick it need not exceed real time.
         self.tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK)) if factor else _TICK
         #: Maximum samples per tick if time may wait: more would overflow the subscribers.
@@ -152,11 +146,7 @@ class SampleClock:
             self._go_on(now)
 
     def step(self, now: int) -> int:
-        """
-        Take one sample in paused time and return its stamp [ns].
-
-        It raises `JobError` if time is not paused, or the sample before waits for responses.
-        """
+        """Take one sample in paused time, if no sample waits; return its stamp [ns]."""
         if not self.paused:
             raise JobError('time is not paused; pause first')
         if self.awaited is not None:

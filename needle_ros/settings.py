@@ -39,31 +39,17 @@ def constant(
     """
     Declare a numeric dataclass field with unit, description and valid range.
 
-    A tuple as default declares an array field, whose elements all have the range. The unit is an
-    SI unit, ``1`` for a pure number. The description becomes the description of the ROS parameter.
-    `open_low` excludes ``low`` itself. With `unlimited` infinity is valid, with `whole` only whole
-    numbers are.
+    The unit is an SI unit, ``1`` for a pure number. A tuple as default declares an array field,
+    whose elements have the range. `open_low` excludes ``low`` itself. With `unlimited` infinity is
+    valid, with `whole` only whole numbers are.
     """
-    return field(
-        default=default,
-        metadata={
-            'unit': unit,
-            'description': description,
-            'low': low,
-            'high': high,
-            'open_low': open_low,
-            'unlimited': unlimited,
-            'whole': whole,
-        },
-    )
+    meta = {'low': low, 'high': high, 'open_low': open_low, 'unlimited': unlimited, 'whole': whole}
+    return field(default=default, metadata={'unit': unit, 'description': description, **meta})
 
 
 def choice(default: str, valid: Iterable[str], meaning: str = '') -> Any:
-    """
-    Declare a dataclass field with one of the `valid` words, which its description lists.
-
-    A mapping by word may get more words later.
-    """
+    """Declare a dataclass field with one of the `valid` words, which its description lists."""
+    # A mapping by word may get more words later.
     words = valid if isinstance(valid, Mapping) else tuple(valid)
     description = f'one of {", ".join(words)}' + (meaning and f': {meaning}')
     return field(default=default, metadata={'valid': words, 'description': description})
@@ -80,12 +66,7 @@ def text(default: str, description: str) -> Any:
 
 
 def check_constants(values: object) -> None:
-    """
-    Check every field of a dataclass that is declared by a function of this module.
-
-    The message of the `ParameterError` contains the field, the value, and the valid range with its
-    unit, or the valid words.
-    """
+    """Check every field of a dataclass that is declared by a function of this module."""
     for item in fields(values):  # type: ignore[arg-type]
         value, meta = getattr(values, item.name), item.metadata
         if 'unit' in meta:
@@ -148,24 +129,23 @@ def from_values(
     kind: Callable[..., _Settings], values: Mapping[str, Any], prefix: str = ''
 ) -> _Settings:
     """
-    Construct settings from values by field name.
+    Construct settings from values by field name; errors name the field with ``prefix``.
 
     Integers and text with a unit are accepted for floats, lists, arrays and single numbers for
-    tuples. None means an empty tuple, because rcl returns an empty list of a parameter file as
-    None. The message of a `ParameterError` contains the field with ``prefix``, such as ``model.``.
+    tuples. None means an empty tuple: rcl returns an empty list of a parameter file as None.
     """
     known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
     given = {}
     for name, value in values.items():
         if name not in known:
-            raise ParameterError(
-                unknown_name(f'{prefix}{name}', (f'{prefix}{item}' for item in known))
-            )
-        several = isinstance(known[name].default, tuple)
+            names = (f'{prefix}{item}' for item in known)
+            raise ParameterError(unknown_name(f'{prefix}{name}', names))
+        item = known[name]
+        several = isinstance(item.default, tuple)
         taken = tuple(value or ()) if several and isinstance(value, _LISTS) else value
-        if 'unit' in known[name].metadata:
-            taken = _as_number(taken, known[name].metadata['unit'])
-            only_tuple = several and 'float |' not in str(known[name].type)
+        if 'unit' in item.metadata:
+            taken = _as_number(taken, item.metadata['unit'])
+            only_tuple = several and 'float |' not in str(item.type)
             taken = (taken,) if only_tuple and isinstance(taken, float) else taken
         given[name] = taken
     try:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Status of the state machines, and its mapping to the key-value pairs of a DiagnosticStatus.
+Status of the nodes, and its mapping to the key-value pairs of a DiagnosticStatus.
 
-A node publishes its status on ``/diagnostics``. Readers use the dataclasses of this file; the keys
-of the pairs are for people and plots. A key is the name of the field with its unit, such as
-``insertion depth [m]``; the fields of a nested dataclass and the entries of a mapping follow the
-name of the field, such as ``input joint_states rate [Hz]``. An optional field without a value has
-no pair.
+Readers use the dataclasses of this file; the keys are for people and plots. A key is the name of
+the field with its unit, such as ``insertion depth [m]``; the fields of a nested dataclass and the
+entries of a mapping follow it, such as ``input joint_states rate [Hz]``. An optional field without
+a value has no pair.
 """
 
 from collections.abc import Iterator, Mapping
@@ -14,17 +13,14 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, ClassVar, Final, Generic, get_args, get_origin, get_type_hints, TypeVar
+from typing import Any, Final, Generic, get_args, get_origin, get_type_hints, TypeVar
 
 from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus
 from needle_ros.system_state import Mode
 
 TASK: Final = 'state'  #: Task in the name of the status of a node: ``/plant: state``.
-
-#: Hardware of nodes without a namespace; the hardware of others is their namespace.
-HARDWARE: Final = 'needle'
-
+HARDWARE: Final = 'needle'  #: Hardware of nodes without a namespace; else the namespace.
 STALE: Final = bytes([3])  #: Level STALE of a DiagnosticStatus: its values are no longer updated.
 _KIND: Final = 'kind'  #: Key of the kind of a status.
 _MISSING: Final = object()  #: Result of a field that is missing or invalid in a status.
@@ -34,11 +30,7 @@ _Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
 
 
 def node_of(name: str) -> str:
-    """
-    Return the node in the name of a DiagnosticStatus, with or without the task of these nodes.
-
-    Nodes of others keep their tasks, so that each of their statuses has its own name.
-    """
+    """Return the node in the name of a DiagnosticStatus; nodes of others keep their tasks."""
     return name.removesuffix(f': {TASK}')
 
 
@@ -152,14 +144,16 @@ class ObserverStatus:
 class NodeStatus:
     """Status of any node."""
 
-    KIND: ClassVar[str] = 'node'  #: Value of the key `kind`.
-
     invalid_messages: Mapping[str, int] = entry(dict, '', 'unreadable messages by topic')
     failure: str = entry('', '', 'reason of the last refused transition')
 
+    @classmethod
+    def kind(cls) -> str:
+        """Return the value of the key `kind`, such as ``plant`` for a `PlantStatus`."""
+        return cls.__name__.removesuffix('Status').lower()
+
     def to_values(self) -> dict[str, str]:
-        """Return the fields as key-value pairs."""
-        return {_KIND: self.KIND, **dict(_pairs(self, '', ''))}
+        return {_KIND: self.kind(), **dict(_pairs(self, '', ''))}
 
     @classmethod
     def from_values(cls: type[_Status], values: Mapping[str, str]) -> _Status:
@@ -171,8 +165,6 @@ class NodeStatus:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerStatus(NodeStatus):
     """Status of the node `controller`."""
-
-    KIND: ClassVar[str] = 'controller'
 
     phase: ControllerPhase = entry(ControllerPhase.INACTIVE, '', 'phase')
     system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
@@ -192,9 +184,7 @@ class ControllerStatus(NodeStatus):
     observer: ObserverStatus | None = entry(None, '', 'observer, from its first estimate')
     latency: LatencyStatus = entry(LatencyStatus, '', 'latency of the commands')
     command_rate: float = entry(0.0, 'Hz', 'commands in the last second')
-    saturated_fraction: float = entry(
-        0.0, '', 'fraction of the commands of the last second at their limit'
-    )
+    saturated_fraction: float = entry(0.0, '', 'fraction of commands at their limit')
     input: Mapping[str, InputStatus] = entry(dict, '', 'inputs by topic')
     rejected: int = entry(0, '', 'rejected messages and requests')
     last_rejection: str = entry('', '', 'reason of the last rejection')
@@ -209,8 +199,6 @@ class ControllerStatus(NodeStatus):
 class SteeringStatus(NodeStatus):
     """Status of the node `steering`."""
 
-    KIND: ClassVar[str] = 'steering'
-
     phase: SteeringPhase = entry(SteeringPhase.INACTIVE, '', 'phase')
     system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
     fault: str = entry('', '', 'reason of the stop')
@@ -221,20 +209,12 @@ class SteeringStatus(NodeStatus):
     guide_setpoint: tuple[float, float] | None = entry(None, 'm', 'guide setpoint x, z')
     turns_left: int | None = entry(None, '', 'half turns that are left')
     hit_probability: float | None = entry(None, '', 'probability of a hit within 1 mm')
-    bending_length_ratio: float | None = entry(
-        None, '', 'estimated bending length over the nominal one'
-    )
+    bending_length_ratio: float | None = entry(None, '', 'bending length over the nominal one')
     law: Mapping[str, float] = entry(dict, '', 'further values of the steering law, by name')
-    expected_tip: tuple[float, float] | None = entry(
-        None, 'm', 'expected tip position x, z at the target depth'
-    )
-    expected_tip_half_width: tuple[float, float] | None = entry(
-        None, 'm', 'half width of its 95 % interval'
-    )
+    expected_tip: tuple[float, float] | None = entry(None, 'm', 'expected tip x, z at the target')
+    expected_tip_half_width: tuple[float, float] | None = entry(None, 'm', 'half width, 95 %')
     last_measurement_readings: int | None = entry(None, '', 'readings of the last tip measurement')
-    last_measurement_error: float | None = entry(
-        None, 'm', 'standard error of the last tip measurement'
-    )
+    last_measurement_error: float | None = entry(None, 'm', 'standard error of this measurement')
     warning: str = entry('', '', 'warning')
     input: Mapping[str, InputStatus] = entry(dict, '', 'inputs by topic')
     rejected: int = entry(0, '', 'rejected messages and requests')
@@ -245,8 +225,6 @@ class SteeringStatus(NodeStatus):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantStatus(NodeStatus):
     """Status of the node `plant`."""
-
-    KIND: ClassVar[str] = 'plant'
 
     phase: PlantPhase = entry(PlantPhase.INACTIVE, '', 'phase')
     system: Mode = entry(Mode.RUNNING, '', 'mode of the system')
@@ -279,8 +257,6 @@ class PlantStatus(NodeStatus):
 class RecorderStatus(NodeStatus):
     """Status of the node `recorder`."""
 
-    KIND: ClassVar[str] = 'recorder'
-
     path: str = entry('', '', 'bag of the recording, empty without a recording')
     messages: int = entry(0, '', 'recorded messages')
     size: int = entry(0, 'B', 'size of the bag')
@@ -291,8 +267,6 @@ class RecorderStatus(NodeStatus):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayerStatus(NodeStatus):
     """Status of the node `player`."""
-
-    KIND: ClassVar[str] = 'player'
 
     phase: PlayerPhase = entry(PlayerPhase.INACTIVE, '', 'phase')
     path: str = entry('', '', 'bag')
@@ -310,8 +284,6 @@ class PlayerStatus(NodeStatus):
 class IdentificationStatus(NodeStatus):
     """Status of the node `identification`."""
 
-    KIND: ClassVar[str] = 'identification'
-
     samples: int = entry(0, '', 'processed samples of the running topics')
     discarded: Mapping[str, int] = entry(dict, '', 'discarded samples by reason')
 
@@ -319,8 +291,6 @@ class IdentificationStatus(NodeStatus):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlicerStatus(NodeStatus):
     """Status of the node `slicer`."""
-
-    KIND: ClassVar[str] = 'slicer'
 
     phase: SlicerPhase = entry(SlicerPhase.INACTIVE, '', 'phase of the connection')
     peer: str = entry('', '', 'address of the connected peer')
@@ -334,19 +304,11 @@ class SlicerStatus(NodeStatus):
     last_rejection: str = entry('', '', 'reason of the last rejection')
 
 
-#: Status classes by kind.
+#: All status classes of nodes by kind, in the order above.
 STATUSES: Final[Mapping[str, type[NodeStatus]]] = {
-    kind.KIND: kind
-    for kind in (
-        NodeStatus,
-        PlantStatus,
-        ControllerStatus,
-        SteeringStatus,
-        RecorderStatus,
-        PlayerStatus,
-        IdentificationStatus,
-        SlicerStatus,
-    )
+    one.kind(): one
+    for one in [*globals().values()]
+    if isinstance(one, type) and issubclass(one, NodeStatus)
 }
 
 
@@ -378,7 +340,6 @@ def _with_unit(key: str, unit: str) -> str:
 
 
 def _pairs(value: Any, key: str, unit: str) -> Iterator[tuple[str, str]]:
-    """Yield the key-value pairs of a value."""
     if value is None:
         return
     if isinstance(value, RequestStatus):
@@ -403,9 +364,7 @@ def _text(value: Any) -> str:
     return ', '.join(map(_text, value)) if isinstance(value, tuple) else str(value)
 
 
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
+_hints = cache(get_type_hints)
 
 
 def _filled(kind: Any, values: Mapping[str, str], prefix: str) -> Any:

@@ -2,9 +2,8 @@
 """
 State of the whole system: running, paused, retracting or stopped, equal in all its nodes.
 
-Every node that moves needle or guide has an `Authority` and publishes its state on
-``system_state``. A node merges each received state into its own: the result does not depend on the
-order, and a repeated or lost message does no harm.
+Every node that moves needle or guide has an `Authority`, and merges each state that it receives
+into its own: the order of the messages, a repetition or a loss do no harm.
 """
 
 from __future__ import annotations
@@ -19,24 +18,15 @@ from typing import Final, NamedTuple
 from needle_ros.errors import printable
 from needle_ros.timing import NANOSECONDS, parse_nanoseconds
 
-#: Keys of a state as values of a DiagnosticStatus.
-_MODE: Final = 'mode'
-_STOP: Final = 'stop '
-_CLEARED: Final = 'cleared '
-_MOTION: Final = 'motion'
+#: Keys of a state as values of a DiagnosticStatus, and beginnings of keys.
+_MODE, _MOTION, _STOP, _CLEARED = 'mode', 'motion', 'stop ', 'cleared '
 
-_PAUSED: Final = 'paused'
-_RETRACTING: Final = 'retracting'
+_MOST_NODES: Final = 64  #: Maximum number of nodes in a state.
+_MOST_VALUES: Final = 2 * _MOST_NODES + 2  #: Maximum number of values in a message.
+_LONGEST_KEY: Final = len(_CLEARED) + 255  #: A word, and the longest name of a node in ROS.
 
-#: Maximum number of nodes in a state; of values in a message, two for each node and two; and of
-#: characters of a key, a word and the longest name of a node in ROS.
-_MOST_NODES: Final = 64
-_MOST_VALUES: Final = 2 * _MOST_NODES + 2
-_LONGEST_KEY: Final = len(_CLEARED) + 255
-
-#: Maximum time of an entry after the present [ns], 100 years, more than between a clock that is
-#: set and one that begins in 1970. Later requests follow each entry, so that their times, too,
-#: must be accepted and have at most 19 digits.
+#: Maximum time of an entry after the present [ns], 100 years: later requests follow each entry,
+#: and clocks that begin in 1970 are accepted.
 _LARGEST_LEAD: Final = 100 * 365 * 24 * 3600 * NANOSECONDS
 
 RETRACT_DEPTH: Final = 0.01  #: Default insertion depth at the end of a retraction [m].
@@ -54,8 +44,8 @@ class Mode(Enum):
     """Mode of the system."""
 
     RUNNING = 'running'
-    PAUSED = _PAUSED  #: Needle and guide rest until a user resumes the motion.
-    RETRACTING = _RETRACTING  #: The needle is withdrawn, until a user requests another motion.
+    PAUSED = 'paused'  #: Needle and guide rest until a user resumes the motion.
+    RETRACTING = 'retracting'  #: The needle is withdrawn, until a user requests another motion.
     STOPPED = 'stopped'  #: No force and no motion of the guide until a user clears the stop.
 
 
@@ -64,9 +54,6 @@ class Stop(NamedTuple):
 
     time: int
     reason: str
-
-
-_NO_STOP: Final = Stop(0, '')
 
 
 class _Motion(NamedTuple):
@@ -79,12 +66,7 @@ class _Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SystemState:
-    """
-    Latest stop of each node, latest cleared stop of each node, and latest request of a user.
-
-    A stop is in effect until a user has cleared that stop; it has priority over all other
-    requests.
-    """
+    """Latest stop and latest cleared stop of each node, and latest request of a user."""
 
     stops: Mapping[str, Stop] = field(default_factory=dict)
     cleared: Mapping[str, int] = field(default_factory=dict)
@@ -100,7 +82,6 @@ class SystemState:
 
     @property
     def mode(self) -> Mode:
-        """Mode of the system."""
         if self.reason:
             return Mode.STOPPED
         if self.motion.paused:
@@ -124,7 +105,7 @@ class SystemState:
         if len(names) > _MOST_NODES:
 
             def priority(node: str) -> tuple[bool, int, str]:
-                stop, end = stops.get(node, _NO_STOP).time, cleared.get(node, 0)
+                stop, end = stops.get(node, Stop(0, '')).time, cleared.get(node, 0)
                 return stop > end, max(stop, end), node
 
             for node in sorted(names, key=priority)[:-_MOST_NODES]:
@@ -133,9 +114,8 @@ class SystemState:
         return SystemState(stops, cleared, max(self.motion, other.motion))
 
     def to_values(self) -> dict[str, str]:
-        """Return the state as values of a DiagnosticStatus."""
         time, retracts, paused = self.motion
-        words = [str(time), _RETRACTING * retracts, _PAUSED * paused]
+        words = [str(time), Mode.RETRACTING.value * retracts, Mode.PAUSED.value * paused]
         return {
             _MODE: self.mode.value,
             _MOTION: ' '.join(filter(None, words)),
@@ -158,31 +138,24 @@ class SystemState:
                 cleared[key[len(_CLEARED) :]] = time
             elif key == _MOTION:
                 words = rest.split()
-                motion = _Motion(time, _RETRACTING in words, _PAUSED in words)
+                motion = _Motion(time, Mode.RETRACTING.value in words, Mode.PAUSED.value in words)
         return cls(stops, cleared, motion)
 
 
 class Authority:
-    """
-    System state in one node, and the requests that change it.
-
-    ``time`` returns a time [ns] by which requests of different nodes are ordered. `changed` is
-    whether the state has changed since the node published it.
-    """
+    """System state in one node, and the requests that change it, ordered by ``time`` [ns]."""
 
     def __init__(self, node: str = '', time: Callable[[], int] = time_ns) -> None:
         self.node, self._time = node, time
         self.state = SystemState()
-        self.changed = True
+        self.changed = True  #: Whether the state has changed since the node published it.
 
     @property
     def mode(self) -> Mode:
-        """Mode of the system."""
         return self.state.mode
 
     @property
     def reason(self) -> str:
-        """Reason of the stop; '' without a stop."""
         return self.state.reason
 
     def _next(self) -> int:
@@ -220,12 +193,7 @@ class Authority:
         self._merge(SystemState(motion=motion))
 
     def request(self, word: str, obstacle: str = '') -> tuple[bool, str]:
-        """
-        Execute a request of a user, a word of `REQUESTS`.
-
-        ``obstacle`` is the reason why the node cannot execute it, or ''. Return whether it is
-        executed, and one line for the user.
-        """
+        """Execute a word of `REQUESTS`; return whether it is executed, and a line for the user."""
         stopped = self.reason
         if word == STOP:
             self.stop('requested by a user')

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, steady_timer
+from needle_ros.base_node import BaseNode, key_values, steady_timer
 from needle_ros.event_log import Severity
 from needle_ros.system_state import Authority, Mode, PAUSE, REQUESTS, RESUME, STOP, SystemState
 from std_msgs.msg import Bool
@@ -20,9 +20,8 @@ class SystemStateTopics:
     """
     Publish and receive ``system_state``, and offer the requests of a user as services.
 
-    The services are ``~/stop``, ``~/clear_stop`` and ``~/retract`` (Trigger) and ``~/pause``
-    (SetBool). ``request`` executes a word of `REQUESTS` and returns whether it succeeded, and a
-    line for the user; ``obey`` follows a state of another node.
+    ``request`` executes a word of `REQUESTS` and returns whether it succeeded, and a line for the
+    user; ``obey`` follows a state of another node.
     """
 
     def __init__(
@@ -82,9 +81,6 @@ class SystemStateTopics:
                 level=severity.level,
                 name=authority.node,
                 message=f'{mode.value}: {reason}' if reason else mode.value,
-                values=[
-                    KeyValue(key=key, value=value)
-                    for key, value in authority.state.to_values().items()
-                ],
+                values=key_values(authority.state.to_values()),
             )
         )

@@ -8,8 +8,6 @@ NANOSECONDS: Final = 1_000_000_000
 #: Larger differences indicate stamps of different clocks, such as simulated and system time [ns].
 _DAYS: Final = 10 * 24 * 3600 * NANOSECONDS
 
-_DIGITS: Final = 19
-
 
 def nanoseconds(time: Any) -> int:
     """Convert a builtin_interfaces Time or Duration to ns."""
@@ -22,12 +20,8 @@ def seconds(time: Any) -> float:
 
 
 def parse_nanoseconds(text: str) -> int | None:
-    """
-    Parse a time [ns] of at most 19 decimal digits, as of 64 bits; None if it is invalid.
-
-    Python raises an error for texts with thousands of digits.
-    """
-    valid = len(text) <= _DIGITS and text.isascii() and text.isdecimal()
+    """Parse a time [ns] of at most 19 decimal digits, as of 64 bits; None if it is invalid."""
+    valid = len(text) <= 19 and text.isascii() and text.isdecimal()
     return int(text) if valid else None
 
 

@@ -39,11 +39,10 @@ class LateTrajectoryError(ParameterError):
 
 class JointPath(NamedTuple):
     """
-    Points of joints, with times from the start of the trajectory [s].
+    Points of joints, with times from the stamp of the trajectory [s].
 
-    The start is the stamp of the message, as for joint_trajectory_controller: a trajectory that
-    arrives later joins at its first point that is not in the past. Without points, the joints
-    stop; without names, all joints.
+    One that arrives later joins at its first point that is not in the past, as for
+    joint_trajectory_controller. Without points, the joints stop; without names, all joints.
     """
 
     joints: Sequence[str]
@@ -54,20 +53,17 @@ class JointPath(NamedTuple):
 
     @classmethod
     def from_message(cls, message: Any) -> JointPath:
-        """Convert a trajectory_msgs/JointTrajectory."""
         # One point above the limit is enough to reject it.
         points = message.points[: MOST_POINTS + 1]
-        return cls(
-            list(message.joint_names),
-            [seconds(point.time_from_start) for point in points],
-            [list(point.positions) for point in points],
-            [list(point.velocities) for point in points],
-            [list(point.effort) for point in points],
+        times = [seconds(point.time_from_start) for point in points]
+        columns = (
+            [list(getattr(point, field)) for point in points]
+            for field in ('positions', 'velocities', 'effort')
         )
+        return cls(list(message.joint_names), times, *columns)
 
     @property
     def stops(self) -> bool:
-        """Whether the joints must stop."""
         return not self.times
 
     def end(self, begun: int) -> int:
@@ -75,11 +71,7 @@ class JointPath(NamedTuple):
         return begun + round(NANOSECONDS * self.times[-1]) if self.times else begun
 
     def check(self, elapsed: float) -> None:
-        """
-        Check number and times of the points, at a time after the start [s].
-
-        Raises `LateTrajectoryError` if all points are in the past.
-        """
+        """Check number and times of the points, at a time after the start [s]."""
         if len(self.times) > MOST_POINTS:
             raise ParameterError(f'a path may have at most {MOST_POINTS} points')
         if self.stops:
@@ -104,7 +96,6 @@ class JointPath(NamedTuple):
         return JointPath(self.joints, times, *columns)
 
     def only(self, joints: Collection[str]) -> JointPath:
-        """Return the path of some of its joints."""
         kept = [k for k, name in enumerate(self.joints) if name in joints]
         columns = (
             [[point[k] for k in kept if k < len(point)] for point in values]
@@ -114,12 +105,7 @@ class JointPath(NamedTuple):
 
 
 def joint_values(joint: str, joints: Sequence[str], values: Points) -> list[float | None]:
-    """
-    Return the values of one joint at each point of a trajectory, None at points without one.
-
-    `joints` are the joint names of the trajectory; `ParameterError` if the joint is not among
-    them.
-    """
+    """Return the values of one of the `joints` at each point, None at points without one."""
     if joint not in joints:
         raise ParameterError(f'needs the joint {joint!r}, got {list(joints)}')
     index = list(joints).index(joint)

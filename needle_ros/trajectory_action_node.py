@@ -3,12 +3,16 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from importlib import import_module
+from functools import partial
 from typing import Any, Final
 
-from needle_ros.base_node import BaseNode
-from needle_ros.contract import FOLLOW_JOINT_TRAJECTORY, JOINT_TRAJECTORY
-from needle_ros.errors import ParameterError, printable
+from needle_ros.base_node import BaseNode, message_class
+from needle_ros.contract import (
+    FOLLOW_JOINT_TRAJECTORY,
+    FOLLOW_JOINT_TRAJECTORY_TYPE,
+    JOINT_TRAJECTORY,
+)
+from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.requests import Acknowledgement, RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import FollowedJoint, JointPath
@@ -19,13 +23,10 @@ from needle_ros.trajectory_goals import (
     TrajectoryGoal,
     UnknownJointError,
 )
+import numpy as np
 from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
-from trajectory_msgs.msg import JointTrajectoryPoint
 
-#: Period of the feedback [ns], as for joint_trajectory_controller.
-_PERIOD: Final = NANOSECONDS // 20
-
-_INACTIVE: Final = 'the node is not active'
+_PERIOD: Final = NANOSECONDS // 20  #: Of the feedback [ns], as for joint_trajectory_controller.
 
 
 class _GoalServer(ActionServer):
@@ -57,27 +58,11 @@ class TrajectoryAction:
     """
     Offer ``~/follow_joint_trajectory`` of control_msgs, if this package is installed.
 
-    A goal becomes the same request as a message on `joint_trajectory`. Every goal is accepted, and
-    an invalid one aborted with code and reason, for which a rejection has no field. A goal that is
-    canceled or violates a tolerance holds its joints.
-
-    Parameters
-    ----------
-    node : BaseNode
-        The receiver.
-    requests : RequestLog
-        Log of its requests, in which `joint_trajectory` is answered.
-    joints : collection of str
-        Joints that it moves.
-    request : callable
-        Takes a trajectory with its stamp [ns], as if it arrived on the topic.
-    hold : callable
-        Holds joints at once.
-    discard : callable
-        Discards the requests of joints that await their start, for a reason.
-    now : callable
-        Returns the time of the stamps [ns].
-
+    A goal for some of the `joints` becomes the same request as a message on `joint_trajectory`,
+    which `request` executes with its stamp [ns], and `requests` answers. Every goal is accepted,
+    and an invalid one aborted with code and reason, for which a rejection has no field. `hold`
+    holds the joints of a goal that is canceled or violates a tolerance, `discard` discards those
+    that await their start, for a reason. `now` returns the time of the stamps [ns].
     """
 
     def __init__(
@@ -93,21 +78,18 @@ class TrajectoryAction:
         self._node, self._requests, self._joints = node, requests, joints
         self._request, self._hold, self._discard, self._now = request, hold, discard, now
         self._server: _GoalServer | None = None
-        #: Goals in execution, by their stamps [ns].
-        self._running: dict[int, _Execution] = {}
+        self._running: dict[int, _Execution] = {}  #: Goals in execution, by their stamps [ns].
         self._canceled: list[ServerGoalHandle] = []
-        #: Time of the last check of the goals [ns].
-        self._updated = 0
-        package, _, kind = FOLLOW_JOINT_TRAJECTORY.type_name.partition('/action/')
+        self._updated = 0  #: Time of the last check of the goals [ns].
         try:
-            self._action = getattr(import_module(f'{package}.action'), kind)
-        except ImportError:
+            self._action = message_class(FOLLOW_JOINT_TRAJECTORY_TYPE, kind='action')
+        except MessageError:
             # Not among the wheels of ROS 2.
             return
         self._server = _GoalServer(
             node,
             self._action,
-            FOLLOW_JOINT_TRAJECTORY.name,
+            FOLLOW_JOINT_TRAJECTORY,
             # Goals are executed by `update`.
             lambda _handle: self._action.Result(),
             handle_accepted_callback=self._on_goal,
@@ -116,7 +98,6 @@ class TrajectoryAction:
 
     @property
     def moves(self) -> bool:
-        """Whether there are goals in execution."""
         return bool(self._running)
 
     def destroy(self) -> None:
@@ -129,25 +110,20 @@ class TrajectoryAction:
     # Goals.
 
     def _on_goal(self, handle: ServerGoalHandle) -> None:
-        """Turn a goal into a request."""
         handle.execute()
         try:
             if not self._node.is_active:
-                raise ParameterError(_INACTIVE)
+                raise ParameterError('the node is not active')
             goal = TrajectoryGoal.from_message(handle.request, self._joints)
-        except UnknownJointError as error:
-            self._finish(handle, Outcome(ErrorCode.INVALID_JOINTS, str(error)))
-            return
         except ParameterError as error:
-            self._finish(handle, Outcome(ErrorCode.INVALID_GOAL, str(error)))
+            unknown = isinstance(error, UnknownJointError)
+            code = ErrorCode.INVALID_JOINTS if unknown else ErrorCode.INVALID_GOAL
+            self._finish(handle, Outcome(code, str(error)))
             return
         execution = _Execution(handle, goal)
-
-        def tell(answer: Acknowledgement, moved: Collection[str]) -> None:
-            self._on_answer(execution, answer, moved)
-
         stamp = nanoseconds(handle.request.trajectory.header.stamp) or self._now()
-        goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, tell)
+        report = partial(self._on_answer, execution)
+        goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, report)
         if not self._running:
             self._updated = self._now()
         self._running[goal.stamp] = execution
@@ -197,11 +173,7 @@ class TrajectoryAction:
     def update(
         self, stamp: int, followed: Mapping[str, FollowedJoint], paused: Collection[str] = ()
     ) -> None:
-        """
-        Check the goals in execution at a sample with a stamp [ns], and publish feedback.
-
-        Goals of joints that are paused wait.
-        """
+        """Check the goals at a sample with a stamp [ns], except for those of paused joints."""
         elapsed, self._updated = stamp - self._updated, stamp
         for execution in [*self._running.values()]:
             goal = execution.goal
@@ -227,18 +199,16 @@ class TrajectoryAction:
         feedback = self._action.Feedback(joint_names=[*goal.trajectory.joints])
         time = feedback.header.stamp
         time.sec, time.nanosec = divmod(stamp, NANOSECONDS)
-        desired = [joint.reference[:3] for joint in joints]
-        actual = [joint.actual for joint in joints]
-        error = [
-            (p - at, v - speed, force - load)
-            for (p, v, force), (at, speed, load) in zip(desired, actual, strict=True)
-        ]
-        for point, rows in (
+        desired = np.array([joint.reference[:3] for joint in joints])
+        actual = np.array([joint.actual for joint in joints])
+        elapsed = divmod(max(0, stamp - goal.stamp), NANOSECONDS)
+        for point, values in (
             (feedback.desired, desired),
             (feedback.actual, actual),
-            (feedback.error, error),
+            (feedback.error, desired - actual),
         ):
-            _fill(point, rows, max(0, stamp - goal.stamp))
+            point.positions, point.velocities, point.effort = values.T.tolist()
+            point.time_from_start.sec, point.time_from_start.nanosec = elapsed
         return feedback
 
     def _finish(self, handle: ServerGoalHandle, outcome: Outcome) -> None:
@@ -249,23 +219,9 @@ class TrajectoryAction:
             handle.succeed()
         else:
             handle.abort()
-            self._node.get_logger().warning(
-                printable(
-                    f'follow_joint_trajectory aborted, {outcome.code.name}: {outcome.reason}'
-                ),
-                throttle_duration_sec=1.0,
-            )
+            line = f'follow_joint_trajectory aborted, {outcome.code.name}: {outcome.reason}'
+            self._node.get_logger().warning(printable(line), throttle_duration_sec=1.0)
         reason = printable(outcome.reason)
         result = self._action.Result(error_code=int(outcome.code), error_string=reason)
         if self._server is not None:
             self._server.send_result(handle, result)
-
-
-def _fill(
-    point: JointTrajectoryPoint, rows: list[tuple[float, float, float]], elapsed: int
-) -> None:
-    """Write position, velocity and effort of each joint, at a time after the start [ns]."""
-    columns = (list(column) for column in zip(*rows, strict=True))
-    point.positions, point.velocities, point.effort = columns
-    time = point.time_from_start
-    time.sec, time.nanosec = divmod(elapsed, NANOSECONDS)

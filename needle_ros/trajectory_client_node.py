@@ -4,13 +4,12 @@
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from importlib import import_module
 from typing import Any
 
 from action_msgs.msg import GoalStatus
-from needle_ros.base_node import BaseNode
-from needle_ros.contract import FOLLOW_JOINT_TRAJECTORY, JOINT_TRAJECTORY
-from needle_ros.errors import ParameterError, printable
+from needle_ros.base_node import BaseNode, message_class
+from needle_ros.contract import FOLLOW_JOINT_TRAJECTORY_TYPE, JOINT_TRAJECTORY
+from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.requests import Acknowledgement, RequestStatus, Verdict
 from needle_ros.timing import nanoseconds
 from needle_ros.trajectory_goals import ErrorCode
@@ -20,40 +19,20 @@ from trajectory_msgs.msg import JointTrajectory
 
 
 class TrajectoryClient:
-    """
-    Send trajectories as goals, and report the answers as those of a receiver of the topic.
-
-    Parameters
-    ----------
-    node : BaseNode
-        The sender.
-    action : str
-        Name of the action.
-    tell : callable
-        Takes the name of the action, and its answer to the last trajectory.
-
-    Raises
-    ------
-    ParameterError
-        If control_msgs is not installed.
-
-    """
+    """Send trajectories as goals; `take` receives the name of the action, and its answers."""
 
     def __init__(
-        self, node: BaseNode, action: str, tell: Callable[[str, RequestStatus], None]
+        self, node: BaseNode, action: str, take: Callable[[str, RequestStatus], None]
     ) -> None:
-        package, _, kind = FOLLOW_JOINT_TRAJECTORY.type_name.partition('/action/')
         try:
-            self._kind = getattr(import_module(f'{package}.action'), kind)
-        except ImportError:
-            raise ParameterError(f'the action {action} needs {package}: install it') from None
-        self._action, self._tell = action, tell
+            self._kind = message_class(FOLLOW_JOINT_TRAJECTORY_TYPE, kind='action')
+        except MessageError:
+            raise ParameterError(f'the action {action} needs control_msgs: install it') from None
+        self._action, self._take = action, take
         self._client = ActionClient(node, self._kind, action)
-        #: The last trajectory; an older one is superseded by it.
-        self._last = JointTrajectory()
+        self._last = JointTrajectory()  #: The last trajectory, which supersedes older ones.
 
     def destroy(self) -> None:
-        """Destroy the client."""
         self._client.destroy()
 
     def send(self, trajectory: JointTrajectory) -> None:
@@ -68,16 +47,15 @@ class TrajectoryClient:
         """Report the answer to the last trajectory, or that there is none."""
         topic, stamp = JOINT_TRAJECTORY.name, nanoseconds(self._last.header.stamp)
         answers = () if verdict is None else (Acknowledgement(topic, stamp, verdict, reason),)
-        self._tell(self._action, RequestStatus({topic: tuple(self._last.joint_names)}, answers))
+        self._take(self._action, RequestStatus({topic: tuple(self._last.joint_names)}, answers))
 
     def _on_response(self, trajectory: JointTrajectory, future: Future) -> None:
         handle: ClientGoalHandle = future.result()
+        accepted = handle.accepted
         if trajectory is self._last:
-            if handle.accepted:
-                self._report(Verdict.ACCEPTED)
-            else:
-                self._report(Verdict.REJECTED, 'the goal was rejected')
-        if handle.accepted:
+            reason = '' if accepted else 'the goal was rejected'
+            self._report(Verdict.ACCEPTED if accepted else Verdict.REJECTED, reason)
+        if accepted:
             handle.get_result_async().add_done_callback(partial(self._on_result, trajectory))
 
     def _on_result(self, trajectory: JointTrajectory, future: Future) -> None:

@@ -61,12 +61,11 @@ class Tolerance(NamedTuple):
 @dataclass(slots=True)
 class TrajectoryGoal:
     """
-    A goal with its tolerances by joint, for the joints of a receiver.
+    A goal with its tolerances by joint.
 
-    It succeeds when the references of all joints have arrived and the joints are within
-    ``goal``. This may take ``timeout`` [ns] from the time of the last point on, as for
-    joint_trajectory_controller, or any time if it is 0. Until the references have arrived, the
-    joints must be within ``path`` of them.
+    It succeeds when the references of all joints have arrived and the joints are within ``goal``,
+    at most ``timeout`` [ns] after the last point (0: any time). Before, they must be within
+    ``path``.
     """
 
     trajectory: JointPath
@@ -74,18 +73,11 @@ class TrajectoryGoal:
     goal: Mapping[str, Tolerance]
     timeout: int
     stamp: int = 0  #: Stamp of its request [ns].
-    #: Whether its motion has begun, and time for which it was paused [ns].
-    moves: bool = False
-    paused: int = 0
+    moves: bool = False  #: Whether its motion has begun.
+    paused: int = 0  #: Time for which it was paused [ns].
 
     @classmethod
     def from_message(cls, message: Any, joints: Collection[str]) -> TrajectoryGoal:
-        """
-        Convert a goal of the action, for the joints of a receiver.
-
-        Raises `UnknownJointError` for other joints, and `ParameterError` for a goal without
-        points, with a multi-DOF joint or its tolerances, or with an invalid tolerance.
-        """
         trajectory = JointPath.from_message(message.trajectory)
         _check_joints('joint_names', trajectory.joints, joints)
         if trajectory.stops:
@@ -105,14 +97,15 @@ class TrajectoryGoal:
 
     @property
     def joints(self) -> frozenset[str]:
-        """Names of the moved joints."""
         return frozenset(self.trajectory.joints)
 
     def check(self, stamp: int, followed: Mapping[str, FollowedJoint]) -> Outcome | None:
         """Return the outcome at a sample with a stamp [ns], None while the goal is executed."""
         joints = {name: followed[name] for name in self.trajectory.joints}
         waits = [name for name, joint in joints.items() if not joint.reference.arrived]
-        excess = _first_excess(self.path if waits else self.goal, joints)
+        limits = self.path if waits else self.goal
+        found = (limit.excess(name, joints[name]) for name, limit in limits.items())
+        excess = next(filter(None, found), '')
         if waits and excess:
             return Outcome(ErrorCode.PATH_TOLERANCE_VIOLATED, excess)
         if not waits and not excess:
@@ -129,9 +122,9 @@ def outcome_of(answer: Acknowledgement, now: int) -> Outcome:
     """Return the outcome of a goal whose request is refused at a time [ns]."""
     rejected = answer.verdict is Verdict.REJECTED
     is_old = rejected and is_stale(answer.stamp, now) and answer.stamp < now
-    if answer.verdict is Verdict.LATE or is_old:
-        return Outcome(ErrorCode.OLD_HEADER_TIMESTAMP, answer.reason)
-    return Outcome(ErrorCode.INVALID_GOAL, answer.reason)
+    old = answer.verdict is Verdict.LATE or is_old
+    code = ErrorCode.OLD_HEADER_TIMESTAMP if old else ErrorCode.INVALID_GOAL
+    return Outcome(code, answer.reason)
 
 
 def _check_joints(field: str, names: Collection[str], valid: Collection[str]) -> None:
@@ -146,7 +139,6 @@ def _check_joints(field: str, names: Collection[str], valid: Collection[str]) ->
 def _tolerances(
     field: str, messages: Iterable[Any], joints: Collection[str]
 ) -> dict[str, Tolerance]:
-    """Convert tolerances of some of the joints."""
     found = {one.name: Tolerance(one.position, one.velocity) for one in messages}
     if found:
         _check_joints(field, [one.name for one in messages], joints)
@@ -156,8 +148,3 @@ def _tolerances(
                 f'{field} of {name} must be positive, 0 or {_ERASED:g}, got {list(tolerance)}'
             )
     return found
-
-
-def _first_excess(tolerances: Mapping[str, Tolerance], joints: Mapping[str, FollowedJoint]) -> str:
-    found = (tolerance.excess(name, joints[name]) for name, tolerance in tolerances.items())
-    return next(filter(None, found), '')

@@ -9,16 +9,12 @@ from needle_ros.errors import ParameterError
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS
 
-#: Executes a request: an object of the caller, and the time since the stamp [s].
+#: Executes a request with an object of the caller and the time since the stamp [s], or raises.
 RequestAction: TypeAlias = Callable[[Any, float], None]
 
 
 class WaitingRequest(NamedTuple):
-    """
-    A received request: topic, stamp [ns], moved joints, and action.
-
-    The action raises its errors; the time of a request that has waited is 0.
-    """
+    """A received request: topic, stamp [ns], moved joints, and action."""
 
     topic: Topic
     stamp: int
@@ -62,11 +58,7 @@ class WaitingRequests:
     def execute(
         self, until: int, context: Any, elapsed: float, only: WaitingRequest | None = None
     ) -> list[ParameterError]:
-        """
-        Execute and answer the requests, or one, sent before a time [ns]; return the errors.
-
-        `context` is the object for their actions, `elapsed` the time since their stamps [s].
-        """
+        """Execute and answer the requests, or one, sent before `until` [ns]; return the errors."""
         errors = []
         while (request := self.take(until, only)) is not None:
             topic, stamp, joints, act = request

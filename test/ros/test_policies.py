@@ -96,7 +96,7 @@ def test_permissions_to_publish_agree_with_the_contract() -> None:
 def test_goals_are_accepted_from_operator_and_steering_only() -> None:
     """Each action that may be called is executed by a node that receives trajectories."""
     offered = {node: profile.execute for node, profile in POLICY.items() if profile.execute}
-    name = FOLLOW_JOINT_TRAJECTORY.name
+    name = FOLLOW_JOINT_TRAJECTORY
     assert offered == {n: {name.replace('~', f'/{n}')} for n in ('plant', 'controller')}
     assert {*offered} == {n for n in NODES if '/joint_trajectory' in POLICY[n].subscribe} - {
         'recorder'
