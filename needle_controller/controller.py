@@ -83,20 +83,7 @@ class ControllerSettings(CheckedSettings):
         return self.measurement_timeout + 1.0 / self.rate
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
-        """
-        Return the least and largest insertion depth to control [m].
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            The needle.
-
-        Raises
-        ------
-        ParameterError
-            If the settings leave no range for this needle.
-
-        """
+        """Return the least and largest insertion depth to control [m]; reject an empty range."""
         low = max(self.lowest_depth, parameters.minimum_depth)
         high = min(self.highest_depth, parameters.length)
         if not low < high:
@@ -166,11 +153,6 @@ class Controller:
         Limits of the reference.
     uncertainty : Uncertainty, optional
         Uncertainty of the nominal constants; the gains must be stable within it.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown or the gains are unstable at this rate and delay.
 
     Examples
     --------
@@ -255,22 +237,8 @@ class Controller:
         """
         Continue with other constants, gains or another law; target, reference and memory stay.
 
-        During a motion the switch is bumpless: the force is continuous.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters, optional
-            Needle and tissue.
-        law : str, optional
-            Control law.
-        gains : Mapping[str, Mapping[str, Gains]], optional
-            Gains by law and axis; missing gains stay.
-
-        Raises
-        ------
-        ParameterError
-            If the gains are unstable with the changes. Nothing is changed then.
-
+        Missing gains stay. During a motion the switch is bumpless: the force is continuous. If the
+        gains are unstable with the changes, nothing is changed.
         """
         parameters, name = parameters or self.parameters, law or self.law
         completed = _completed(gains or {}, self._gains)
@@ -306,20 +274,7 @@ class Controller:
         )
 
     def set_target(self, depth: float) -> None:
-        """
-        Set the target insertion depth; see `ReferenceGenerator.aim`.
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth [m].
-
-        Raises
-        ------
-        ParameterError
-            If it is not finite or out of range.
-
-        """
+        """Set the target insertion depth [m]; see `ReferenceGenerator.aim`."""
         self.guide.aim(depth)
         # A new target is valid, also if the needle has moved before.
         self._last_depth = None
@@ -330,20 +285,7 @@ class Controller:
         positions: Sequence[float],
         velocities: Sequence[float] | None = None,
     ) -> None:
-        """
-        Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`.
-
-        Parameters
-        ----------
-        times, positions, velocities
-            As for `ReferenceGenerator.follow`.
-
-        Raises
-        ------
-        ParameterError
-            If the path is not valid.
-
-        """
+        """Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`."""
         self.guide.follow(times, positions, velocities)
         self._last_depth = None
 
@@ -384,22 +326,11 @@ class Controller:
         self, measured: Measurement, load: float = 0.0, age: float = 0.0
     ) -> ControllerOutput:
         """
-        Return the command that answers a measurement.
+        Return the command that answers a measurement of an age [s], with a known load [N].
 
-        Parameters
-        ----------
-        measured, load
-            As for `Commander.command`.
-        age : float
-            Age of the measurement [s].
-
-        Returns
-        -------
-        ControllerOutput
-            Zero force without a target, or on a fault of the measurement: a value is not finite,
-            or the displacement is inconsistent with the velocity. After a gap or a step back in
-            time the motion restarts from the measured depth.
-
+        The force is zero without a target, or on a fault of the measurement: a value is not
+        finite, or the displacement is inconsistent with the velocity. After a gap or a step back
+        in time the motion restarts from the measured depth.
         """
         notice = None
         gap = self._displacement.gap(measured.time)

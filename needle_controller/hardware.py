@@ -123,18 +123,9 @@ class HardwareSettings:
 
     def axes(self) -> tuple[tuple[int, float], ...]:
         """
-        Return the sensor axes along x, y and z of ``needle_base``, a proper rotation.
+        Return index and sign of the sensor axes along x, y and z of ``needle_base``.
 
-        Returns
-        -------
-        tuple of (int, float)
-            Index and sign of the axis of the sensor, for x, y and z of ``needle_base``.
-
-        Raises
-        ------
-        ParameterError
-            If an axis is unknown, or both are the same.
-
+        They are a proper rotation. An unknown or repeated axis is a `ParameterError`.
         """
         sign, axis = signed_axis(self.force_axis, 'force_axis')
         along = AXES.index(axis)
@@ -191,8 +182,6 @@ class Robot:
 
     Attributes
     ----------
-    settings : HardwareSettings
-        As given.
     estimates : bool
         Whether velocities are estimated.
 
@@ -222,15 +211,7 @@ class Robot:
             self._base.position = None
 
     def configure(self, controller: Controller) -> None:
-        """
-        Take the nominal model and limits of a controller, for position commands.
-
-        Parameters
-        ----------
-        controller : Controller
-            The controller.
-
-        """
+        """Take the nominal model and limits of a controller, for position commands."""
         self._base = Admittance(
             Axis.insertion(controller.parameters),
             period=controller.period,
@@ -240,69 +221,26 @@ class Robot:
         )
 
     def set_model(self, parameters: NeedleParameters) -> None:
-        """
-        Continue with another nominal friction.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle and tissue.
-
-        """
+        """Continue with another nominal friction."""
         if self._base is not None:
             self._base.axis = Axis.insertion(parameters)
 
     # From the robot.
 
     def length(self, position: float) -> float:
-        """
-        Return the insertion depth at a position of the robot.
-
-        Parameters
-        ----------
-        position : float
-            Position of the joint, in its unit.
-
-        """
+        """Return the insertion depth [m] at a position of the joint, in its unit."""
         return self._gain * (position - self.settings.zero)
 
     def force(self, effort: float) -> float:
-        """
-        Return the axial force on the needle for an effort of the robot.
-
-        Parameters
-        ----------
-        effort : float
-            Effort of the joint, in its unit.
-
-        Returns
-        -------
-        float
-            Force on the needle [N], positive into the tissue.
-
-        """
+        """Return the axial force on the needle [N] for an effort of the joint, in its unit."""
         return effort / self._gain
 
     def measurement(self, reading: Reading) -> Measurement:
         """
-        Convert a joint state to a measurement.
+        Convert a joint state, with any joints in any order, to a measurement.
 
-        Parameters
-        ----------
-        reading : Reading
-            The joint state, with any joints in any order.
-
-        Returns
-        -------
-        Measurement
-            Depth, velocity, angle and force; the force is NaN if it is not reported, or with
-            position commands.
-
-        Raises
-        ------
-        ParameterError
-            If a required joint, position, or velocity for efforts is missing.
-
+        The force is NaN if it is not reported, or with position commands. A missing joint,
+        position, or velocity for efforts is a `ParameterError`.
         """
         settings, names = self.settings, reading.names
         positions, velocities, efforts = reading.values
@@ -354,19 +292,9 @@ class Robot:
 
     def wrench(self, reading: Reading) -> Reading:
         """
-        Convert a force sensor reading to the axes and the sign of the contract.
+        Convert a reading of the force sensor to the wrench on the needle, along ``needle_base``.
 
-        Parameters
-        ----------
-        reading : Reading
-            Reading of the sensor, in its own frame.
-
-        Returns
-        -------
-        Reading
-            Wrench of the base on the needle, along the axes of ``needle_base``; the frame name is
-            unchanged, and the moment is still about the origin of the sensor.
-
+        The frame name is unchanged, and the moment is still about the origin of the sensor.
         """
         numbers = reading.values[0]
         sign = -1.0 if self.settings.reaction else 1.0
@@ -382,22 +310,10 @@ class Robot:
         self, answer: ForceCommand, load: float = 0.0, *, stopped: bool = False
     ) -> list[float] | None:
         """
-        Return the joint commands for a force command.
+        Return efforts or positions in the units of the robot; None if there is no position yet.
 
-        Parameters
-        ----------
-        answer : ForceCommand
-            Force command of the controller.
-        load : float
-            Load against insertion that the force must overcome [N].
-        stopped : bool
-            Whether a stop is latched: then the position command is the last measured position.
-
-        Returns
-        -------
-        list of float or None
-            Efforts or positions, in the units of the robot; None if there is no position yet.
-
+        ``load`` is the load against insertion that the force must overcome [N]. With ``stopped``,
+        a latched stop, the position command is the last measured position.
         """
         settings = self.settings
         if settings.command == EFFORT:

@@ -66,26 +66,10 @@ def transition_matrix(
     Compute the transition matrix of the closed loop over one period, exact for its linear part.
 
     The state is position, velocity, the memory of the law (integral, filtered rate and modeled
-    motion, if its gains use them) and the pending commands; the latest are known to the law.
-    The matrix is computed by running the implemented loop on unit states, so that analysis and
-    implementation agree.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect that the law takes into account.
-    unmodeled : int
-        Additional periods of delay, unknown to the law.
-    plant : Axis, optional
-        The true axis, if it differs from the nominal axis of the law; without its dry friction.
-
-    Returns
-    -------
-    ndarray, shape (N, N)
-        Transition matrix over one period.
-
+    motion, if its gains use them) and the pending commands; the latest are known to the law. The
+    law takes ``delay`` periods from measurement to effect into account; ``unmodeled`` more are
+    unknown to it. ``plant`` is the true axis, without its dry friction. The matrix is computed by
+    running the implemented loop on unit states, so that analysis and implementation agree.
     """
     linear, late = law.linear(), delay + unmodeled
     moved = (plant or law.axis).without_coulomb()
@@ -110,15 +94,7 @@ def transition_matrix(
 
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None) -> float:
-    """
-    Return the largest modulus of the poles; below 1 is stable.
-
-    Parameters
-    ----------
-    law, delay, unmodeled, plant
-        As for `transition_matrix`.
-
-    """
+    """Return the largest modulus of the poles; below 1 is stable. See `transition_matrix`."""
     matrix = transition_matrix(law, delay, unmodeled, plant)
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
@@ -149,37 +125,11 @@ def stability_limit(
     law: Law, delay: int, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
 ) -> Limit:
     """
-    Find the stability limit of a loop over all axes, with its delay and with the delay in reserve.
+    Return the largest limit cycle, or else the radius with the largest excess over its bound.
 
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect.
-    margin : float
-        Required distance of the spectral radius from one, in [0, 1).
-    plants : sequence of Axis
-        Other axes on which the loop must be stable, such as those from `Uncertainty.axes`.
-
-    Returns
-    -------
-    Limit
-        The largest limit cycle, or else the radius with the largest excess over its bound.
-
-    Raises
-    ------
-    ParameterError
-        If ``margin`` is out of range.
-
-    Examples
-    --------
-    >>> from needle_controller import Axis, Pid, PidGains, stability_limit
-    >>> from needle_dynamics import NeedleParameters
-    >>> axis = Axis.insertion(NeedleParameters.preset('phantom'))
-    >>> stability_limit(Pid(axis=axis, gains=PidGains(), period=1e-3), delay=1).stable
-    True
-
+    The loop runs on its nominal axis and on other ``plants``, such as those from
+    `Uncertainty.axes`, with its delay and with the delay in reserve. ``margin`` is the required
+    distance of the spectral radius from one, in [0, 1).
     """
     if not 0.0 <= margin < 1.0:
         raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
@@ -195,10 +145,16 @@ def check_stability(
 
     Parameters
     ----------
-    law, delay, margin, plants
-        As for `stability_limit`.
+    law : Law
+        Control law.
+    delay : int
+        Periods from measurement to effect.
     name : str
         Name of the gains for the message.
+    margin : float
+        Required distance of the spectral radius from one, in [0, 1).
+    plants : sequence of Axis
+        Other axes on which the loop must be stable, such as those from `Uncertainty.axes`.
 
     Returns
     -------

@@ -39,17 +39,7 @@ class Uncertainty(CheckedSettings):
     )
 
     def axes(self, axis: Axis, *, carriage: bool = False) -> list[Axis]:
-        """
-        Return the axes at the uncertainty bounds, also with fractions of the carriage mass.
-
-        Parameters
-        ----------
-        axis : Axis
-            The nominal axis.
-        carriage : bool
-            Whether the axis may carry the carriage.
-
-        """
+        """Return the axes at the uncertainty bounds, with ``carriage`` also with its mass."""
         extra = [part * self.carriage for part in _PARTS if carriage and self.carriage > 0.0]
         inertias = [*_bounds(axis.inertia, self.inertia)]
         inertias += [max(inertias) + mass for mass in extra]

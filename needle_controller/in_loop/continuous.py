@@ -64,12 +64,8 @@ def run_continuous(
 
     Raises
     ------
-    ShapeError, ParameterError
-        If an argument is invalid.
-    InsertionDepthError
-        If the needle leaves its range.
     NeedleError
-        If the solver fails, or law and friction chatter.
+        If the needle leaves its range, the solver fails, or law and friction chatter.
 
     Notes
     -----

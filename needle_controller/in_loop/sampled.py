@@ -39,22 +39,7 @@ class Commander(Protocol):
         """Periods from a measurement to the effect of its command."""
 
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
-        """
-        Return the command for a measurement.
-
-        Parameters
-        ----------
-        measured : Measurement
-            Encoder measurement.
-        load : float
-            Force of the bent needle against insertion [N]; 0 if unknown.
-
-        Returns
-        -------
-        ControllerOutput
-            Force and torque.
-
-        """
+        """Return the command for a measurement and the load of the bent needle [N]."""
 
 
 def run_controller(
@@ -222,10 +207,8 @@ def run_batch(
         Coulomb friction [N] and viscous friction [N s/m] are added, until the next row.
     step : float
         Longest step of the integrator [s].
-    keep : bool
-        Keep the insertion depths of all periods.
-    record : bool
-        Keep the states and the commands of all periods.
+    keep, record : bool
+        Keep the insertion depths of all periods; keep their states and commands.
     workers : int, optional
         Number of threads; one per core by default.
     progress : bool or callable, optional
@@ -235,13 +218,6 @@ def run_batch(
     -------
     LoopBatch
         Results, independent of the number of threads.
-
-    Raises
-    ------
-    ShapeError
-        If the numbers of runs do not agree.
-    ParameterError, InsertionDepthError
-        If a value is invalid.
 
     """
     each_law = [laws] if isinstance(laws, Law) else list(laws)

@@ -48,7 +48,12 @@ def _gain_matrix(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousLaw(ABC):
-    """Control law in continuous time: a function of state, goal and integral of the error."""
+    """
+    Control law in continuous time: a function of state, goal and integral of the error.
+
+    States X = [d, theta, q1, ..., qn] and rates have shape (2 (2 + n),), goals q, q_dot and q_ddot
+    have shape (3, 2 + n).
+    """
 
     model: NeedleModel  #: nominal model of needle and tissue; the plant may differ
     #: ``physical``: f_y and tau only. ``modal``: a generalized force on every coordinate, as in
@@ -66,27 +71,7 @@ class ContinuousLaw(ABC):
         return 0
 
     def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
-        """
-        Return the errors of the driven coordinates.
-
-        Parameters
-        ----------
-        state : ndarray, shape (2 (2 + n),)
-            State X = [d, theta, q1, ..., qn] and rates.
-        goal : array_like, shape (3, 2 + n)
-            Desired q, q_dot and q_ddot.
-
-        Returns
-        -------
-        ndarray, shape (3, driven)
-            e = q_d - q, its rate, and the desired acceleration.
-
-        Raises
-        ------
-        ShapeError
-            If the shape of the goal is wrong or a number is not finite.
-
-        """
+        """Return e = q_d - q, its rate, and the desired acceleration; shape (3, driven)."""
         m, k = self.model.coordinates, self.driven
         wanted = np.array(goal, dtype=float)
         if wanted.shape != (3, m) or not np.isfinite(wanted).all():
@@ -100,30 +85,11 @@ class ContinuousLaw(ABC):
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
         """
-        Return the forces.
+        Return the forces at a time [s], for tissue that swells; shape (2 + n,).
 
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State X = [d, theta, q1, ..., qn] and rates.
-        goal : array_like, shape (3, 2 + n)
-            Desired q, q_dot and q_ddot.
-        integral : array_like, shape (integrals,)
-            Integral of the errors of the driven coordinates.
-        time : float
-            Time [s], for tissue that swells.
-
-        Returns
-        -------
-        ndarray, shape (2 + n,)
-            f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i
-            [N m^-1/2].
-
-        Raises
-        ------
-        ShapeError, InsertionDepthError
-            If the state, the goal or the integral is invalid.
-
+        They are f_y [N], positive into the tissue, tau [N m], and the generalized force on each
+        q_i [N m^-1/2]. The integral of the errors of the driven coordinates has shape
+        (integrals,).
         """
 
 

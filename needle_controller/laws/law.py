@@ -45,13 +45,12 @@ _TERMS: Final = {
 
 
 def no_memory() -> FloatArray:
-    """Return the initial memory of a law, `MEMORY` zeros."""
     return np.zeros(MEMORY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains(CheckedSettings):
-    """Gains of a law on one axis: `scaled` applies to kp, ki, kd, kv and bandwidth only."""
+    """Gains of a law on one axis."""
 
     def scaled(self, factor: float) -> LawGains:
         """Return a copy with kp, ki, kd, kv and bandwidth multiplied by a positive factor."""
@@ -104,24 +103,10 @@ class Law:
         load: float = 0.0,
     ) -> float:
         """
-        Return the force for the next period, before any limit.
+        Return the force for the next period, before any limit [N].
 
-        Parameters
-        ----------
-        position, velocity : float
-            Position and velocity of the axis.
-        setpoint : Setpoint
-            Setpoint.
-        memory : ndarray, shape (MEMORY,)
-            As from `no_memory`.
-        load : float
-            Known force against the motion [N].
-
-        Returns
-        -------
-        float
-            Force [N].
-
+        The memory, shape (MEMORY,), is as from `no_memory`; ``load`` is a known force against the
+        motion [N].
         """
         return law_force(self.packed, memory, _instant(position, velocity, setpoint), float(load))
 
@@ -130,20 +115,7 @@ class Law:
         return replace(self, axis=self.axis.without_coulomb())
 
     def scaled(self, factor: float) -> Law:
-        """
-        Return the law with all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            The factor, positive.
-
-        Returns
-        -------
-        Law
-            The law, of the same class.
-
-        """
+        """Return the law with all gains multiplied by a positive factor."""
         return replace(self, gains=self.gains.scaled(factor))
 
 
@@ -154,19 +126,10 @@ def _instant(position: float, velocity: float, setpoint: Setpoint) -> tuple[floa
 
 class SampledLoop:
     """
-    Sampled law with delay compensation and a force limit.
+    Sampled law with delay compensation and a force limit [N].
 
     A command computed from a measurement takes effect ``delay`` periods later. The law uses the
     state predicted for this time from the pending commands.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect.
-    limit : float
-        Largest force [N].
     """
 
     def __init__(self, law: Law, delay: int, limit: float) -> None:
@@ -195,20 +158,7 @@ class SampledLoop:
         self.memory[:] = 0.0
 
     def switch(self, law: Law) -> None:
-        """
-        Continue with another law of the same period; its first force equals the last force.
-
-        Parameters
-        ----------
-        law : Law
-            New law.
-
-        Raises
-        ------
-        ParameterError
-            If its period differs.
-
-        """
+        """Continue with another law of the same period; its first force equals the last force."""
         if law.period != self.law.period:
             raise ParameterError(
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
@@ -241,24 +191,9 @@ class SampledLoop:
         self, position: float, velocity: float, setpoint: Setpoint, load: float = 0.0
     ) -> float:
         """
-        Return the force to apply, within the limit [N]; see `Law.force`.
+        Return the force to apply, within the limit [N] or [N m]; see `Law.force`.
 
-        The state is measured now; the setpoint is for the time of the effect of the command.
-
-        Parameters
-        ----------
-        position, velocity : float
-            Measured position and velocity of the axis [m, m/s] or [rad, rad/s].
-        setpoint : Setpoint
-            Setpoint at the time of the effect of the command.
-        load : float
-            Known force against the motion, added by the law [N] or [N m].
-
-        Returns
-        -------
-        float
-            Force [N] or torque [N m].
-
+        Position and velocity are measured now; the setpoint is for the effect of the command.
         """
         law, load = self.law, float(load)
         law_learn(law.packed, self.memory, float(position), float(velocity), self._acts - load)

@@ -76,20 +76,18 @@ class Observer:
     """
     Estimator of q1 to qn and their rates during the motion.
 
+    Depths [m], velocities [m/s] and deflections [m] are floats, stamps integers in ns on one
+    clock.
+
     Parameters
     ----------
     parameters : NeedleParameters
-        Nominal parameters of needle and tissue.
+        Nominal parameters of needle and tissue; the formulation is `complete`.
     settings : ObserverSettings
         Noise and sensors.
     period : float
-        Sample period of encoders and wrench [s].
-
-    Raises
-    ------
-    ParameterError
-        If the formulation is `as_printed`, or the period is not positive, not shorter than the
-        history, or far from a whole number of samples of the force sensor's filter.
+        Sample period of encoders and wrench [s], shorter than the history, and about a whole
+        number of samples of the force sensor's filter.
 
     """
 
@@ -167,28 +165,12 @@ class Observer:
         """
         Process a sample of the encoders, and optionally of the base wrench.
 
-        The observer starts at the first sample, without its wrench. A gap is bridged at constant
-        velocity. A gap longer than the history, a clock set back by more than the history, or a
-        jump of depth restarts the observer with a `warning`.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the sample [ns]. Steps within 1 % of the period count as one period.
-        depth, velocity : float
-            Insertion depth [m] and velocity [m/s], positive into the tissue.
-        wrench : tuple of float, optional
-            Lateral force along z [N] and moment about x at the base [N m], less any torque that
-            turns the base; nan for a missing component.
-
-        Raises
-        ------
-        ParameterError
-            If the stamp is not an integer, depth or velocity is not finite, or the speed is
-            implausible; the estimate does not change.
-        InsertionDepthError
-            If the depth is outside its range; the estimate does not change.
-
+        The observer starts at the first sample, without its wrench. Steps within 1 % of the period
+        count as one period. A gap is bridged at constant velocity. A gap longer than the history,
+        a clock set back by more than the history, or a jump of depth restarts the observer with a
+        `warning`. The wrench is the lateral force along z [N] and the moment about x at the base
+        [N m], less any torque that turns the base; nan for a missing component. An invalid sample
+        raises `ParameterError` or `InsertionDepthError`, and the estimate does not change.
         """
         needle = self._filter.needle
         fastest = needle.length / self.period
@@ -235,16 +217,9 @@ class Observer:
 
     def add_wrench(self, stamp: int, lateral: float, moment: float) -> None:
         """
-        Process a base wrench that arrives separately from the encoder sample of the same time.
+        Process a base wrench that arrives separately from the encoder sample of the same stamp.
 
-        Parameters
-        ----------
-        stamp : int
-            Time of the wrench [ns], on the clock of `update`: the time of an encoder sample, which
-            may arrive later.
-        lateral, moment : float
-            As for `update`; nan if missing.
-
+        The encoder sample may arrive later. Force and moment are as for `update`.
         """
         time, lateral, moment = self._seconds(stamp), _finite(lateral), _finite(moment)
         if self._last is None or not (isfinite(lateral) or isfinite(moment)):
@@ -267,16 +242,10 @@ class Observer:
 
     def add_tip(self, stamp: int, deflection: float) -> None:
         """
-        Process a sample of the tip deflection, with any delay within the history.
+        Process a mean tip deflection [m], with any delay within the history.
 
-        Parameters
-        ----------
-        stamp : int
-            End of the exposure [ns], plus ``tip_latency``, on the clock of `update`. It may be
-            later than the last encoder sample, and earlier than previous tip samples.
-        deflection : float
-            Mean deflection over the exposure [m].
-
+        The stamp [ns] is the end of the exposure plus ``tip_latency``. It may be later than the
+        last encoder sample, and earlier than previous tip samples.
         """
         end = self._seconds(stamp) - self.settings.tip_latency
         if self._last is None or not isfinite(_finite(deflection)):

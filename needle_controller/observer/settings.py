@@ -53,7 +53,6 @@ def _low_pass(
 
 
 def _of_sensor(name: str, channel: int) -> float:
-    """Return a constant of the default force sensor of the plant."""
     return float(_SENSOR.per_axis(name)[channel])
 
 
@@ -151,7 +150,6 @@ class ObserverSettings:
         }
 
     def noise(self) -> Noise:
-        """Return the variances of the filter."""
         gain = _low_pass(self.cutoffs, self.filter_rate)[3]
         # A count of the reading is uniform rounding.
         counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
@@ -168,20 +166,7 @@ class ObserverSettings:
         )
 
     def low_pass(self, ticks: int) -> LowPass:
-        """
-        Return the low-pass of the wrench over a sample.
-
-        Parameters
-        ----------
-        ticks : int
-            Samples of the force sensor in a sample of the observer.
-
-        Returns
-        -------
-        LowPass
-            Transition, noise and responses over this number of samples.
-
-        """
+        """Return the low-pass of the wrench over a number of samples of the force sensor."""
         transition, drive, steady, _ = _low_pass(self.cutoffs, self.filter_rate)
         response = np.empty((ticks, len(drive)))
         response[0] = drive

@@ -35,20 +35,7 @@ class Reference(Protocol):
     duration: float  #: Duration of the motion [s].
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time.
-
-        Parameters
-        ----------
-        time : float
-            Time since the start [s]. Before the start and after the end the reference rests.
-
-        Returns
-        -------
-        Setpoint
-            Desired position, velocity and acceleration.
-
-        """
+        """Return the setpoint at a time since the start [s]; it rests before and after."""
 
 
 def around(depths: tuple[float, float], start: Setpoint) -> tuple[float, float]:
