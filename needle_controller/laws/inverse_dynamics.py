@@ -69,7 +69,7 @@ class InverseDynamics(Law):
     The force that starts a needle of 0.2 kg at rest towards a target 1 mm away:
 
     >>> from needle_controller import Axis, InverseDynamics, InverseDynamicsGains, Setpoint
-    >>> from needle_controller import no_memory
+    >>> from needle_controller.laws.law import no_memory
     >>> axis = Axis(inertia=0.2, viscous=300.0, coulomb=0.56)
     >>> law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=1e-3)
     >>> print(f'{law.force(0.02, 0.0, Setpoint(0.021), no_memory()):.2f} N')

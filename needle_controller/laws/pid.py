@@ -56,7 +56,8 @@ class Pid(Law):
     --------
     The force on a needle of 0.2 kg at rest, 1 mm from its target:
 
-    >>> from needle_controller import Axis, no_memory, Pid, PidGains, Setpoint
+    >>> from needle_controller import Axis, Pid, PidGains, Setpoint
+    >>> from needle_controller.laws.law import no_memory
     >>> axis = Axis(inertia=0.2, viscous=300.0, coulomb=0.56)
     >>> law = Pid(axis=axis, gains=PidGains(), period=1e-3)
     >>> print(f'{law.force(0.02, 0.0, Setpoint(0.021), no_memory()):.2f} N')
