@@ -19,7 +19,7 @@ from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant, flag
+from needle_ros.settings import CheckedSettings, constant, flag, positive
 from needle_ros.status import ControllerStatus
 
 AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
@@ -53,16 +53,15 @@ class ControllerSettings(CheckedSettings):
         1.0, 'periods', 'number of whole periods from a measurement to the effect of its command',
         high=20.0, whole=True,
     )  # fmt: skip
-    force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
-    torque_limit: float = constant(0.01, 'N m', 'largest torque', open_low=True)
-    measurement_timeout: float = constant(
-        0.1, 's', 'age from which a measurement is stale', open_low=True
-    )
-    jump: float = constant(
-        2e-3, 'm', 'displacement, at once or within 2 s, that is inconsistent with the measured '
+    force_limit: float = positive(15.0, 'N', 'largest insertion force')
+    torque_limit: float = positive(0.01, 'N m', 'largest torque')
+    measurement_timeout: float = positive(0.1, 's', 'age from which a measurement is stale')
+    jump: float = positive(
+        2e-3,
+        'm',
+        'displacement, at once or within 2 s, that is inconsistent with the measured '
         'velocity and is a fault; a displacement of this size during a fault clears the target',
-        open_low=True,
-    )  # fmt: skip
+    )
     stability_margin: float = constant(
         MARGIN, '1', 'required relative decrease of every control error per period', high=0.5
     )
@@ -72,10 +71,9 @@ class ControllerSettings(CheckedSettings):
     lowest_depth: float = constant(
         0.0, 'm', 'least insertion depth to control; minimum_depth if that is larger'
     )
-    highest_depth: float = constant(
-        10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller',
-        open_low=True,
-    )  # fmt: skip
+    highest_depth: float = positive(
+        10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller'
+    )
 
     @property
     def longest_gap(self) -> float:

@@ -14,7 +14,7 @@ from needle_dynamics import NeedleParameters
 from needle_ros.axes import AXES, signed_axis
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, choice, constant, flag, text
+from needle_ros.settings import check_constants, choice, constant, flag, positive, text
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -56,7 +56,7 @@ class HardwareSettings:
     sign: float = constant(
         1.0, '1', '1 if the position increases into the tissue, else -1', low=-1.0, high=1.0
     )
-    scale: float = constant(1.0, 'm', 'depth per unit of the joint: 1e-3 for mm', open_low=True)
+    scale: float = positive(1.0, 'm', 'depth per unit of the joint: 1e-3 for mm')
     zero: float = constant(0.0, 'unit of the robot', 'position at depth 0', low=-1e9, high=1e9)
     state_topic: str = text(
         '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
@@ -87,10 +87,8 @@ class HardwareSettings:
             'The others get zero effort, or hold their position at activation'
         },
     )
-    speed: float = constant(0.05, 'm/s', 'largest speed of a commanded position', open_low=True)
-    lead: float = constant(
-        2e-3, 'm', 'largest distance of a commanded from the measured position', open_low=True
-    )
+    speed: float = positive(0.05, 'm/s', 'largest speed of a commanded position')
+    lead: float = positive(2e-3, 'm', 'largest distance of a commanded from the measured position')
 
     def __post_init__(self) -> None:
         check_constants(self)

@@ -58,6 +58,11 @@ def constant(
     )
 
 
+def positive(default: float, unit: str, description: str, *, high: float = inf) -> Any:
+    """Declare a numeric dataclass field that must be above zero; see `constant`."""
+    return constant(default, unit, description, high=high, open_low=True)
+
+
 def choice(default: str, valid: Iterable[str], meaning: str = '') -> Any:
     """
     Declare a dataclass field with one of the `valid` words, which its description lists.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import inf
 
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_ros.settings import constant, flag
+from needle_ros.settings import constant, flag, positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,10 +19,9 @@ class AdaptiveGains(InverseDynamicsGains):
         0.5, '1', 'largest learned change of dry and of viscous friction, relative to the model',
         high=10.0,
     )  # fmt: skip
-    noise: float = constant(
-        0.05, 'N or N m', 'standard deviation of the force not explained by the friction model',
-        open_low=True,
-    )  # fmt: skip
+    noise: float = positive(
+        0.05, 'N or N m', 'standard deviation of the force not explained by the friction model'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

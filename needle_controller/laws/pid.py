@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_controller.compiled.laws import PID
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.settings import choice, constant, flag
+from needle_ros.settings import choice, constant, flag, positive
 
 #: Methods against integrator windup by name.
 ANTI_WINDUP: Final = ('conditional', 'back_calculation')
@@ -28,12 +28,13 @@ class PidGains(LawGains):
         0.0, 's', 'time constant of the low-pass filter of the error rate; 0 for none'
     )
     anti_windup: str = choice('conditional', ANTI_WINDUP)
-    tracking_time: float = constant(0.2, 's', 'time constant of back_calculation', open_low=True)
+    tracking_time: float = positive(0.2, 's', 'time constant of back_calculation')
     feed_forward: bool = flag(False, 'add the force of the reference motion on the modeled axis')
-    breakaway_speed: float = constant(
-        1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward fully includes '
-        'Coulomb friction', open_low=True,
-    )  # fmt: skip
+    breakaway_speed: float = positive(
+        1e-4,
+        '(m or rad)/s',
+        'speed of the reference at which feed_forward fully includes Coulomb friction',
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from needle_dynamics import FloatArray, ForceSensorParameters
 from needle_dynamics.simulated.force_sensor import low_pass
 from needle_dynamics.simulated.tip_sensor import TipParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, positive
 import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
 
@@ -76,29 +76,27 @@ class ObserverSettings:
         'for the model error of the tissue (the default covers a stiffness error of 30 % '
         'down to half the needle)',
     )  # fmt: skip
-    initial_deflection: float = constant(
-        1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
+    initial_deflection: float = positive(
+        1e-3, 'm', 'standard deviation of the tip deflection at the start'
     )
     tip_force: float = constant(
         0.5, 'N', 'standard deviation of a lateral force at the tip, such as a bevel load'
     )
-    tip_force_time: float = constant(1000.0, 's', 'correlation time of this force', open_low=True)
-    tip_noise: float = constant(
-        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
-        open_low=True,
-    )  # fmt: skip
-    tip_exposure: float = constant(
-        1e-3, 's', 'exposure before the stamp over which a tip sample is the mean', open_low=True
+    tip_force_time: float = positive(1000.0, 's', 'correlation time of this force')
+    tip_noise: float = positive(
+        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection'
+    )
+    tip_exposure: float = positive(
+        1e-3, 's', 'exposure before the stamp over which a tip sample is the mean'
     )
     tip_latency: float = constant(
         0.0, 's', 'time from the end of the exposure to the stamp of a tip sample', high=1.0
     )
-    force_noise: float = constant(
-        _read_noise(2, 6), 'N', 'standard deviation of the measured lateral force',
-        open_low=True,
-    )  # fmt: skip
-    torque_noise: float = constant(
-        _read_noise(3, 8), 'N m', 'standard deviation of the measured moment', open_low=True
+    force_noise: float = positive(
+        _read_noise(2, 6), 'N', 'standard deviation of the measured lateral force'
+    )
+    torque_noise: float = positive(
+        _read_noise(3, 8), 'N m', 'standard deviation of the measured moment'
     )
     force_offset: float = constant(
         0.01, 'N', 'standard deviation of the offset of the measured lateral force'
@@ -106,7 +104,7 @@ class ObserverSettings:
     torque_offset: float = constant(
         1e-3, 'N m', 'standard deviation of the offset of the measured moment'
     )
-    offset_time: float = constant(1000.0, 's', 'correlation time of these offsets', open_low=True)
+    offset_time: float = positive(1000.0, 's', 'correlation time of these offsets')
     force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
     torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
     cutoffs: tuple[float, ...] = field(
@@ -116,17 +114,13 @@ class ObserverSettings:
             '(Butterworth, second order) [Hz]'
         },
     )
-    filter_rate: float = constant(
-        _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input',
-        open_low=True,
-    )  # fmt: skip
-    history: float = constant(
-        0.3, 's', 'largest age of a late tip sample; longer gaps restart the observer',
-        open_low=True, high=10.0,
-    )  # fmt: skip
-    jump: float = constant(
-        5e-3, 'm', 'change of depth between samples that restarts the observer', open_low=True
+    filter_rate: float = positive(
+        _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input'
     )
+    history: float = positive(
+        0.3, 's', 'largest age of a late tip sample; longer gaps restart the observer', high=10.0
+    )
+    jump: float = positive(5e-3, 'm', 'change of depth between samples that restarts the observer')
 
     def __post_init__(self) -> None:
         check_constants(self)
