@@ -11,7 +11,7 @@ from needle_controller.hardware import POSITION, Robot, STAMPS
 from needle_controller.laws.axis import Axis
 from needle_controller.reference.setpoint import Setpoint
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.rate_monitor import RateMonitor
+from needle_controller.safety.timing_monitor import RateMonitor
 from needle_ros.axes import AXES
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant, flag
