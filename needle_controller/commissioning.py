@@ -108,7 +108,6 @@ class Commissioning:
                 )
 
     def _restart(self, phase: CommissioningPhase, result: str = '') -> None:
-        """Discard all measurements."""
         own = self.controller.settings
         self._steps: Generator[float, Measurement, None] | None = None
         #: Time, depth, velocity and force at rest, and changes since.

@@ -126,7 +126,6 @@ class ControllerOutput:
     refusal: str | None = None  #: why the motion is refused and the system must stop
 
     def is_finite(self) -> bool:
-        """Return whether force and torque are finite."""
         return isfinite(self.force) and isfinite(self.torque)
 
 
@@ -260,7 +259,6 @@ class Controller:
         return self._insertion.learned
 
     def status(self) -> ControllerStatus:
-        """Return target, law, stability and learned correction as fields of a status."""
         name, limit = max(self.limits.items(), key=lambda item: item[1].radius - item[1].bound)
         return ControllerStatus(
             target=self.target,
@@ -306,9 +304,9 @@ class Controller:
 
     def release(self) -> None:
         """
-        Discard the motion: the next measurement starts a new one from the measured depth.
+        Discard the motion: the next one starts at the measured depth.
 
-        Integrals are frozen while no force is commanded.
+        Integrals are frozen until then.
         """
         self.guide.release()
         self._insertion.stop()

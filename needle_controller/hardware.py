@@ -147,11 +147,7 @@ def dynamic_reading(
     joints: Sequence[str],
     interfaces: Sequence[tuple[Sequence[str], Sequence[float]]],
 ) -> Reading:
-    """
-    Convert a DynamicJointState to a JointState reading; missing values are NaN.
-
-    Each entry of ``interfaces`` has the names and values of the interfaces of one joint.
-    """
+    """Convert names and values by joint of a DynamicJointState; missing values are NaN."""
     columns = tuple(
         tuple(
             values[names.index(wanted)] if wanted in names else nan
@@ -178,11 +174,6 @@ class Robot:
     settings : HardwareSettings
         Joints, units and commands.
 
-    Attributes
-    ----------
-    estimates : bool
-        Whether velocities are estimated.
-
     """
 
     def __init__(self, settings: HardwareSettings) -> None:
@@ -198,7 +189,7 @@ class Robot:
 
     def begin(self) -> None:
         """Discard all measurements and commands."""
-        self.estimates = False
+        self.estimates = False  #: Whether velocities are estimated.
         self._speed = _Speed()
         #: Last measured insertion depth [m].
         self._depth = nan

@@ -72,11 +72,7 @@ class LoadEstimator:
             self.observer.add_wrench(stamp, lateral, moment)
 
     def take_truth(self, state: Sequence[float]) -> None:
-        """
-        Set the load from a true state, shape (2 (2 + n),), SI units.
-
-        Raises NeedleError if the state has no valid load.
-        """
+        """Set the load from a true state, shape (2 (2 + n),), which must have a valid load."""
         self.load = 0.0
         # Finite states may overflow.
         with np.errstate(over='ignore', invalid='ignore'):
@@ -86,11 +82,7 @@ class LoadEstimator:
         self.load = load
 
     def update(self, stamp: int, measured: Measurement) -> None:
-        """
-        Update the observer with an encoder sample and the wrench of the same stamp [ns].
-
-        Raises NeedleError if the observer rejects the sample.
-        """
+        """Update the observer with an encoder sample and the wrench of the same stamp [ns]."""
         observer, wrench = self.observer, self._waiting
         if observer is None:
             return
@@ -122,7 +114,6 @@ class LoadEstimator:
             )
 
     def status(self) -> ObserverStatus | None:
-        """Return the status of the observer; None before its first estimate."""
         observer = self.observer
         if observer is None or not observer.ready:
             return None

@@ -241,7 +241,6 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
 
 
 def _upwards(most: float) -> Iterator[float]:
-    """Yield factors above one, in ratios of 1.1."""
     factor = 1.1
     while factor <= most:
         yield factor

@@ -175,7 +175,6 @@ class SteeringNode(CompiledNode):
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
-        """Discard the steering executive."""
         self._loop = self._told = self._before = None
         if self._client is not None:
             self._client.destroy()
@@ -197,7 +196,6 @@ class SteeringNode(CompiledNode):
             self._processed = None
 
     def about(self) -> str:
-        """Name constants, steps and topics."""
         values = self.values()
         return (
             f'law {values["law"]}, needle {values["needle"]}, steps of '
@@ -255,13 +253,11 @@ class SteeringNode(CompiledNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Pass other nodes' answers to motions to the executive."""
         if self._client is not None:
-            # The action answers; the topic is not used.
+            # The action answers; receivers of the topic take none of the motions.
             return
         for status in message.status:
-            values = {one.key: one.value for one in status.values}
-            answers = RequestStatus.from_values(values)
-            # With an action, receivers of the topic take none of the motions.
-            if answers.takes and self._client is None:
+            answers = RequestStatus.from_values({one.key: one.value for one in status.values})
+            if answers.takes:
                 node = printable(node_of(status.name).rpartition('/')[2])
                 self._hear(node, answers)
 
@@ -305,7 +301,6 @@ class SteeringNode(CompiledNode):
             )
 
     def _obey(self) -> None:
-        """Follow the state of the system."""
         if self._loop is not None and self.is_active:
             self._act(self._loop.obey(self.now()))
 
@@ -377,7 +372,6 @@ class SteeringNode(CompiledNode):
         self._tip_expected.publish(message)
 
     def diagnose(self) -> Diagnosis[SteeringStatus]:
-        """Report the state, the expected tip and faults."""
         if self._loop is None:
             return Diagnosis(Severity.INFO, self.state, SteeringStatus())
         if not self.is_active:

@@ -93,7 +93,6 @@ class Supervisor(StateMachine[ForceCommand]):
         self.safety.stop = stop
 
     def cleanup(self) -> None:
-        """Discard controller and load estimate."""
         self.controller = self._active = None
         self.bending = LoadEstimator(NeedleParameters())
 
@@ -153,7 +152,6 @@ class Supervisor(StateMachine[ForceCommand]):
     # Requests.
 
     def receive(self, *, targets: bool) -> None:
-        """Set which requests are accepted."""
         self._targets = targets
         topics = (TARGET, JOINT_TRAJECTORY) if targets else (JOINT_TRAJECTORY,)
         self._take_requests(dict.fromkeys(topics, (INSERTION,)))
@@ -283,7 +281,6 @@ class Supervisor(StateMachine[ForceCommand]):
             controller.set_target(min(max(min(self.retract_depth, depth), low), high))
 
     def tip(self, reading: Reading, now: int) -> ForceCommand | None:
-        """Take a `tip_deflection` measurement."""
         if self._active is None:
             return None
         answer, (x, depth, deflection) = self._check_clock(now), reading.values[0]
@@ -295,7 +292,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return answer
 
     def wrench(self, reading: Reading, now: int) -> ForceCommand | None:
-        """Take a `base_wrench` measurement."""
         if self._active is None:
             return None
         answer, values = self._check_clock(now), reading.values[0]

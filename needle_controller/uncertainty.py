@@ -58,12 +58,11 @@ def _bounds(value: float, share: float) -> list[float]:
 
 def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float) -> float:
     """
-    Simulate a law on another axis; return the amplitude of a limit cycle [m] or [rad], 0 without.
+    Simulate a law on another axis; return the amplitude of a limit cycle [m] or [rad], or 0.
 
     A limit cycle is possible if the law has an integral, or compensates friction in the direction
     of the measured velocity, as inverse dynamics without feedback does. Other laws are not
-    simulated. ``delay`` and ``unmodeled`` are the modeled and unmodeled periods of delay;
-    ``radius`` is the spectral radius of the loop, below 1.
+    simulated. ``radius`` is the spectral radius of the loop, below 1.
     """
     c = law.constants
     measured = c.kind == INVERSE_DYNAMICS and c.kp == 0.0

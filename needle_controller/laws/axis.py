@@ -14,7 +14,6 @@ from needle_ros.errors import ParameterError
 
 
 def require_complete(parameters: NeedleParameters) -> None:
-    """Raise `ParameterError` unless the formulation is `complete`."""
     if parameters.formulation != 'complete':
         raise ParameterError(
             "formulation must be 'complete' for controller and observer, got "

@@ -151,21 +151,12 @@ class ContinuousInverseDynamics(ContinuousLaw):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousPid(ContinuousLaw):
-    """
-    F = k_p e + k_i int e dt + k_v e_dot, section 3.2.7.2.
+    """F = k_p e + k_i int e dt + k_v e_dot, section 3.2.7.2."""
 
-    Attributes
-    ----------
-    kp, kd : array_like, shape (driven,) or (driven, driven)
-        Gains, positive definite; the paper writes k_v for kd.
-    ki : array_like, shape (driven,) or (driven, driven), optional
-        Integral gain, positive semidefinite; no integral by default.
-
-    """
-
+    #: Gains, positive definite, shape (driven,) or (driven, driven); the paper writes k_v for kd.
     kp: ArrayLike
     kd: ArrayLike
-    ki: ArrayLike | None = None
+    ki: ArrayLike | None = None  #: integral gain, positive semidefinite; None: no integral
     _gains: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -207,12 +198,7 @@ class ContinuousPid(ContinuousLaw):
 def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
 ) -> FloatArray:
-    """
-    Return q_ddot, shape (2 + n,): forward dynamics (16)-(17) with a force on each coordinate.
-
-    ``forces`` are f_y [N], positive into the tissue, tau [N m], and the generalized force on each
-    q_i.
-    """
+    """Return q_ddot of (16)-(17) under `ContinuousLaw.forces`; both have shape (2 + n,)."""
     x, applied = model.checked_state(state), np.array(forces, dtype=float)
     if applied.shape != (model.coordinates,) or not np.isfinite(applied).all():
         raise ShapeError(

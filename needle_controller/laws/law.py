@@ -120,7 +120,6 @@ class Law:
 
 
 def _instant(position: float, velocity: float, setpoint: Setpoint) -> tuple[float, ...]:
-    """Return state and setpoint as the plain tuple of `Instant`."""
     return float(position), float(velocity), *setpoint
 
 

@@ -319,7 +319,6 @@ class Observer:
     # Estimates.
 
     def _estimated(self) -> _Estimate:
-        """Return the present estimate, computed once for each sample."""
         if self._last is None:
             raise NeedleError('the observer has no estimate before the first encoder sample')
         if self._estimate is None:
@@ -357,11 +356,10 @@ class Observer:
     @property
     def load(self) -> float:
         """
-        Force of the bent needle against insertion [N], to be added by inverse dynamics.
+        Force of the bent needle against insertion [N]: row d of the bias forces (13), reversed.
 
-        It is row d of the bias forces (13) with reversed sign. Modes above half the sample rate
-        are left out: the estimates of their rates are noise, and the load depends on the square of
-        the rates.
+        Modes above half the sample rate are left out: the estimates of their rates are noise, and
+        the load depends on the square of the rates.
         """
         return self._estimated().load
 
@@ -388,23 +386,9 @@ class Observer:
 
     def nees(self, modal: ArrayLike, rates: ArrayLike) -> float:
         """
-        Return the normalized estimation error squared (NEES) against the ground truth.
+        Return the normalized estimation error squared (NEES) of true modal coordinates and rates.
 
-        Parameters
-        ----------
-        modal, rates : array_like, shape (n,)
-            True modal coordinates and rates.
-
-        Returns
-        -------
-        float
-            Distributed as chi^2 with 2 n degrees of freedom if the filter is consistent.
-
-        Raises
-        ------
-        ShapeError
-            If a shape is wrong.
-
+        Their shape is (n,). It is chi^2 with 2 n degrees of freedom if the filter is consistent.
         """
         truth = np.concatenate([np.asarray(modal, dtype=float), np.asarray(rates, dtype=float)])
         estimated = self._estimated()

@@ -64,11 +64,7 @@ def _read_noise(channel: int, digits: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverSettings:
-    """
-    Assumptions of the observer on sensors and tissue in addition to `NeedleParameters`.
-
-    The defaults match the default sensors of the plant.
-    """
+    """Assumed sensors and tissue, beyond `NeedleParameters`; by default those of the plant."""
 
     irregularity: float = constant(
         1e-3, 'N s^(1/2) m^(-1/2)',

@@ -39,7 +39,6 @@ class ReferenceGenerator:
         self.forget()
 
     def forget(self) -> None:
-        """Discard target, path and pause."""
         #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
         self._path: Path | None = None

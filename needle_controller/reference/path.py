@@ -79,7 +79,6 @@ class Path:
     def _join_lines(
         self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
     ) -> None:
-        """Build the pieces from lines joined by parabolas."""
         slopes = [*(np.diff(positions) / np.diff(times)).tolist(), 0.0]
         # At the first point the velocity equals the slope of the first line.
         velocity, free = slopes[0], times[0]
@@ -111,7 +110,6 @@ class Path:
         velocities: Sequence[float],
         limits: ReferenceLimits,
     ) -> None:
-        """Build the pieces from cubics."""
         if velocities[-1] != 0.0:
             raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
         low, high = self.depths
@@ -197,11 +195,7 @@ class Joined(Reference):
 
 
 def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float]) -> Reference:
-    """
-    Return the shortest motion to rest, without a limit of jerk.
-
-    It exceeds the acceleration limit only where the range of depths ends before.
-    """
+    """Return the shortest motion to rest; the end of the range may need more acceleration."""
     low, high = depths
     stop = start.position + 0.5 * start.velocity * abs(start.velocity) / limits.acceleration
     slack = ROUNDING * (high - low)

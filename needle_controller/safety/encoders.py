@@ -10,11 +10,7 @@ from needle_ros.wire import Reading
 
 
 def read_encoders(reading: Reading) -> Measurement:
-    """
-    Convert a joint state to a measurement; `rotation` and efforts may be missing.
-
-    Raises ParameterError if `insertion` is missing, or a joint has no position or velocity.
-    """
+    """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
     names, (positions, velocities, efforts) = reading.names, reading.values
     try:
         i = names.index('insertion')

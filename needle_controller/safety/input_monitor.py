@@ -40,25 +40,12 @@ class InputMonitor:
     A message is stale from the age ``timeout`` on, or if its stamp leads by more than ``ahead``,
     by default the timeout [s]. ``frames`` are the valid frames, none: any. ``jumps`` are the
     implausible changes of each value between two messages. ``noise`` is the noise of each value: a
-    noisy stream with constant values is frozen; without noise, constant values are valid.
+    noisy stream with constant values is ``frozen``; without noise, constant values are valid.
 
-    Attributes
-    ----------
-    last : int
-        Stamp of the newest message that was in time [ns], -1 before the first.
-    step : int
-        Time between that message and the one before [ns].
-    counted : int or None
-        Time at which the last valid message was received [ns].
-    counts : Counter
-        Messages by result of the check.
-    frozen : bool
-        Whether a noisy stream has had the same values for longer than the timeout.
-    publishers : int
-        Number of nodes that publish the topic. With several publishers no message is valid.
-    window : RateCounter
-        Messages, with a mark for messages out of order.
-
+    ``last`` is the stamp of the newest message that was in time, -1 before the first, and ``step``
+    the time since the message before. ``counted`` is the time at which the last valid message was
+    received, and ``counts`` the messages by result of the check. With several ``publishers`` no
+    message is valid. ``window`` counts messages, and marks those out of order.
     """
 
     def __init__(

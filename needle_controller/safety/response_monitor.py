@@ -67,7 +67,6 @@ class StallMonitor:
         self._depth, self._velocity, self._expected = depth, 0.0, 0.0
 
     def change(self, axis: Axis) -> None:
-        """Continue with another nominal friction."""
         self.axis = axis
         self._learn()
 
@@ -98,14 +97,7 @@ class StallMonitor:
     def update(
         self, stamp: int, depth: float, rate: float, force: float, load: float
     ) -> str | None:
-        """
-        Process a measurement at a stamp [ns] and the force [N] that acted before it.
-
-        Takes insertion depth [m], velocity of the reference [m/s] and the known load against the
-        force [N].
-
-        Returns the fault, or None.
-        """
+        """Process depth [m], velocity of the reference [m/s], and force and load before it [N]."""
         before, self._stamp, self.notice = self._stamp, stamp, None
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
         if not 0.0 < elapsed <= self._longest:
@@ -175,7 +167,6 @@ class ResponseMonitor:
         self.forget()
 
     def change(self, parameters: NeedleParameters) -> None:
-        """Continue with another nominal friction."""
         self._stall.change(Axis.insertion(parameters))
 
     def forget(self) -> None:
@@ -188,7 +179,6 @@ class ResponseMonitor:
 
     @property
     def relaxed(self) -> bool:
-        """Whether no force may act while the reference rests."""
         return self._stall.relaxed
 
     def update(
@@ -205,9 +195,9 @@ class ResponseMonitor:
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
-        commanded and the reported force [N], the known load against the force [N], and whether
-        the reference is a step; the reported force is NaN if the robot reports none. During a step
-        no stall is detected: the reference rests while the needle moves.
+        commanded and the reported force [N], NaN if there is none, the known load against the
+        force [N], and whether the reference is a step: it rests while the needle moves, and is no
+        stall.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
@@ -227,7 +217,6 @@ class ResponseMonitor:
     def _follows_not(
         self, stamp: int, depth: float, rate: float, commanded: float, reported: float
     ) -> bool:
-        """Return whether the plant does not follow."""
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
             self._mark = None

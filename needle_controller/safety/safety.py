@@ -110,7 +110,6 @@ class Safety:
         return reason
 
     def obstacle(self, now: int) -> str | None:
-        """Return why a stop cannot be released."""
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
@@ -182,7 +181,6 @@ class Safety:
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def status(self, status: ControllerStatus, now: int) -> ControllerStatus:
-        """Return a status of the controller with stop, publishers, commands and inputs."""
         return replace(
             status,
             stop=self.stop or '',

@@ -56,12 +56,11 @@ class LatencyMonitor:
 
 class RateMonitor:
     """
-    Compare the time between two measurements, by their stamps, with the period.
+    Compare the steps between stamps of measurements with the ``rate`` of the laws [Hz].
 
     Only a sample of the measurements is compared, to save computing time. Lost measurements and
     jitter make some steps longer and others shorter; a wrong rate changes nearly all of them.
-    ``rate`` is the configured rate of the laws [Hz], ``longest`` the time between measurements
-    from which it is a gap [s].
+    ``longest`` is the step from which it is a gap [s].
     """
 
     def __init__(self, rate: float, longest: float) -> None:
@@ -95,10 +94,10 @@ class RateMonitor:
 
 class TimingMonitor:
     """
-    Monitor the latency, and compare rate and latency with the settings of a controller.
+    Compare rate and latency with the settings of a controller; without, only measure the latency.
 
-    Without `settings`, only the latency is measured. Without `stamped`, stamps are receive times:
-    they do not resolve single periods, and the rate is not compared.
+    Without `stamped`, stamps are receive times: they do not resolve single periods, and the rate
+    is not compared.
     """
 
     def __init__(
