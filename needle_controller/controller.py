@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Axial controller: reference, control laws and limits; one command per measurement."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -18,9 +20,13 @@ from needle_controller.safety.displacement_monitor import DisplacementMonitor
 from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
+from needle_ros.contract import INSERTION
 from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant, flag, positive
 from needle_ros.status import ControllerStatus
+from needle_ros.timing import NANOSECONDS
+from needle_ros.trajectories import joint_values, JointPath
+from needle_ros.wire import Reading
 
 AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
 
@@ -104,6 +110,31 @@ class Measurement:
     angular_velocity: float = 0.0  #: its velocity [rad/s]
     #: Axial force on the needle as reported by the robot [N]; NaN if not reported.
     force: float = nan
+
+    @classmethod
+    def from_reading(cls, reading: Reading) -> Measurement:
+        """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
+        names, (positions, velocities, efforts) = reading.names, reading.values
+        try:
+            i = names.index('insertion')
+            depth, velocity = positions[i], velocities[i]
+            angle = angular_velocity = 0.0
+            if 'rotation' in names:
+                j = names.index('rotation')
+                angle, angular_velocity = positions[j], velocities[j]
+        except (ValueError, IndexError):
+            raise ParameterError(
+                "joint_states needs position and velocity of 'insertion', got names "
+                f'{list(names)}, {len(positions)} positions, {len(velocities)} velocities'
+            ) from None
+        return cls(
+            time=reading.stamp / NANOSECONDS,
+            depth=depth,
+            velocity=velocity,
+            angle=angle,
+            angular_velocity=angular_velocity,
+            force=efforts[i] if i < len(efforts) else nan,
+        )
 
     def is_finite(self) -> bool:
         """Return whether every number is finite; the force may be missing."""
@@ -284,6 +315,20 @@ class Controller:
         """Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`."""
         self.guide.follow(times, positions, velocities)
         self._last_depth = None
+
+    def follow_joints(self, path: JointPath, elapsed: float) -> None:
+        """Follow the insertion in a path, at a time after its start [s]; without points, stop."""
+        path = path.after(elapsed)
+        if path.stops:
+            if path.joints:
+                joint_values(INSERTION, path.joints, ())
+            self.stop_motion()
+            return
+        depths, rates = (
+            [one for one in joint_values(INSERTION, path.joints, values) if one is not None]
+            for values in (path.positions, path.velocities)
+        )
+        self.follow(path.times, depths, rates or None)
 
     def stop_motion(self) -> None:
         """Brake to rest and hold; see `ReferenceGenerator.stop_motion`."""

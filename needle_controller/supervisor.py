@@ -3,17 +3,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from time import monotonic
 from typing import Final
 
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
-from needle_controller.joint_path import follow_path
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
-from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.limits import SafetyLimits
@@ -175,8 +172,11 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
         """Take a path, which starts at its stamp."""
-        act = partial(follow_path, path)
-        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, act)
+
+        def follow(controller: Controller, elapsed: float) -> None:
+            controller.follow_joints(path, elapsed)
+
+        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
         if path.stops and stamp <= now:
             # A stop waits for no sample.
             self._execute_request(stamp + 1)
@@ -342,7 +342,8 @@ class Supervisor(StateMachine[ForceCommand]):
         self._execute_request(stamp)
         try:
             robot = self._robot
-            measured = read_encoders(reading) if robot is None else robot.measurement(reading)
+            convert = Measurement.from_reading if robot is None else robot.measurement
+            measured = convert(reading)
         except ParameterError as error:
             return self._release_for(str(error), stamp)
         if measured.is_finite():
