@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics with friction adaptation."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import inf
+from typing import Any, ClassVar
 
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
 from needle_ros.settings import constant, flag, positive
@@ -34,6 +34,8 @@ class Adaptive(InverseDynamics):
     every measurement: a bounded external force on the loop of inverse dynamics.
     """
 
+    LINEAR: ClassVar[Mapping[str, Any]] = {'learn': False, 'bound': 0.0}
+
     gains: AdaptiveGains
 
     def __post_init__(self) -> None:
@@ -43,8 +45,3 @@ class Adaptive(InverseDynamics):
         constants = self.constants._replace(bound=float(self.gains.bound), noise=float(noise))
         object.__setattr__(self, 'constants', constants)
         object.__setattr__(self, 'packed', tuple(constants))
-
-    def linear(self) -> Adaptive:
-        """Return the law without Coulomb friction and learning; see `Law.linear`."""
-        gains = replace(self.gains, learn=False, bound=0.0)
-        return replace(self, axis=self.axis.without_coulomb(), gains=gains)

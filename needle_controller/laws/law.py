@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from math import exp, inf, sqrt
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from needle_controller.compiled.laws import (
     axis_step,
@@ -63,6 +64,8 @@ class LawGains(CheckedSettings):
 class Law:
     """Sampled control law on one axis; its memory is stored by its loop."""
 
+    LINEAR: ClassVar[Mapping[str, Any]] = {}  #: Gains that make the law linear.
+
     axis: Axis  #: nominal model of the axis
     gains: LawGains
     period: float  #: sample period h [s]
@@ -111,8 +114,9 @@ class Law:
         return law_force(self.packed, memory, _instant(position, velocity, setpoint), float(load))
 
     def linear(self) -> Law:
-        """Return the law without Coulomb friction, for its poles."""
-        return replace(self, axis=self.axis.without_coulomb())
+        """Return the law for its poles: without Coulomb friction, and with the gains `LINEAR`."""
+        gains = replace(self.gains, **self.LINEAR)
+        return replace(self, axis=self.axis.without_coulomb(), gains=gains)
 
     def scaled(self, factor: float) -> Law:
         """Return the law with all gains multiplied by a positive factor."""

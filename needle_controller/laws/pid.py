@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """PID control, section 3.2.7.2 of the paper, in implicit sampled form."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
 
 from needle_controller.compiled.laws import PID
 from needle_controller.laws.law import Law, LawGains
@@ -66,6 +65,8 @@ class Pid(Law):
 
     """
 
+    LINEAR: ClassVar[Mapping[str, Any]] = {'tolerance': 0.0}
+
     gains: PidGains
 
     def __post_init__(self) -> None:
@@ -82,10 +83,4 @@ class Pid(Law):
             # Implicit: stable for every tracking time.
             tracking=h / (gains.tracking_time + h) if tracks else 0.0,
             feed_forward=gains.feed_forward,
-        )
-
-    def linear(self) -> Pid:
-        """Return the law without Coulomb friction and tolerance; see `Law.linear`."""
-        return replace(
-            self, axis=self.axis.without_coulomb(), gains=replace(self.gains, tolerance=0.0)
         )

@@ -10,15 +10,12 @@ from needle_controller.safety.guard import Guard
 from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import NeedleParameters
-from needle_ros.contract import BASE
+from needle_ros.contract import BASE, ENTRY
 from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
 #: Topics whose absence or duplicate publishers prevent any force.
 _VITAL: Final = ('wrench_command', 'joint_states')
-
-#: Topics with messages in the order of their stamps.
-_MEASURED: Final = ('joint_states', 'ground_truth', 'base_wrench', 'tip_deflection')
 
 #: Fractions of messages out of order for a warning and for a stop; above this rate [Hz].
 _LATE: Final = 0.5
@@ -53,26 +50,25 @@ class Safety:
         self.guard = Guard(limits, settings.depths(parameters))
         self.saturation = RateCounter()
         noise = noise or {}
-        timeout = limits.sensor_timeout
+        #: Timeout, valid frames and implausible changes of each input.
+        inputs: dict[str, tuple[float, tuple[str, ...], tuple[float, ...]]] = {
+            'joint_states': (settings.measurement_timeout, (), ()),
+            'ground_truth': (settings.measurement_timeout, (), ()),
+            'base_wrench': (
+                limits.sensor_timeout,
+                (wrench_frame,),
+                (limits.lateral_jump, limits.moment_jump),
+            ),
+            'tip_deflection': (limits.sensor_timeout, (ENTRY,), (limits.tip_jump,)),
+        }
         # A stamp in the future would make the stamps of the true source late.
         ahead = 1.0 / settings.rate
         self.streams = {
-            stream.name: stream
-            for stream in (
-                InputMonitor('joint_states', settings.measurement_timeout, ahead=ahead),
-                InputMonitor('ground_truth', settings.measurement_timeout, ahead=ahead),
-                InputMonitor(
-                    'base_wrench', timeout, frames=(wrench_frame,),
-                    jumps=(limits.lateral_jump, limits.moment_jump),
-                    noise=noise.get('base_wrench', ()), ahead=ahead,
-                ),
-                InputMonitor(
-                    'tip_deflection', timeout, frames=('needle_entry',),
-                    jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
-                    ahead=ahead,
-                ),
+            name: InputMonitor(
+                name, timeout, frames=frames, jumps=jumps, noise=noise.get(name, ()), ahead=ahead
             )
-        }  # fmt: skip
+            for name, (timeout, frames, jumps) in inputs.items()
+        }
         self._expected = expected
         #: Start of encoder measurements without a gap [ns]; 0: no /clock yet.
         self._begun: int | None = None
@@ -174,9 +170,7 @@ class Safety:
         late = (
             f'{name} has {share:.0%} of its messages out of order'
             for name, stream in self.streams.items()
-            if name in _MEASURED
-            and (share := stream.window.share(now)) > _LATE
-            and stream.window.rate(now) >= _FEW
+            if (share := stream.window.share(now)) > _LATE and stream.window.rate(now) >= _FEW
         )
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
