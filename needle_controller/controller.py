@@ -31,10 +31,11 @@ from needle_ros.wire import Reading
 AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
 
 Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
+AllGains: TypeAlias = Mapping[str, Mapping[str, Gains]]  #: Gains by law and axis.
 
 #: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
 #: rotary inertia of the paper's needle.
-DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
+DEFAULT_GAINS: Final[AllGains] = {
     'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
     'inverse_dynamics': {'insertion': InverseDynamicsGains(), 'rotation': InverseDynamicsGains()},
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
@@ -201,7 +202,7 @@ class Controller:
         parameters: NeedleParameters,
         law: str = LAWS[0],
         *,
-        gains: Mapping[str, Mapping[str, Gains]] | None = None,
+        gains: AllGains | None = None,
         settings: ControllerSettings | None = None,
         reference: str = 'trapezoid',
         limits: ReferenceLimits | None = None,
@@ -232,7 +233,7 @@ class Controller:
         self.forget()
 
     def _checked(
-        self, name: str, parameters: NeedleParameters, gains: Mapping[str, Mapping[str, Gains]]
+        self, name: str, parameters: NeedleParameters, gains: AllGains
     ) -> tuple[list[Law], dict[str, Limit]]:
         """Return the laws and their stability limits; reject unstable gains."""
         if name not in LAWS:
@@ -260,7 +261,7 @@ class Controller:
         parameters: NeedleParameters | None = None,
         *,
         law: str | None = None,
-        gains: Mapping[str, Mapping[str, Gains]] | None = None,
+        gains: AllGains | None = None,
     ) -> None:
         """
         Continue with other constants, gains or another law; target, reference and memory stay.
@@ -424,10 +425,7 @@ class Controller:
         return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
 
 
-def _completed(
-    gains: Mapping[str, Mapping[str, Gains]],
-    defaults: Mapping[str, Mapping[str, Gains]] = DEFAULT_GAINS,
-) -> dict[str, dict[str, Gains]]:
+def _completed(gains: AllGains, defaults: AllGains = DEFAULT_GAINS) -> dict[str, dict[str, Gains]]:
     """Return gains of every law and axis; reject unknown names and gains of another law."""
     completed = {law: dict(axes) for law, axes in defaults.items()}
     for law, axes in gains.items():

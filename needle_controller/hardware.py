@@ -108,7 +108,6 @@ class HardwareSettings:
             raise ParameterError(
                 f"command_type must be one of {others} for the command position, got 'wrench'"
             )
-
         if self.command_type != 'wrench' and not self.command_topic:
             raise ParameterError(
                 f"command_topic must be the driver's topic for {self.command_type}, got ''"

@@ -37,26 +37,6 @@ class Path:
         limits: ReferenceLimits,
         depths: tuple[float, float],
     ) -> None:
-        self._check(times, positions, velocities, depths)
-        #: Start time, position, velocity, acceleration and jerk of each piece.
-        self._pieces: list[tuple[float, float, float, float, float]] = []
-        #: Times of the first point and of the end [s], and insertion depth at the end [m].
-        self.begin, self.end, self.last = float(times[0]), float(times[-1]), float(positions[-1])
-        self.depths = depths
-        if velocities is None:
-            self._join_lines(times, positions, limits)
-        else:
-            self._join_cubics(times, positions, velocities, limits)
-        self._starts = np.array([piece[0] for piece in self._pieces])
-
-    @staticmethod
-    def _check(
-        times: Sequence[float],
-        positions: Sequence[float],
-        velocities: Sequence[float] | None,
-        depths: tuple[float, float],
-    ) -> None:
-        """Reject points that are missing, not finite, out of order or out of range."""
         if not times or len(times) != len(positions):
             raise ParameterError(
                 f'path needs one position for each of at least one time, got {len(positions)} '
@@ -75,10 +55,19 @@ class Path:
             raise ParameterError(
                 f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
             )
+        #: Start time, position, velocity, acceleration and jerk of each piece.
+        self._pieces: list[tuple[float, float, float, float, float]] = []
+        #: Times of the first point and of the end [s], and insertion depth at the end [m].
+        self.begin, self.end, self.last = float(times[0]), float(times[-1]), float(positions[-1])
+        self.depths, self._limits = depths, limits
+        if velocities is None:
+            self._join_lines(times, positions)
+        else:
+            self._join_cubics(times, positions, velocities)
+        self._starts = np.array([piece[0] for piece in self._pieces])
 
-    def _join_lines(
-        self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
-    ) -> None:
+    def _join_lines(self, times: Sequence[float], positions: Sequence[float]) -> None:
+        limits = self._limits
         slopes = [*(np.diff(positions) / np.diff(times)).tolist(), 0.0]
         # At the first point the velocity equals the slope of the first line.
         velocity, free = slopes[0], times[0]
@@ -104,15 +93,11 @@ class Path:
         self._pieces[-1] = (free, positions[-1], 0.0, 0.0, 0.0)
 
     def _join_cubics(
-        self,
-        times: Sequence[float],
-        positions: Sequence[float],
-        velocities: Sequence[float],
-        limits: ReferenceLimits,
+        self, times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]
     ) -> None:
         if velocities[-1] != 0.0:
             raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
-        low, high = self.depths
+        (low, high), limits = self.depths, self._limits
         for k in range(len(times) - 1):
             t = times[k + 1] - times[k]
             p, d, v0, v1 = positions[k], positions[k + 1] - positions[k], *velocities[k : k + 2]
