@@ -37,7 +37,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Longest time to find a topic by its type, and time between two checks [s].
 _DISCOVERY: Final = 10.0
-_LOOK: Final = 0.1
+_PAUSE: Final = 0.1
 
 
 def _named(topic: Topic, name: str, type_name: str) -> Topic:
@@ -88,7 +88,7 @@ def await_topics(node: BaseNode, settings: HardwareSettings) -> None:
     types = [kind for _, name, kind in _readings(settings) if name == BY_TYPE]
     deadline = monotonic() + _DISCOVERY
     while not all(_published(node, one) for one in types) and monotonic() < deadline:
-        sleep(_LOOK)
+        sleep(_PAUSE)
 
 
 def _published(node: BaseNode, type_name: str) -> list[str]:

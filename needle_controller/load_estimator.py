@@ -93,7 +93,7 @@ class LoadEstimator:
         observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1
         if self._updates % _CHECK_INTERVAL == 0:
-            self._judge(observer)
+            self._check_consistency(observer)
         if not abs(observer.load) <= self._largest:
             load = observer.load
             self.forget()
@@ -101,7 +101,7 @@ class LoadEstimator:
         if self.warning is None:
             self.load = observer.load
 
-    def _judge(self, observer: Observer) -> None:
+    def _check_consistency(self, observer: Observer) -> None:
         """Check the consistency of the observer (NIS)."""
         # The initial state is a guess, and affects the NIS while the history contains it.
         known = self._updates * observer.period > 1.2 * observer.settings.history

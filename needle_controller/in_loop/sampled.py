@@ -240,8 +240,8 @@ def run_batch(
         )
     count, runs = round(duration / period), sizes.pop() if sizes else 1
     # Setpoint of a command: the reference at the time of its effect.
-    course = _setpoints(reference, period, count + delay + 1)
-    setpoints, goal = course[delay:-1], np.ascontiguousarray(course[: count + 1, 0])
+    motion = _setpoints(reference, period, count + delay + 1)
+    setpoints, goal = motion[delay:-1], np.ascontiguousarray(motion[: count + 1, 0])
     blurred = np.array(noise, dtype=np.float64).reshape(-1, 3)
     if len(blurred) not in (0, count) or not np.isfinite(blurred).all():
         raise ShapeError(f'noise must be finite, of shape ({count}, 3), got {blurred.shape}')

@@ -205,7 +205,7 @@ class ResponseMonitor:
             self._stall.forget()
         else:
             self.fault = self._stall.update(stamp, depth, rate, applied, load)
-        self.lost = self._follows_not(stamp, depth, rate, commanded, reported)
+        self.lost = self._is_lost(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:
             self.notice = (
@@ -214,7 +214,7 @@ class ResponseMonitor:
             )
         return self.lost
 
-    def _follows_not(
+    def _is_lost(
         self, stamp: int, depth: float, rate: float, commanded: float, reported: float
     ) -> bool:
         # Without a command no response is expected.
@@ -226,11 +226,8 @@ class ResponseMonitor:
         mark = self._mark
         elapsed = min(stamp - mark.stamp, _PATIENCE) / NANOSECONDS
         moved = abs(depth - mark.depth) > _NOTHING * abs(rate) * elapsed
-        lost = self.lost
-        if lost and moved:
-            lost, self._mark = False, None
-        elif not lost and stamp - mark.stamp > _PATIENCE:
-            lost = not moved and rate != 0.0
-            if not lost:
-                self._mark = None
+        late = stamp - mark.stamp > _PATIENCE
+        lost = not moved and (self.lost or (late and rate != 0.0))
+        if not lost and (self.lost or late):
+            self._mark = None
         return lost
