@@ -182,9 +182,10 @@ class Driver:
                 )
             )
 
-        events = SubscriptionEventCallbacks(
-            matched=lambda event: matched(event.total_count_change)
-        )
+        def on_match(event: Any) -> None:
+            matched(event.total_count_change)
+
+        events = SubscriptionEventCallbacks(matched=on_match)
         self._node.create_subscription(
             self._dynamic, self.topics.state.name, on_message, SENSOR, event_callbacks=events
         )

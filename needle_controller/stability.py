@@ -18,14 +18,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
-from needle_controller.compiled.laws import (
-    FOLLOWS,
-    INTEGRAL,
-    INVERSE_DYNAMICS,
-    POSITION,
-    RATE,
-    VELOCITY,
-)
+from needle_controller.compiled import laws
 from needle_controller.laws.axis import Axis
 from needle_controller.laws.inverse_dynamics import BANDWIDTH, InverseDynamics
 from needle_controller.laws.law import Law, SampledLoop
@@ -76,15 +69,16 @@ def transition_matrix(
     loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
     # Only memory used by the gains is part of the loop; the offset after a switch decays.
     c = law.constants
-    follows = c.kp if c.kind == INVERSE_DYNAMICS else 0.0
-    uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, VELOCITY: follows}
+    follows = c.kp if c.kind == laws.INVERSE_DYNAMICS else 0.0
+    uses = {laws.INTEGRAL: c.ki, laws.RATE: c.filter_time * c.kd}
+    uses |= {laws.POSITION: follows, laws.VELOCITY: follows}
     used = [entry for entry, gain in uses.items() if gain > 0.0]
     first = 2 + len(used)
 
     def period(state: FloatArray) -> list[float]:
         position, velocity = state[:2].tolist()
         commands: list[float] = state[first:].tolist()
-        loop.memory[used], loop.memory[FOLLOWS] = state[2:first], float(follows > 0.0)
+        loop.memory[used], loop.memory[laws.FOLLOWS] = state[2:first], float(follows > 0.0)
         loop.pending.extend(commands[unmodeled:])
         commands.append(loop.command(position, velocity, rest))
         end = moved.propagate(position, velocity, commands[0], linear.period)

@@ -83,7 +83,7 @@ def run_controller(
 
     Examples
     --------
-    >>> from needle_controller import Controller, ControllerOutput, run_controller
+    >>> from needle_controller import Controller, run_controller
     >>> from needle_dynamics import NeedleModel, NeedleParameters
     >>> plant = NeedleParameters.preset('phantom')
     >>> start = NeedleModel(plant).state_at(0.02)
@@ -91,16 +91,6 @@ def run_controller(
     >>> controller.set_target(0.022)
     >>> run = run_controller(controller, plant, start, duration=0.5)
     >>> bool(abs(run.depth[-1] - 0.022) < 2e-5)
-    True
-
-    A custom controller, here a proportional law:
-
-    >>> class Proportional:
-    ...     period, delay = 1e-3, 1
-    ...     def command(self, measured, load=0.0):
-    ...         return ControllerOutput(force=2000.0 * (0.022 - measured.depth))
-    >>> run = run_controller(Proportional(), plant, start, duration=0.5)
-    >>> bool(run.depth[-1] < 0.022)
     True
 
     """
@@ -274,16 +264,9 @@ def run_batch(
         run(range(1), each_run)
         shares = [range(1 + k, runs, workers) for k in range(workers)]
         list(pool.map(run, shares, repeat(each_run)))
+    final, largest, squares = errors.T
     return LoopBatch(
-        final=errors[:, 0],
-        largest=errors[:, 1],
-        rms=np.sqrt(errors[:, 2]),
-        states=ends,
-        completed=completed,
-        goal=goal,
-        depths=depths,
-        trajectories=trajectories,
-        commands=commands,
+        final, largest, np.sqrt(squares), ends, completed, goal, depths, trajectories, commands
     )
 
 

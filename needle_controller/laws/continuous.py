@@ -46,6 +46,13 @@ def _gain_matrix(
     return matrix
 
 
+def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    array = np.array(values, dtype=float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ShapeError(f'{name} must be finite with shape {shape}, got {array.tolist()}')
+    return array
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousLaw(ABC):
     """
@@ -73,9 +80,7 @@ class ContinuousLaw(ABC):
     def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
         """Return e = q_d - q, its rate, and the desired acceleration; shape (3, driven)."""
         m, k = self.model.coordinates, self.driven
-        wanted = np.array(goal, dtype=float)
-        if wanted.shape != (3, m) or not np.isfinite(wanted).all():
-            raise ShapeError(f'goal must be finite with shape (3, {m}), got {wanted.tolist()}')
+        wanted = _finite('goal', goal, (3, m))
         wanted[0] -= state[:m]
         wanted[1] -= state[m:]
         return wanted[:, :k]
@@ -181,11 +186,7 @@ class ContinuousPid(ContinuousLaw):
         del time
         x, k = self.model.checked_state(state), self.driven
         error, rate, _ = self.errors(x, goal)
-        summed = np.array(integral, dtype=float)
-        if summed.shape != (self.integrals,) or not np.isfinite(summed).all():
-            raise ShapeError(
-                f'integral must be finite with shape ({self.integrals},), got {summed.tolist()}'
-            )
+        summed = _finite('integral', integral, (self.integrals,))
         forces = np.zeros(self.model.coordinates)
         forces[:k] = self._gains[0] @ error + self._gains[1] @ rate
         if self.integrals:
@@ -199,11 +200,7 @@ def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
 ) -> FloatArray:
     """Return q_ddot of (16)-(17) under `ContinuousLaw.forces`; both have shape (2 + n,)."""
-    x, applied = model.checked_state(state), np.array(forces, dtype=float)
-    if applied.shape != (model.coordinates,) or not np.isfinite(applied).all():
-        raise ShapeError(
-            f'forces must be finite with shape ({model.coordinates},), got {applied.tolist()}'
-        )
+    x, applied = model.checked_state(state), _finite('forces', forces, (model.coordinates,))
     result = model.acceleration(x, float(applied[0]), float(applied[1]), time)
     if applied[_BASE:].any():
         # The mass matrix is block diagonal: forces on q1..qn do not act on the base.

@@ -144,16 +144,10 @@ class ObserverSettings:
         # A count of the reading is uniform rounding.
         counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
         white = (self.force_noise / gain) ** 2, (self.torque_noise / gain) ** 2
-        offsets = self.force_offset**2, self.torque_offset**2
-        return Noise(
-            self.irregularity**2,
-            self.initial_deflection**2,
-            self.tip_noise**2,
-            counts,
-            white,
-            (self.tip_force**2, *offsets),
-            (1.0 / self.tip_force_time, 1.0 / self.offset_time, 1.0 / self.offset_time),
-        )
+        loads = self.tip_force**2, self.force_offset**2, self.torque_offset**2
+        decays = 1.0 / self.tip_force_time, 1.0 / self.offset_time, 1.0 / self.offset_time
+        density, start = self.irregularity**2, self.initial_deflection**2
+        return Noise(density, start, self.tip_noise**2, counts, white, loads, decays)
 
     def low_pass(self, ticks: int) -> LowPass:
         """Return the low-pass of the wrench over a number of samples of the force sensor."""
