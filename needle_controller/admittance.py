@@ -6,8 +6,7 @@ from typing import Final
 from needle_controller.laws.axis import Axis
 from needle_ros.timing import NANOSECONDS
 
-#: Longest time of one step, in periods: missing samples are not made up for.
-_LONGEST: Final = 2.0
+_LONGEST: Final = 2.0  #: Longest step, in periods: missing samples are not made up for.
 
 
 class Admittance:
@@ -26,18 +25,14 @@ class Admittance:
     def __init__(
         self, axis: Axis, *, period: float, speed: float, lead: float, depths: tuple[float, float]
     ) -> None:
-        #: May be exchanged between steps.
-        self.axis = axis
+        self.axis = axis  #: May be exchanged between steps.
         self._period, self._speed, self._lead = period, speed, lead
         self._low, self._high = depths
         #: Commanded insertion depth [m]; None before the first step.
         self.position: float | None = None
-        #: Velocity of the base [m/s].
-        self.velocity = 0.0
-        #: Last measured insertion depth [m].
-        self.measured = 0.0
-        #: Stamp of the last step [ns]; None at rest.
-        self.answered: int | None = None
+        self.velocity = 0.0  #: Velocity of the base [m/s].
+        self.measured = 0.0  #: Last measured insertion depth [m].
+        self.answered: int | None = None  #: Stamp of the last step [ns]; None at rest.
 
     def step(self, force: float, measured: float, stamp: int) -> float:
         """

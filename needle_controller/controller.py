@@ -225,8 +225,7 @@ class Controller:
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
         self._displacement = DisplacementMonitor(settings.jump, settings.longest_gap)
         self._last_depth: float | None = None
-        #: Whether the insertion force is zero although there is a target.
-        self.relaxed = False
+        self.relaxed = False  #: Whether the insertion force is zero although there is a target.
         #: Check before the first motion: answers a measurement, and whether a motion is requested,
         #: with a command; None without a check.
         self.check: Callable[[Measurement, bool], ControllerOutput | None] | None = None

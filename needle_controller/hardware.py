@@ -18,11 +18,9 @@ from needle_ros.settings import check_constants, choice, constant, flag, positiv
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
-#: Kinds of joint commands.
 EFFORT: Final = 'effort'
 POSITION: Final = 'position'
-COMMANDS: Final = (EFFORT, POSITION)
-
+COMMANDS: Final = (EFFORT, POSITION)  #: Kinds of joint commands.
 BY_TYPE: Final = 'auto'  #: Selects the only topic of its type.
 
 #: Message types of commands and joint states; the first is the type of the contract.
@@ -37,15 +35,10 @@ STATE_TYPES: Final = {
     'dynamic_joint_state': 'control_msgs/msg/DynamicJointState',
 }
 
-#: Source of measurement stamps: message header or receive time.
-STAMPS: Final = ('header', 'receive')
-
-#: Time constant of an estimated velocity, and the gap after which it restarts [s].
-_FILTER: Final = 5e-3
-_GAP: Final = 0.1
-
-#: Interfaces of ros2_control, in the order of a JointState.
-_INTERFACES: Final = ('position', 'velocity', 'effort')
+STAMPS: Final = ('header', 'receive')  #: Source of measurement stamps: header or receive time.
+_INTERFACES: Final = ('position', 'velocity', 'effort')  #: Order of the values of a JointState.
+_FILTER: Final = 5e-3  #: Time constant of an estimated velocity [s].
+_GAP: Final = 0.1  #: Gap after which the estimate of the velocity restarts [s].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -190,8 +183,7 @@ class Robot:
         """Discard all measurements and commands."""
         self.estimates = False  #: Whether velocities are estimated.
         self._speed = _Speed()
-        #: Last measured insertion depth [m].
-        self._depth = nan
+        self._depth = nan  #: Last measured insertion depth [m].
         #: Positions of the other joints of a command to hold, in the unit of the robot.
         self._others: dict[str, float] = {}
         if self._base is not None:

@@ -35,9 +35,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Longest time to find a topic by its type, and time between two checks [s].
-_DISCOVERY: Final = 10.0
-_PAUSE: Final = 0.1
+_DISCOVERY: Final = 10.0  #: Longest time to find a topic by its type [s].
+_PAUSE: Final = 0.1  #: Time between two checks for the topic [s].
 
 
 def _named(topic: Topic, name: str, type_name: str) -> Topic:

@@ -44,8 +44,7 @@ class LoadEstimator:
         """Discard all measurements."""
         #: Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
         self.load = 0.0
-        #: Why the observer is inconsistent.
-        self.warning: str | None = None
+        self.warning: str | None = None  #: Why the observer is inconsistent.
         self._updates = 0
         #: Stamp, lateral force and moment of the last wrench that waits for the encoders.
         self._waiting: tuple[int, float, float] | None = None

@@ -31,9 +31,8 @@ import numpy as np
 MARGIN: Final = 1e-6  #: Default distance of the spectral radius from one.
 RESERVE: Final = 1  #: Periods of unmodeled delay in reserve.
 
-#: Largest factors on gains and rate in the search for stable gains.
-_MOST_GAIN: Final = 1e6
-_MOST_RATE: Final = 1e3
+_MOST_GAIN: Final = 1e6  #: Largest factor on the gains in the search for stable gains.
+_MOST_RATE: Final = 1e3  #: Largest factor on the rate in this search.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

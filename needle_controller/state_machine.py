@@ -32,8 +32,7 @@ class StateMachine(ABC, Generic[_Command]):
         #: Mode of the system that is followed, and time of the retraction that is followed [ns].
         self._obeyed = Mode.RUNNING
         self._retracted = 0
-        #: Time of the last event [ns].
-        self._time = 0
+        self._time = 0  #: Time of the last event [ns].
         self._take_requests(takes)
 
     def _take_requests(self, takes: Mapping[Topic, Sequence[str]]) -> None:

@@ -116,17 +116,14 @@ class SteeringNode(CompiledNode):
         self._file = RecordFile(self.get_fully_qualified_name(), self.context.get_domain_id())
         #: Record before a restart and the source of its measurements, until they are compared.
         self._before: tuple[SteeringRecord, str] | None = None
-        #: Expected tip of the last publication.
-        self._published_tip: TipEstimate | None = None
-        #: State of the system, also before the node is configured.
-        self._authority = Authority()
+        self._published_tip: TipEstimate | None = None  #: Expected tip of the last publication.
+        self._authority = Authority()  #: State of the system, also before the node is configured.
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
         #: Reports the processed sample, with simulated time.
         self._processed: Publisher | None = None
         #: Processed sample that is not reported yet: a plan is computed first.
         self._unreported: int | None = None
-        #: Whether a motion was sent since the last report.
-        self._moved = False
+        self._moved = False  #: Whether a motion was sent since the last report.
 
     # Transitions.
 

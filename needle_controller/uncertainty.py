@@ -13,17 +13,11 @@ from needle_controller.laws.law import Law
 from needle_ros.settings import CheckedSettings, constant
 import numpy as np
 
-#: Fractions of the carriage mass that are checked.
-_PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
-
-#: Initial positions of the simulations for limit cycles [m] or [rad].
-_STARTS: Final = (1e-3, 5e-5)
-
-#: Duration of such a simulation [s]: minimum, maximum. Decrease of errors in each third of it.
-_SHORTEST: Final = 0.5
-_LONGEST: Final = 20.0
-_DECREASE: Final = 0.1
-
+_PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)  #: Checked fractions of the carriage.
+_STARTS: Final = (1e-3, 5e-5)  #: Initial positions of simulated limit cycles [m] or [rad].
+_SHORTEST: Final = 0.5  #: Shortest duration of such a simulation [s].
+_LONGEST: Final = 20.0  #: Longest duration [s].
+_DECREASE: Final = 0.1  #: Decrease of errors in each third of it.
 _LEAST: Final = 1e-6  #: Least range of motion that is a limit cycle [m] or [rad].
 
 

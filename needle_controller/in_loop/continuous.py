@@ -19,11 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _AT_REST: Final = 1e-300  #: Smallest velocity of either sign, for a start from rest [m/s].
-
-#: Relative excess of a force over dry friction at break-away, so that an exponentially decaying
-#: motion ends only once.
-_ROUNDING: Final = 1e-9
-
+_ROUNDING: Final = 1e-9  #: Relative excess of a force at break-away: a decaying motion ends once.
 _MOST_PIECES: Final = 1000  #: Largest number of pieces of a motion; more are chatter.
 
 

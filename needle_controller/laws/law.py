@@ -33,9 +33,7 @@ import numpy as np
 #: at the end of the period if this is longer: a law then breaks away at any sample rate.
 BREAKAWAY_TIME: Final = 1e-3
 
-#: Time constant with which the force offset after a switch of laws fades [s].
-HANDOVER_TIME: Final = 0.1
-
+HANDOVER_TIME: Final = 0.1  #: Time constant of the force offset after a switch of laws [s].
 
 #: Learned corrections with units, in the order of `needle_controller.compiled.learning`.
 _TERMS: Final = {
@@ -141,10 +139,8 @@ class SampledLoop:
         #: Commands without effect so far [N].
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
-        #: Last command [N].
-        self.last = 0.0
-        #: Force of the period that starts now [N].
-        self._acts = 0.0
+        self.last = 0.0  #: Last command [N].
+        self._acts = 0.0  #: Force of the period that starts now [N].
         self._take_over = False
 
     def stop(self) -> None:

@@ -40,18 +40,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _EVEN: Final = 0.01  #: Relative deviation of encoder stamps from the period that is ignored.
-
-#: Relative tolerance of the ratio of the sensor's filter rate to the sample rate.
-_NEAR: Final = 0.1
-
+_NEAR: Final = 0.1  #: Relative tolerance of the filter rate as a multiple of the sample rate.
 _SAME: Final = 0.1  #: Largest stamp difference of a wrench and its encoder sample, in periods.
 _WAITING: Final = 16  #: Largest number of wrenches that wait for their encoder sample.
-
-#: Largest relative overlap of exposures of the tip; above it a sample is a duplicate.
-_OVERLAP: Final = 0.1
-
-#: Largest plausible measurement [m, N or N m]; squares of larger ones overflow.
-_LARGEST: Final = 1e6
+_OVERLAP: Final = 0.1  #: Relative overlap of exposures above which a tip sample is a duplicate.
+_LARGEST: Final = 1e6  #: Largest plausible measurement; squares of larger ones overflow [SI].
 
 
 class _Encoders(NamedTuple):
@@ -129,8 +122,7 @@ class Observer:
         from needle_dynamics.compiled.boxed import Boxed
 
         self._boxed = Boxed(self._filter)
-        #: Computed when it is needed.
-        self._estimate: _Estimate | None = None
+        self._estimate: _Estimate | None = None  #: Computed when it is needed.
         #: Stamp of the first sample [ns]: times of the filter are relative to it.
         self._origin: int | None = None
         #: Newest and oldest slot of the filter, and number of exposures of the tip.
@@ -151,9 +143,8 @@ class Observer:
         #: that are not finite, repeated, older than the history, far ahead of the encoders, or (a
         #: wrench) between encoder samples.
         self.refused = 0
-        #: Number of automatic restarts, and reason of the last one.
-        self.restarts = 0
-        self.warning: str | None = None
+        self.restarts = 0  #: Number of automatic restarts.
+        self.warning: str | None = None  #: Reason of the last restart.
         self._last: _Encoders | None = None
         self._waiting: list[tuple[int, float, float]] = []
 

@@ -34,8 +34,7 @@ class ReferenceGenerator:
         self.limits, self._depths = limits, depths
         self._motion: Reference | None = None
         self._start = self.now = 0.0
-        #: Elapsed time of the path at the last change [s].
-        self._passed = 0.0
+        self._passed = 0.0  #: Elapsed time of the path at the last change [s].
         self.forget()
 
     def forget(self) -> None:

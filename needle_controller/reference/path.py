@@ -165,8 +165,7 @@ class Joined(Reference):
         self._joining = joining
         self._halting = self._halt.duration if self._halt else 0.0
         self._joined = self._halting + (joining.duration if joining else 0.0)
-        #: Time of this motion at time zero of the path [s].
-        self.offset = self._joined - entry
+        self.offset = self._joined - entry  #: Time of this motion at time zero of the path [s].
         self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:

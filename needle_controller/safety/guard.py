@@ -9,8 +9,7 @@ from needle_controller.controller import Measurement
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import euler_loads, NeedleParameters
 
-#: Readings in a row beyond a limit that violate it: a single one may be a sensor fault.
-_IN_A_ROW: Final = 2
+_IN_A_ROW: Final = 2  #: Readings in a row that violate a limit: one may be a sensor fault.
 
 
 def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:

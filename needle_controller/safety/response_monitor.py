@@ -9,19 +9,14 @@ from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 
-#: Time without response after which the plant does not follow [ns].
-_PATIENCE: Final = NANOSECONDS // 10
-
-#: Least response, as a fraction of the commanded force or of the distance of the reference.
-_NOTHING: Final = 0.1
-
+_PATIENCE: Final = NANOSECONDS // 10  #: Time without response until the plant is lost [ns].
+_NOTHING: Final = 0.1  #: Least response, as a fraction of the commanded force or distance.
+_WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 #: Friction as a multiple of the nominal one: the strongest, for a stop while the reference moves;
 #: and at rest as a multiple of the observed one, which is between these bounds.
 _STRONGER, _WEAKER = 1.5, 0.7
 _OBSERVED: Final = 0.1, 4.0
-
-_WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 
 class _Mark(NamedTuple):
@@ -56,8 +51,7 @@ class StallMonitor:
         self.relaxed = False
         self._stamp: int | None = None
         self._begin(0.0)
-        #: Message at the measurement where ``relaxed`` begins.
-        self.notice: str | None = None
+        self.notice: str | None = None  #: Message at the measurement where ``relaxed`` begins.
         #: Force that holds the needle against an unknown load while the reference rests [N].
         self._holding = 0.0
         self._learn()
@@ -72,11 +66,9 @@ class StallMonitor:
 
     def _learn(self) -> None:
         """Observe the friction from the next measurement on."""
-        #: Friction in the last motion, as a multiple of the nominal one.
-        self._friction = 1.0
+        self._friction = 1.0  #: Friction in the last motion, as a multiple of the nominal one.
         self._mark: _Mark | None = None
-        #: Impulse since the mark [N s].
-        self._impulse = 0.0
+        self._impulse = 0.0  #: Impulse since the mark [N s].
 
     def _observe(self, stamp: int, depth: float, impulse: float) -> None:
         """Compare the mean force of a displacement with the nominal friction."""

@@ -14,13 +14,10 @@ from needle_ros.contract import BASE, ENTRY
 from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
-#: Topics whose absence or duplicate publishers prevent any force.
-_VITAL: Final = ('wrench_command', 'joint_states')
-
-#: Fractions of messages out of order for a warning and for a stop; above this rate [Hz].
-_LATE: Final = 0.5
-_MIXED: Final = 0.9
-_FEW: Final = 10.0
+_VITAL: Final = ('wrench_command', 'joint_states')  #: Topics that need exactly one publisher.
+_LATE: Final = 0.5  #: Fraction of messages out of order for a warning.
+_MIXED: Final = 0.9  #: Fraction of messages out of order for a stop.
+_FEW: Final = 10.0  #: Least rate for both [Hz].
 
 
 class Safety:
@@ -42,9 +39,8 @@ class Safety:
         wrench_frame: str = BASE,
     ) -> None:
         self.limits = limits
-        #: Reason of the latched stop, and number of stops so far.
-        self.stop: str | None = None
-        self.stops = 0
+        self.stop: str | None = None  #: Reason of the latched stop.
+        self.stops = 0  #: Number of stops so far.
         #: Topics with duplicate publishers of commands or measurements.
         self.duplicate_publishers: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))

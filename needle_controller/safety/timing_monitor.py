@@ -10,17 +10,12 @@ from needle_controller.safety.input_monitor import InputMonitor
 from needle_ros.status import LatencyStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
-#: Tolerated fraction of late commands, and tolerated number per second [Hz].
-_LATE: Final = 0.05
-_FEW: Final = 3.0
-
-#: Largest and least number of compared steps: a second of them.
-_MOST: Final = 40
-_FEWEST: Final = 20
-
-#: Relative tolerance of a period, and fraction of periods out of tolerance for a warning.
-_TOLERANCE: Final = 0.2
-_SHARE: Final = 0.9
+_LATE: Final = 0.05  #: Tolerated fraction of late commands.
+_FEW: Final = 3.0  #: Tolerated number of late commands per second [Hz].
+_MOST: Final = 40  #: Largest number of compared steps.
+_FEWEST: Final = 20  #: Least number of compared steps: a second of them.
+_TOLERANCE: Final = 0.2  #: Relative tolerance of a period.
+_SHARE: Final = 0.9  #: Fraction of periods out of tolerance for a warning.
 
 
 class LatencyMonitor:
