@@ -120,7 +120,7 @@ class Commissioning:
         """Answer a measurement; `moves` is a requested motion. Return None when it is passed."""
         if self.phase in (CommissioningPhase.SKIPPED, CommissioningPhase.PASSED):
             return None
-        longest = self.controller.settings.measurement_timeout + self.controller.period
+        longest = self.controller.settings.longest_gap
         elapsed, self._time = measured.time - self._time, measured.time
         if not 0.0 < elapsed <= longest or (self._steps is not None and not moves):
             self._restart(CommissioningPhase.WAITING)
