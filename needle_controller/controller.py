@@ -348,11 +348,7 @@ class Controller:
         self._stopped = self.relaxed = False
 
     def release(self) -> None:
-        """
-        Discard the motion: the next one starts at the measured depth.
-
-        Integrals are frozen until then.
-        """
+        """Discard the motion, freeze the integrals; the next motion starts at the needle."""
         self.guide.release()
         self._insertion.stop()
         self._rotation.stop()

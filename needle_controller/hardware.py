@@ -112,11 +112,7 @@ class HardwareSettings:
         return self.command_joints or (self.joint,)
 
     def axes(self) -> tuple[tuple[int, float], ...]:
-        """
-        Return index and sign of the sensor axes along x, y and z of ``needle_base``.
-
-        They are a proper rotation. An unknown or repeated axis is a `ParameterError`.
-        """
+        """Return index and sign of the sensor axes along x, y and z of ``needle_base``."""
         sign, axis = signed_axis(self.force_axis, 'force_axis')
         along = AXES.index(axis)
         aside, other = (along + 1) % 3, 1.0
@@ -271,11 +267,7 @@ class Robot:
         return i
 
     def wrench(self, reading: Reading) -> Reading:
-        """
-        Convert a reading of the force sensor to the wrench on the needle, along ``needle_base``.
-
-        The frame name is unchanged, and the moment is still about the origin of the sensor.
-        """
+        """Convert a force sensor reading to the axes of ``needle_base``, about its own origin."""
         numbers = reading.values[0]
         sign = -1.0 if self.settings.reaction else 1.0
         turned = tuple(

@@ -26,12 +26,7 @@ def build_observer(
 
 
 class LoadEstimator:
-    """
-    Load of the bent needle: estimated by an observer, from the simulation, or zero.
-
-    Stamps are integers in ns. The observer is restarted above ``largest``, the largest plausible
-    load [N].
-    """
+    """Load of the bent needle up to ``largest`` [N], of an observer or the simulation, or zero."""
 
     def __init__(
         self, parameters: NeedleParameters, observer: Observer | None = None, largest: float = 1e6

@@ -24,11 +24,7 @@ from numpy.typing import ArrayLike
 
 
 class Commander(Protocol):
-    """
-    Interface of the controllers that `run_controller` accepts, such as `Controller`.
-
-    It is called from Python once per period and needs no compiled code.
-    """
+    """Interface of the controllers that `run_controller` accepts, such as `Controller`."""
 
     @property
     def period(self) -> float:

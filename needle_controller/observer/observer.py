@@ -207,11 +207,7 @@ class Observer:
         return (_checked(stamp) - (self._origin or 0)) / NANOSECONDS
 
     def add_wrench(self, stamp: int, lateral: float, moment: float) -> None:
-        """
-        Process a base wrench that arrives separately from the encoder sample of the same stamp.
-
-        The encoder sample may arrive later. Force and moment are as for `update`.
-        """
+        """Process a base wrench that arrives apart from the encoder sample of its stamp [ns]."""
         time, lateral, moment = self._seconds(stamp), _finite(lateral), _finite(moment)
         if self._last is None or not (isfinite(lateral) or isfinite(moment)):
             self.refused += 1
@@ -239,7 +235,7 @@ class Observer:
         last encoder sample, and earlier than previous tip samples.
         """
         end = self._seconds(stamp) - self.settings.tip_latency
-        if self._last is None or not isfinite(_finite(deflection)):
+        if self._last is None or not abs(deflection) <= _LARGEST:
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
@@ -363,11 +359,7 @@ class Observer:
 
     @property
     def nis(self) -> Consistency:
-        """
-        Consistency of the measurements over the history: normalized innovations squared.
-
-        Each innovation is relative to all measurements of earlier times, including late arrivals.
-        """
+        """NIS over the history: innovations relative to all earlier measurements, also late."""
         if self._last is None:
             return Consistency.of(0.0, 0)
         slots, first = len(self._filter.samples), self._oldest
@@ -376,11 +368,7 @@ class Observer:
         return Consistency.of(float(samples['nis'].sum()), round(samples['degrees'].sum()))
 
     def nees(self, modal: ArrayLike, rates: ArrayLike) -> float:
-        """
-        Return the normalized estimation error squared (NEES) of true modal coordinates and rates.
-
-        Their shape is (n,). It is chi^2 with 2 n degrees of freedom if the filter is consistent.
-        """
+        """Return NEES of true modal coordinates and rates, (n,) each: chi^2 of 2 n degrees."""
         truth = np.concatenate([np.asarray(modal, dtype=float), np.asarray(rates, dtype=float)])
         estimated = self._estimated()
         if truth.shape != estimated.modal.shape:

@@ -88,11 +88,7 @@ class Guard:
         return self._hold('reference', ('tracking error', error, limit, 'm', 'tracking_error'))
 
     def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
-        """
-        Check force [N] and torque [N m] on the sensor along x, y and z; y is along the needle.
-
-        A component that is not measured, NaN, counts as zero.
-        """
+        """Check force [N] and torque [N m] along x, y (needle) and z; NaN counts as zero."""
         x, axial, z = map(_measured, force)
         around_x, torsion, around_z = map(_measured, torque)
         lateral, moment = hypot(x, z), hypot(around_x, around_z)

@@ -136,14 +136,11 @@ class Safety:
             self._begun = now or None
             return {}
         begun = self._begun = self._begun or joints.counted
-        silences = {
-            name: (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS
-            for name in self._expected
-        }
         return {
             name: f'{name} is stale: no valid message for {silence:.1f} s'
-            for name, silence in silences.items()
-            if silence > self.limits.sensor_timeout
+            for name in self._expected
+            if (silence := (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS)
+            > self.limits.sensor_timeout
         }
 
     def new_warnings(self, now: int) -> list[str]:
