@@ -21,9 +21,9 @@ from needle_controller import (
     ObserverSettings,
     Pid,
     PidGains,
-    SampledLoop,
     Setpoint,
 )
+from needle_controller.laws.law import SampledLoop
 from needle_dynamics import FloatArray, NeedleParameters
 import numpy as np
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from needle_controller.admittance import Admittance as Admittance
     from needle_controller.controller import Controller as Controller
     from needle_controller.controller import ControllerOutput as ControllerOutput
     from needle_controller.controller import ControllerSettings as ControllerSettings
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from needle_controller.hardware import Robot as Robot
     from needle_controller.in_loop.continuous import run_continuous as run_continuous
     from needle_controller.in_loop.run import LoopRun as LoopRun
-    from needle_controller.in_loop.sampled import Commander as Commander
     from needle_controller.in_loop.sampled import LoopBatch as LoopBatch
     from needle_controller.in_loop.sampled import run_batch as run_batch
     from needle_controller.in_loop.sampled import run_controller as run_controller
@@ -32,18 +30,14 @@ if TYPE_CHECKING:
     from needle_controller.laws.continuous import (
         ContinuousInverseDynamics as ContinuousInverseDynamics,
     )
-    from needle_controller.laws.continuous import ContinuousLaw as ContinuousLaw
     from needle_controller.laws.continuous import ContinuousPid as ContinuousPid
     from needle_controller.laws.inverse_dynamics import InverseDynamics as InverseDynamics
     from needle_controller.laws.inverse_dynamics import (
         InverseDynamicsGains as InverseDynamicsGains,
     )
     from needle_controller.laws.law import Law as Law
-    from needle_controller.laws.law import no_memory as no_memory
-    from needle_controller.laws.law import SampledLoop as SampledLoop
     from needle_controller.laws.pid import Pid as Pid
     from needle_controller.laws.pid import PidGains as PidGains
-    from needle_controller.observer.consistency import Consistency as Consistency
     from needle_controller.observer.observer import Observer as Observer
     from needle_controller.observer.settings import ObserverSettings as ObserverSettings
     from needle_controller.reference.generator import REFERENCES as REFERENCES
@@ -52,14 +46,8 @@ if TYPE_CHECKING:
     from needle_controller.reference.setpoint import ReferenceLimits as ReferenceLimits
     from needle_controller.reference.setpoint import Setpoint as Setpoint
     from needle_controller.reference.trapezoid import Trapezoid as Trapezoid
-    from needle_controller.safety.guard import Guard as Guard
-    from needle_controller.safety.input_monitor import InputMonitor as InputMonitor
     from needle_controller.safety.limits import SafetyLimits as SafetyLimits
     from needle_controller.stability import check_stability as check_stability
-    from needle_controller.stability import Limit as Limit
-    from needle_controller.stability import spectral_radius as spectral_radius
-    from needle_controller.stability import stability_limit as stability_limit
-    from needle_controller.stability import transition_matrix as transition_matrix
     from needle_controller.steering.executive import SteeringExecutive as SteeringExecutive
     from needle_controller.steering.law import build_law as build_law
     from needle_controller.steering.law import GuideSetpoint as GuideSetpoint

@@ -11,7 +11,7 @@ from needle_controller.hardware import POSITION, Robot, STAMPS
 from needle_controller.laws.axis import Axis
 from needle_controller.reference.setpoint import Setpoint
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.safety.rate_monitor import RateMonitor
+from needle_controller.safety.timing_monitor import RateMonitor
 from needle_ros.axes import AXES
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant, flag
@@ -108,7 +108,6 @@ class Commissioning:
                 )
 
     def _restart(self, phase: CommissioningPhase, result: str = '') -> None:
-        """Discard all measurements."""
         own = self.controller.settings
         self._steps: Generator[float, Measurement, None] | None = None
         #: Time, depth, velocity and force at rest, and changes since.
@@ -121,7 +120,7 @@ class Commissioning:
         """Answer a measurement; `moves` is a requested motion. Return None when it is passed."""
         if self.phase in (CommissioningPhase.SKIPPED, CommissioningPhase.PASSED):
             return None
-        longest = self.controller.settings.measurement_timeout + self.controller.period
+        longest = self.controller.settings.longest_gap
         elapsed, self._time = measured.time - self._time, measured.time
         if not 0.0 < elapsed <= longest or (self._steps is not None and not moves):
             self._restart(CommissioningPhase.WAITING)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Axial controller: reference, control laws and limits; one command per measurement."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -18,17 +20,22 @@ from needle_controller.safety.displacement_monitor import DisplacementMonitor
 from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
+from needle_ros.contract import INSERTION
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant, flag
+from needle_ros.settings import CheckedSettings, constant, flag, positive
 from needle_ros.status import ControllerStatus
+from needle_ros.timing import NANOSECONDS
+from needle_ros.trajectories import joint_values, JointPath
+from needle_ros.wire import Reading
 
 AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
 
 Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
+AllGains: TypeAlias = Mapping[str, Mapping[str, Gains]]  #: Gains by law and axis.
 
 #: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
 #: rotary inertia of the paper's needle.
-DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
+DEFAULT_GAINS: Final[AllGains] = {
     'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
     'inverse_dynamics': {'insertion': InverseDynamicsGains(), 'rotation': InverseDynamicsGains()},
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
@@ -53,16 +60,15 @@ class ControllerSettings(CheckedSettings):
         1.0, 'periods', 'number of whole periods from a measurement to the effect of its command',
         high=20.0, whole=True,
     )  # fmt: skip
-    force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
-    torque_limit: float = constant(0.01, 'N m', 'largest torque', open_low=True)
-    measurement_timeout: float = constant(
-        0.1, 's', 'age from which a measurement is stale', open_low=True
-    )
-    jump: float = constant(
-        2e-3, 'm', 'displacement, at once or within 2 s, that is inconsistent with the measured '
+    force_limit: float = positive(15.0, 'N', 'largest insertion force')
+    torque_limit: float = positive(0.01, 'N m', 'largest torque')
+    measurement_timeout: float = positive(0.1, 's', 'age from which a measurement is stale')
+    jump: float = positive(
+        2e-3,
+        'm',
+        'displacement, at once or within 2 s, that is inconsistent with the measured '
         'velocity and is a fault; a displacement of this size during a fault clears the target',
-        open_low=True,
-    )  # fmt: skip
+    )
     stability_margin: float = constant(
         MARGIN, '1', 'required relative decrease of every control error per period', high=0.5
     )
@@ -72,10 +78,9 @@ class ControllerSettings(CheckedSettings):
     lowest_depth: float = constant(
         0.0, 'm', 'least insertion depth to control; minimum_depth if that is larger'
     )
-    highest_depth: float = constant(
-        10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller',
-        open_low=True,
-    )  # fmt: skip
+    highest_depth: float = positive(
+        10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller'
+    )
 
     @property
     def longest_gap(self) -> float:
@@ -83,20 +88,7 @@ class ControllerSettings(CheckedSettings):
         return self.measurement_timeout + 1.0 / self.rate
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
-        """
-        Return the least and largest insertion depth to control [m].
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            The needle.
-
-        Raises
-        ------
-        ParameterError
-            If the settings leave no range for this needle.
-
-        """
+        """Return the least and largest insertion depth to control [m]; reject an empty range."""
         low = max(self.lowest_depth, parameters.minimum_depth)
         high = min(self.highest_depth, parameters.length)
         if not low < high:
@@ -120,6 +112,31 @@ class Measurement:
     #: Axial force on the needle as reported by the robot [N]; NaN if not reported.
     force: float = nan
 
+    @classmethod
+    def from_reading(cls, reading: Reading) -> Measurement:
+        """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
+        names, (positions, velocities, efforts) = reading.names, reading.values
+        try:
+            i = names.index('insertion')
+            depth, velocity = positions[i], velocities[i]
+            angle = angular_velocity = 0.0
+            if 'rotation' in names:
+                j = names.index('rotation')
+                angle, angular_velocity = positions[j], velocities[j]
+        except (ValueError, IndexError):
+            raise ParameterError(
+                "joint_states needs position and velocity of 'insertion', got names "
+                f'{list(names)}, {len(positions)} positions, {len(velocities)} velocities'
+            ) from None
+        return cls(
+            time=reading.stamp / NANOSECONDS,
+            depth=depth,
+            velocity=velocity,
+            angle=angle,
+            angular_velocity=angular_velocity,
+            force=efforts[i] if i < len(efforts) else nan,
+        )
+
     def is_finite(self) -> bool:
         """Return whether every number is finite; the force may be missing."""
         insertion = isfinite(self.depth) and isfinite(self.velocity)
@@ -141,7 +158,6 @@ class ControllerOutput:
     refusal: str | None = None  #: why the motion is refused and the system must stop
 
     def is_finite(self) -> bool:
-        """Return whether force and torque are finite."""
         return isfinite(self.force) and isfinite(self.torque)
 
 
@@ -167,11 +183,6 @@ class Controller:
     uncertainty : Uncertainty, optional
         Uncertainty of the nominal constants; the gains must be stable within it.
 
-    Raises
-    ------
-    ParameterError
-        If a name is unknown or the gains are unstable at this rate and delay.
-
     Examples
     --------
     >>> from needle_controller import Controller, Measurement
@@ -191,7 +202,7 @@ class Controller:
         parameters: NeedleParameters,
         law: str = LAWS[0],
         *,
-        gains: Mapping[str, Mapping[str, Gains]] | None = None,
+        gains: AllGains | None = None,
         settings: ControllerSettings | None = None,
         reference: str = 'trapezoid',
         limits: ReferenceLimits | None = None,
@@ -214,15 +225,14 @@ class Controller:
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
         self._displacement = DisplacementMonitor(settings.jump, settings.longest_gap)
         self._last_depth: float | None = None
-        #: Whether the insertion force is zero although there is a target.
-        self.relaxed = False
+        self.relaxed = False  #: Whether the insertion force is zero although there is a target.
         #: Check before the first motion: answers a measurement, and whether a motion is requested,
         #: with a command; None without a check.
         self.check: Callable[[Measurement, bool], ControllerOutput | None] | None = None
         self.forget()
 
     def _checked(
-        self, name: str, parameters: NeedleParameters, gains: Mapping[str, Mapping[str, Gains]]
+        self, name: str, parameters: NeedleParameters, gains: AllGains
     ) -> tuple[list[Law], dict[str, Limit]]:
         """Return the laws and their stability limits; reject unstable gains."""
         if name not in LAWS:
@@ -250,27 +260,13 @@ class Controller:
         parameters: NeedleParameters | None = None,
         *,
         law: str | None = None,
-        gains: Mapping[str, Mapping[str, Gains]] | None = None,
+        gains: AllGains | None = None,
     ) -> None:
         """
         Continue with other constants, gains or another law; target, reference and memory stay.
 
-        During a motion the switch is bumpless: the force is continuous.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters, optional
-            Needle and tissue.
-        law : str, optional
-            Control law.
-        gains : Mapping[str, Mapping[str, Gains]], optional
-            Gains by law and axis; missing gains stay.
-
-        Raises
-        ------
-        ParameterError
-            If the gains are unstable with the changes. Nothing is changed then.
-
+        Missing gains stay. During a motion the switch is bumpless: the force is continuous. If the
+        gains are unstable with the changes, nothing is changed.
         """
         parameters, name = parameters or self.parameters, law or self.law
         completed = _completed(gains or {}, self._gains)
@@ -294,7 +290,6 @@ class Controller:
         return self._insertion.learned
 
     def status(self) -> ControllerStatus:
-        """Return target, law, stability and learned correction as fields of a status."""
         name, limit = max(self.limits.items(), key=lambda item: item[1].radius - item[1].bound)
         return ControllerStatus(
             target=self.target,
@@ -306,20 +301,7 @@ class Controller:
         )
 
     def set_target(self, depth: float) -> None:
-        """
-        Set the target insertion depth; see `ReferenceGenerator.aim`.
-
-        Parameters
-        ----------
-        depth : float
-            Insertion depth [m].
-
-        Raises
-        ------
-        ParameterError
-            If it is not finite or out of range.
-
-        """
+        """Set the target insertion depth [m]; see `ReferenceGenerator.aim`."""
         self.guide.aim(depth)
         # A new target is valid, also if the needle has moved before.
         self._last_depth = None
@@ -330,22 +312,23 @@ class Controller:
         positions: Sequence[float],
         velocities: Sequence[float] | None = None,
     ) -> None:
-        """
-        Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`.
-
-        Parameters
-        ----------
-        times, positions, velocities
-            As for `ReferenceGenerator.follow`.
-
-        Raises
-        ------
-        ParameterError
-            If the path is not valid.
-
-        """
+        """Follow a path of insertion depths from now on; see `ReferenceGenerator.follow`."""
         self.guide.follow(times, positions, velocities)
         self._last_depth = None
+
+    def follow_joints(self, path: JointPath, elapsed: float) -> None:
+        """Follow the insertion in a path, at a time after its start [s]; without points, stop."""
+        path = path.after(elapsed)
+        if path.stops:
+            if path.joints:
+                joint_values(INSERTION, path.joints, ())
+            self.stop_motion()
+            return
+        depths, rates = (
+            [one for one in joint_values(INSERTION, path.joints, values) if one is not None]
+            for values in (path.positions, path.velocities)
+        )
+        self.follow(path.times, depths, rates or None)
 
     def stop_motion(self) -> None:
         """Brake to rest and hold; see `ReferenceGenerator.stop_motion`."""
@@ -365,11 +348,7 @@ class Controller:
         self._stopped = self.relaxed = False
 
     def release(self) -> None:
-        """
-        Discard the motion: the next measurement starts a new one from the measured depth.
-
-        Integrals are frozen while no force is commanded.
-        """
+        """Discard the motion, freeze the integrals; the next motion starts at the needle."""
         self.guide.release()
         self._insertion.stop()
         self._rotation.stop()
@@ -384,22 +363,11 @@ class Controller:
         self, measured: Measurement, load: float = 0.0, age: float = 0.0
     ) -> ControllerOutput:
         """
-        Return the command that answers a measurement.
+        Return the command that answers a measurement of an age [s], with a known load [N].
 
-        Parameters
-        ----------
-        measured, load
-            As for `Commander.command`.
-        age : float
-            Age of the measurement [s].
-
-        Returns
-        -------
-        ControllerOutput
-            Zero force without a target, or on a fault of the measurement: a value is not finite,
-            or the displacement is inconsistent with the velocity. After a gap or a step back in
-            time the motion restarts from the measured depth.
-
+        The force is zero without a target, or on a fault of the measurement: a value is not
+        finite, or the displacement is inconsistent with the velocity. After a gap or a step back
+        in time the motion restarts from the measured depth.
         """
         notice = None
         gap = self._displacement.gap(measured.time)
@@ -452,10 +420,7 @@ class Controller:
         return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
 
 
-def _completed(
-    gains: Mapping[str, Mapping[str, Gains]],
-    defaults: Mapping[str, Mapping[str, Gains]] = DEFAULT_GAINS,
-) -> dict[str, dict[str, Gains]]:
+def _completed(gains: AllGains, defaults: AllGains = DEFAULT_GAINS) -> dict[str, dict[str, Gains]]:
     """Return gains of every law and axis; reject unknown names and gains of another law."""
     completed = {law: dict(axes) for law, axes in defaults.items()}
     for law, axes in gains.items():

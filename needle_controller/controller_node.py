@@ -262,7 +262,6 @@ class ControllerNode(ModelNode):
             self._driver.robot.set_model(parameters)
 
     def cleanup(self) -> None:
-        """Discard the controller, its robot, and the load estimate."""
         if self._action is not None:
             self._action.destroy()
         self._action = None
@@ -278,7 +277,6 @@ class ControllerNode(ModelNode):
         )
 
     def about(self) -> str:
-        """Name law, constants, rate and topics."""
         values = self.values()
         target = '' if values['steered'] else f'{contract.TARGET.name}, '
         hardware = ''
@@ -393,7 +391,6 @@ class ControllerNode(ModelNode):
         self._action.update(answer.stamp, {joint: FollowedJoint(reference, actual)}, paused)
 
     def diagnose(self) -> Diagnosis[ControllerStatus]:
-        """Report target, state, faults and answers to requests."""
         severity, held, status = self._supervisor.diagnose(self.now())
         if self._driver is not None:
             status = self._driver.with_robot(status)

@@ -14,15 +14,13 @@ from needle_dynamics import NeedleParameters
 from needle_ros.axes import AXES, signed_axis
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, choice, constant, flag, text
+from needle_ros.settings import check_constants, choice, constant, flag, positive, text
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
-#: Kinds of joint commands.
 EFFORT: Final = 'effort'
 POSITION: Final = 'position'
-COMMANDS: Final = (EFFORT, POSITION)
-
+COMMANDS: Final = (EFFORT, POSITION)  #: Kinds of joint commands.
 BY_TYPE: Final = 'auto'  #: Selects the only topic of its type.
 
 #: Message types of commands and joint states; the first is the type of the contract.
@@ -37,15 +35,10 @@ STATE_TYPES: Final = {
     'dynamic_joint_state': 'control_msgs/msg/DynamicJointState',
 }
 
-#: Source of measurement stamps: message header or receive time.
-STAMPS: Final = ('header', 'receive')
-
-#: Time constant of an estimated velocity, and the gap after which it restarts [s].
-_FILTER: Final = 5e-3
-_GAP: Final = 0.1
-
-#: Interfaces of ros2_control, in the order of a JointState.
-_INTERFACES: Final = ('position', 'velocity', 'effort')
+STAMPS: Final = ('header', 'receive')  #: Source of measurement stamps: header or receive time.
+_INTERFACES: Final = ('position', 'velocity', 'effort')  #: Order of the values of a JointState.
+_FILTER: Final = 5e-3  #: Time constant of an estimated velocity [s].
+_GAP: Final = 0.1  #: Gap after which the estimate of the velocity restarts [s].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +49,7 @@ class HardwareSettings:
     sign: float = constant(
         1.0, '1', '1 if the position increases into the tissue, else -1', low=-1.0, high=1.0
     )
-    scale: float = constant(1.0, 'm', 'depth per unit of the joint: 1e-3 for mm', open_low=True)
+    scale: float = positive(1.0, 'm', 'depth per unit of the joint: 1e-3 for mm')
     zero: float = constant(0.0, 'unit of the robot', 'position at depth 0', low=-1e9, high=1e9)
     state_topic: str = text(
         '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
@@ -87,10 +80,8 @@ class HardwareSettings:
             'The others get zero effort, or hold their position at activation'
         },
     )
-    speed: float = constant(0.05, 'm/s', 'largest speed of a commanded position', open_low=True)
-    lead: float = constant(
-        2e-3, 'm', 'largest distance of a commanded from the measured position', open_low=True
-    )
+    speed: float = positive(0.05, 'm/s', 'largest speed of a commanded position')
+    lead: float = positive(2e-3, 'm', 'largest distance of a commanded from the measured position')
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -110,7 +101,6 @@ class HardwareSettings:
             raise ParameterError(
                 f"command_type must be one of {others} for the command position, got 'wrench'"
             )
-
         if self.command_type != 'wrench' and not self.command_topic:
             raise ParameterError(
                 f"command_topic must be the driver's topic for {self.command_type}, got ''"
@@ -122,20 +112,7 @@ class HardwareSettings:
         return self.command_joints or (self.joint,)
 
     def axes(self) -> tuple[tuple[int, float], ...]:
-        """
-        Return the sensor axes along x, y and z of ``needle_base``, a proper rotation.
-
-        Returns
-        -------
-        tuple of (int, float)
-            Index and sign of the axis of the sensor, for x, y and z of ``needle_base``.
-
-        Raises
-        ------
-        ParameterError
-            If an axis is unknown, or both are the same.
-
-        """
+        """Return index and sign of the sensor axes along x, y and z of ``needle_base``."""
         sign, axis = signed_axis(self.force_axis, 'force_axis')
         along = AXES.index(axis)
         aside, other = (along + 1) % 3, 1.0
@@ -158,11 +135,7 @@ def dynamic_reading(
     joints: Sequence[str],
     interfaces: Sequence[tuple[Sequence[str], Sequence[float]]],
 ) -> Reading:
-    """
-    Convert a DynamicJointState to a JointState reading; missing values are NaN.
-
-    Each entry of ``interfaces`` has the names and values of the interfaces of one joint.
-    """
+    """Convert names and values by joint of a DynamicJointState; missing values are NaN."""
     columns = tuple(
         tuple(
             values[names.index(wanted)] if wanted in names else nan
@@ -189,13 +162,6 @@ class Robot:
     settings : HardwareSettings
         Joints, units and commands.
 
-    Attributes
-    ----------
-    settings : HardwareSettings
-        As given.
-    estimates : bool
-        Whether velocities are estimated.
-
     """
 
     def __init__(self, settings: HardwareSettings) -> None:
@@ -211,10 +177,9 @@ class Robot:
 
     def begin(self) -> None:
         """Discard all measurements and commands."""
-        self.estimates = False
+        self.estimates = False  #: Whether velocities are estimated.
         self._speed = _Speed()
-        #: Last measured insertion depth [m].
-        self._depth = nan
+        self._depth = nan  #: Last measured insertion depth [m].
         #: Positions of the other joints of a command to hold, in the unit of the robot.
         self._others: dict[str, float] = {}
         if self._base is not None:
@@ -222,15 +187,7 @@ class Robot:
             self._base.position = None
 
     def configure(self, controller: Controller) -> None:
-        """
-        Take the nominal model and limits of a controller, for position commands.
-
-        Parameters
-        ----------
-        controller : Controller
-            The controller.
-
-        """
+        """Take the nominal model and limits of a controller, for position commands."""
         self._base = Admittance(
             Axis.insertion(controller.parameters),
             period=controller.period,
@@ -240,69 +197,26 @@ class Robot:
         )
 
     def set_model(self, parameters: NeedleParameters) -> None:
-        """
-        Continue with another nominal friction.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle and tissue.
-
-        """
+        """Continue with another nominal friction."""
         if self._base is not None:
             self._base.axis = Axis.insertion(parameters)
 
     # From the robot.
 
     def length(self, position: float) -> float:
-        """
-        Return the insertion depth at a position of the robot.
-
-        Parameters
-        ----------
-        position : float
-            Position of the joint, in its unit.
-
-        """
+        """Return the insertion depth [m] at a position of the joint, in its unit."""
         return self._gain * (position - self.settings.zero)
 
     def force(self, effort: float) -> float:
-        """
-        Return the axial force on the needle for an effort of the robot.
-
-        Parameters
-        ----------
-        effort : float
-            Effort of the joint, in its unit.
-
-        Returns
-        -------
-        float
-            Force on the needle [N], positive into the tissue.
-
-        """
+        """Return the axial force on the needle [N] for an effort of the joint, in its unit."""
         return effort / self._gain
 
     def measurement(self, reading: Reading) -> Measurement:
         """
-        Convert a joint state to a measurement.
+        Convert a joint state, with any joints in any order, to a measurement.
 
-        Parameters
-        ----------
-        reading : Reading
-            The joint state, with any joints in any order.
-
-        Returns
-        -------
-        Measurement
-            Depth, velocity, angle and force; the force is NaN if it is not reported, or with
-            position commands.
-
-        Raises
-        ------
-        ParameterError
-            If a required joint, position, or velocity for efforts is missing.
-
+        The force is NaN if it is not reported, or with position commands. A missing joint,
+        position, or velocity for efforts is a `ParameterError`.
         """
         settings, names = self.settings, reading.names
         positions, velocities, efforts = reading.values
@@ -353,21 +267,7 @@ class Robot:
         return i
 
     def wrench(self, reading: Reading) -> Reading:
-        """
-        Convert a force sensor reading to the axes and the sign of the contract.
-
-        Parameters
-        ----------
-        reading : Reading
-            Reading of the sensor, in its own frame.
-
-        Returns
-        -------
-        Reading
-            Wrench of the base on the needle, along the axes of ``needle_base``; the frame name is
-            unchanged, and the moment is still about the origin of the sensor.
-
-        """
+        """Convert a force sensor reading to the axes of ``needle_base``, about its own origin."""
         numbers = reading.values[0]
         sign = -1.0 if self.settings.reaction else 1.0
         turned = tuple(
@@ -382,22 +282,10 @@ class Robot:
         self, answer: ForceCommand, load: float = 0.0, *, stopped: bool = False
     ) -> list[float] | None:
         """
-        Return the joint commands for a force command.
+        Return efforts or positions in the units of the robot; None if there is no position yet.
 
-        Parameters
-        ----------
-        answer : ForceCommand
-            Force command of the controller.
-        load : float
-            Load against insertion that the force must overcome [N].
-        stopped : bool
-            Whether a stop is latched: then the position command is the last measured position.
-
-        Returns
-        -------
-        list of float or None
-            Efforts or positions, in the units of the robot; None if there is no position yet.
-
+        ``load`` is the load against insertion that the force must overcome [N]. With ``stopped``,
+        a latched stop, the position command is the last measured position.
         """
         settings = self.settings
         if settings.command == EFFORT:

@@ -35,9 +35,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Longest time to find a topic by its type, and time between two checks [s].
-_DISCOVERY: Final = 10.0
-_LOOK: Final = 0.1
+_DISCOVERY: Final = 10.0  #: Longest time to find a topic by its type [s].
+_PAUSE: Final = 0.1  #: Time between two checks for the topic [s].
 
 
 def _named(topic: Topic, name: str, type_name: str) -> Topic:
@@ -52,22 +51,17 @@ def _named(topic: Topic, name: str, type_name: str) -> Topic:
 
 
 def _of(lease: Topic, topic: Topic) -> Topic:
-    """Return a lease topic of the contract under the name of another topic."""
     return replace(lease, name=f'{topic.name}/{lease.name.rpartition("/")[2]}')
 
 
 class Topics(NamedTuple):
-    """
-    Topics of a controller: joint states, force sensor, commands.
+    """Topics of a controller."""
 
-    `measurer` and `commander` are the leases of the publishers of joint states and commands.
-    """
-
-    state: Topic
-    wrench: Topic
+    state: Topic  #: joint states
+    wrench: Topic  #: force sensor
     command: Topic
-    measurer: Topic
-    commander: Topic
+    measurer: Topic  #: lease of the publishers of joint states
+    commander: Topic  #: lease of the publishers of commands
 
 
 #: Topics of the contract.
@@ -80,16 +74,20 @@ CONTRACT: Final = Topics(
 )
 
 
+def _readings(settings: HardwareSettings) -> tuple[tuple[Topic, str, str], ...]:
+    """Return the topics of measurements in the contract, with name and type of the driver."""
+    return (
+        (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
+        (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
+    )
+
+
 def await_topics(node: BaseNode, settings: HardwareSettings) -> None:
     """Wait for the discovery of the topics that are found by their type, for a limited time."""
-    types = []
-    if settings.state_topic == BY_TYPE:
-        types.append(STATE_TYPES[settings.state_type])
-    if settings.wrench_topic == BY_TYPE:
-        types.append(contract.BASE_WRENCH.type_name)
+    types = [kind for _, name, kind in _readings(settings) if name == BY_TYPE]
     deadline = monotonic() + _DISCOVERY
     while not all(_published(node, one) for one in types) and monotonic() < deadline:
-        sleep(_LOOK)
+        sleep(_PAUSE)
 
 
 def _published(node: BaseNode, type_name: str) -> list[str]:
@@ -110,26 +108,16 @@ class Driver:
     """
     Read and command a robot by its own `topics` and message types, for the node of a controller.
 
-    A topic that is found by its type must be in the graph already, see `await_topics`. Raises
-    `ParameterError` if a topic name is invalid, or there is not exactly one topic of its type, and
-    `MessageError` if the message type of the joint states is not installed.
+    A topic that is found by its type must be in the graph already, see `await_topics`. An invalid
+    topic name or not exactly one topic of its type is a `ParameterError`.
     """
 
     def __init__(self, node: BaseNode, settings: HardwareSettings) -> None:
         self.robot = Robot(settings)
         self._node, self._settings = node, settings
-        state, wrench, command = (
-            _named(topic, self._found(topic, name, type_name), type_name)
-            for topic, name, type_name in (
-                (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
-                (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
-                (
-                    contract.WRENCH_COMMAND,
-                    settings.command_topic,
-                    COMMAND_TYPES[settings.command_type],
-                ),
-            )
-        )
+        state, wrench = (self._found(*reading) for reading in _readings(settings))
+        kind = COMMAND_TYPES[settings.command_type]
+        command = _named(contract.WRENCH_COMMAND, settings.command_topic, kind)
         self.topics = Topics(
             state, wrench, command, _of(contract.MEASURER, state), _of(contract.COMMANDER, command)
         )
@@ -145,17 +133,17 @@ class Driver:
         self._period = Duration()
         self._check: Commissioning | None = None
 
-    def _found(self, topic: Topic, name: str, type_name: str) -> str:
-        """Return the name of a topic; `BY_TYPE` selects the only topic of its type."""
-        if name != BY_TYPE or topic is contract.WRENCH_COMMAND:
-            return name
+    def _found(self, topic: Topic, name: str, type_name: str) -> Topic:
+        """Return the driver's topic; `BY_TYPE` selects the only topic of its type."""
+        if name != BY_TYPE:
+            return _named(topic, name, type_name)
         found = _published(self._node, type_name)
         if len(found) != 1:
             raise ParameterError(
                 f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
                 f'other nodes publish, found {", ".join(found) or "none"}'
             )
-        return found[0]
+        return _named(topic, found[0], type_name)
 
     # From the robot.
 
@@ -165,11 +153,7 @@ class Driver:
         take_wrench: Callable[[Reading], None],
         matched: Callable[[int], None],
     ) -> None:
-        """
-        Subscribe to joint states, passed on unconverted, and forces, converted to the contract.
-
-        ``matched`` is as for `BaseNode.listen`.
-        """
+        """Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`."""
         node, robot = self._node, self.robot
 
         def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
@@ -200,12 +184,9 @@ class Driver:
         def on_match(event: Any) -> None:
             matched(event.total_count_change)
 
+        events = SubscriptionEventCallbacks(matched=on_match)
         self._node.create_subscription(
-            self._dynamic,
-            self.topics.state.name,
-            on_message,
-            SENSOR,
-            event_callbacks=SubscriptionEventCallbacks(matched=on_match),
+            self._dynamic, self.topics.state.name, on_message, SENSOR, event_callbacks=events
         )
 
     def with_robot(self, status: ControllerStatus) -> ControllerStatus:

@@ -26,12 +26,7 @@ def build_observer(
 
 
 class LoadEstimator:
-    """
-    Load of the bent needle: estimated by an observer, from the simulation, or zero.
-
-    Stamps are integers in ns. The observer is restarted above ``largest``, the largest plausible
-    load [N].
-    """
+    """Load of the bent needle up to ``largest`` [N], of an observer or the simulation, or zero."""
 
     def __init__(
         self, parameters: NeedleParameters, observer: Observer | None = None, largest: float = 1e6
@@ -44,8 +39,7 @@ class LoadEstimator:
         """Discard all measurements."""
         #: Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
         self.load = 0.0
-        #: Why the observer is inconsistent.
-        self.warning: str | None = None
+        self.warning: str | None = None  #: Why the observer is inconsistent.
         self._updates = 0
         #: Stamp, lateral force and moment of the last wrench that waits for the encoders.
         self._waiting: tuple[int, float, float] | None = None
@@ -72,11 +66,7 @@ class LoadEstimator:
             self.observer.add_wrench(stamp, lateral, moment)
 
     def take_truth(self, state: Sequence[float]) -> None:
-        """
-        Set the load from a true state, shape (2 (2 + n),), SI units.
-
-        Raises NeedleError if the state has no valid load.
-        """
+        """Set the load from a true state, shape (2 (2 + n),), which must have a valid load."""
         self.load = 0.0
         # Finite states may overflow.
         with np.errstate(over='ignore', invalid='ignore'):
@@ -86,11 +76,7 @@ class LoadEstimator:
         self.load = load
 
     def update(self, stamp: int, measured: Measurement) -> None:
-        """
-        Update the observer with an encoder sample and the wrench of the same stamp [ns].
-
-        Raises NeedleError if the observer rejects the sample.
-        """
+        """Update the observer with an encoder sample and the wrench of the same stamp [ns]."""
         observer, wrench = self.observer, self._waiting
         if observer is None:
             return
@@ -101,7 +87,7 @@ class LoadEstimator:
         observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1
         if self._updates % _CHECK_INTERVAL == 0:
-            self._judge(observer)
+            self._check_consistency(observer)
         if not abs(observer.load) <= self._largest:
             load = observer.load
             self.forget()
@@ -109,7 +95,7 @@ class LoadEstimator:
         if self.warning is None:
             self.load = observer.load
 
-    def _judge(self, observer: Observer) -> None:
+    def _check_consistency(self, observer: Observer) -> None:
         """Check the consistency of the observer (NIS)."""
         # The initial state is a guess, and affects the NIS while the history contains it.
         known = self._updates * observer.period > 1.2 * observer.settings.history
@@ -122,7 +108,6 @@ class LoadEstimator:
             )
 
     def status(self) -> ObserverStatus | None:
-        """Return the status of the observer; None before its first estimate."""
         observer = self.observer
         if observer is None or not observer.ready:
             return None

@@ -18,14 +18,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
-from needle_controller.compiled.laws import (
-    FOLLOWS,
-    INTEGRAL,
-    INVERSE_DYNAMICS,
-    POSITION,
-    RATE,
-    VELOCITY,
-)
+from needle_controller.compiled import laws
 from needle_controller.laws.axis import Axis
 from needle_controller.laws.inverse_dynamics import BANDWIDTH, InverseDynamics
 from needle_controller.laws.law import Law, SampledLoop
@@ -38,9 +31,8 @@ import numpy as np
 MARGIN: Final = 1e-6  #: Default distance of the spectral radius from one.
 RESERVE: Final = 1  #: Periods of unmodeled delay in reserve.
 
-#: Largest factors on gains and rate in the search for stable gains.
-_MOST_GAIN: Final = 1e6
-_MOST_RATE: Final = 1e3
+_MOST_GAIN: Final = 1e6  #: Largest factor on the gains in the search for stable gains.
+_MOST_RATE: Final = 1e3  #: Largest factor on the rate in this search.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,41 +58,26 @@ def transition_matrix(
     Compute the transition matrix of the closed loop over one period, exact for its linear part.
 
     The state is position, velocity, the memory of the law (integral, filtered rate and modeled
-    motion, if its gains use them) and the pending commands; the latest are known to the law.
-    The matrix is computed by running the implemented loop on unit states, so that analysis and
-    implementation agree.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect that the law takes into account.
-    unmodeled : int
-        Additional periods of delay, unknown to the law.
-    plant : Axis, optional
-        The true axis, if it differs from the nominal axis of the law; without its dry friction.
-
-    Returns
-    -------
-    ndarray, shape (N, N)
-        Transition matrix over one period.
-
+    motion, if its gains use them) and the pending commands; the latest are known to the law. The
+    law takes ``delay`` periods from measurement to effect into account; ``unmodeled`` more are
+    unknown to it. ``plant`` is the true axis, without its dry friction. The matrix is computed by
+    running the implemented loop on unit states, so that analysis and implementation agree.
     """
     linear, late = law.linear(), delay + unmodeled
     moved = (plant or law.axis).without_coulomb()
     loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
     # Only memory used by the gains is part of the loop; the offset after a switch decays.
     c = law.constants
-    follows = c.kp if c.kind == INVERSE_DYNAMICS else 0.0
-    uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, VELOCITY: follows}
+    follows = c.kp if c.kind == laws.INVERSE_DYNAMICS else 0.0
+    uses = {laws.INTEGRAL: c.ki, laws.RATE: c.filter_time * c.kd}
+    uses |= {laws.POSITION: follows, laws.VELOCITY: follows}
     used = [entry for entry, gain in uses.items() if gain > 0.0]
     first = 2 + len(used)
 
     def period(state: FloatArray) -> list[float]:
         position, velocity = state[:2].tolist()
         commands: list[float] = state[first:].tolist()
-        loop.memory[used], loop.memory[FOLLOWS] = state[2:first], float(follows > 0.0)
+        loop.memory[used], loop.memory[laws.FOLLOWS] = state[2:first], float(follows > 0.0)
         loop.pending.extend(commands[unmodeled:])
         commands.append(loop.command(position, velocity, rest))
         end = moved.propagate(position, velocity, commands[0], linear.period)
@@ -110,15 +87,7 @@ def transition_matrix(
 
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None) -> float:
-    """
-    Return the largest modulus of the poles; below 1 is stable.
-
-    Parameters
-    ----------
-    law, delay, unmodeled, plant
-        As for `transition_matrix`.
-
-    """
+    """Return the largest modulus of the poles; below 1 is stable. See `transition_matrix`."""
     matrix = transition_matrix(law, delay, unmodeled, plant)
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
@@ -149,37 +118,11 @@ def stability_limit(
     law: Law, delay: int, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
 ) -> Limit:
     """
-    Find the stability limit of a loop over all axes, with its delay and with the delay in reserve.
+    Return the largest limit cycle, or else the radius with the largest excess over its bound.
 
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect.
-    margin : float
-        Required distance of the spectral radius from one, in [0, 1).
-    plants : sequence of Axis
-        Other axes on which the loop must be stable, such as those from `Uncertainty.axes`.
-
-    Returns
-    -------
-    Limit
-        The largest limit cycle, or else the radius with the largest excess over its bound.
-
-    Raises
-    ------
-    ParameterError
-        If ``margin`` is out of range.
-
-    Examples
-    --------
-    >>> from needle_controller import Axis, Pid, PidGains, stability_limit
-    >>> from needle_dynamics import NeedleParameters
-    >>> axis = Axis.insertion(NeedleParameters.preset('phantom'))
-    >>> stability_limit(Pid(axis=axis, gains=PidGains(), period=1e-3), delay=1).stable
-    True
-
+    The loop runs on its nominal axis and on other ``plants``, such as those from
+    `Uncertainty.axes`, with its delay and with the delay in reserve. ``margin`` is the required
+    distance of the spectral radius from one, in [0, 1).
     """
     if not 0.0 <= margin < 1.0:
         raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
@@ -195,10 +138,16 @@ def check_stability(
 
     Parameters
     ----------
-    law, delay, margin, plants
-        As for `stability_limit`.
+    law : Law
+        Control law.
+    delay : int
+        Periods from measurement to effect.
     name : str
         Name of the gains for the message.
+    margin : float
+        Required distance of the spectral radius from one, in [0, 1).
+    plants : sequence of Axis
+        Other axes on which the loop must be stable, such as those from `Uncertainty.axes`.
 
     Returns
     -------
@@ -285,7 +234,6 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
 
 
 def _upwards(most: float) -> Iterator[float]:
-    """Yield factors above one, in ratios of 1.1."""
     factor = 1.1
     while factor <= most:
         yield factor

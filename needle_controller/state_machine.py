@@ -22,7 +22,7 @@ class StateMachine(ABC, Generic[_Command]):
     Events, requests, clock and inputs of the axial supervisor and the steering executive.
 
     `authority` is the state of the whole system, which the machine follows. `steady` is as for
-    `EventLog`, `takes` as for `RequestLog`.
+    `EventLog`, `takes` as for `RequestLog`. Times are in ns; a command of None publishes nothing.
     """
 
     def __init__(self, steady: Callable[[], float], takes: Mapping[Topic, Sequence[str]]) -> None:
@@ -32,31 +32,14 @@ class StateMachine(ABC, Generic[_Command]):
         #: Mode of the system that is followed, and time of the retraction that is followed [ns].
         self._obeyed = Mode.RUNNING
         self._retracted = 0
-        #: Time of the last event [ns].
-        self._time = 0
+        self._time = 0  #: Time of the last event [ns].
         self._take_requests(takes)
 
     def _take_requests(self, takes: Mapping[Topic, Sequence[str]]) -> None:
-        """Set which requests are accepted."""
         self.requests = RequestLog(takes, ('', ENTRY), self._steady)
 
     def request(self, word: str, now: int) -> tuple[bool, str, _Command | None]:
-        """
-        Execute a request of a user, and follow the new state.
-
-        Parameters
-        ----------
-        word : str
-            The request, see `needle_ros.system_state.Authority.request`.
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        tuple of (bool, str, command or None)
-            Whether it is executed, one line for the user, and the command to publish.
-
-        """
+        """Execute a request of a user; return whether, one line for the user, and the command."""
         success, message = self.authority.request(word, self._obstacle(word, now))
         if not success:
             self.events.reject(message)
@@ -67,20 +50,7 @@ class StateMachine(ABC, Generic[_Command]):
         """Return why a request of a user cannot be executed, or ''."""
 
     def obey(self, now: int) -> _Command | None:
-        """
-        Follow the state of the system.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        command or None
-            Command to publish.
-
-        """
+        """Follow the state of the system; return the command to publish."""
         mode, before = self.authority.mode, self._obeyed
         time, retracted = self.authority.state.motion.time, self._retracted
         self._obeyed = mode
@@ -108,7 +78,6 @@ class StateMachine(ABC, Generic[_Command]):
         return known is None
 
     def _accept(self, topic: Topic, stamp: int, verdict: Verdict = Verdict.ACCEPTED) -> None:
-        """Acknowledge a request."""
         self.requests.answer(topic, stamp, verdict, joints=(INSERTION,))
 
     def _reject(self, topic: Topic, stamp: int, reason: str | NeedleError) -> None:

@@ -7,7 +7,6 @@ import json
 import sys
 from typing import Any
 
-from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
@@ -40,16 +39,14 @@ from needle_ros.trajectory_client_node import TrajectoryClient
 from needle_ros.wire import Reading
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.duration import Duration as Delay
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 _WATCH = 0.05  #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _ACTION = 'trajectory_action'  #: Parameter with the action of a robot.
-_ARRIVAL = Delay(seconds=1.0)  #: Longest time until a motion is acknowledged, in lock-step.
-
-
+_ARRIVAL = Duration(seconds=1.0)  #: Longest time until a motion is acknowledged, in lock-step.
 _SELDOM = 10.0  #: Shortest time between two warnings of a record that cannot be written [s].
 
 
@@ -119,17 +116,14 @@ class SteeringNode(CompiledNode):
         self._file = RecordFile(self.get_fully_qualified_name(), self.context.get_domain_id())
         #: Record before a restart and the source of its measurements, until they are compared.
         self._before: tuple[SteeringRecord, str] | None = None
-        #: Expected tip of the last publication.
-        self._told: TipEstimate | None = None
-        #: State of the system, also before the node is configured.
-        self._authority = Authority()
+        self._published_tip: TipEstimate | None = None  #: Expected tip of the last publication.
+        self._authority = Authority()  #: State of the system, also before the node is configured.
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
         #: Reports the processed sample, with simulated time.
         self._processed: Publisher | None = None
         #: Processed sample that is not reported yet: a plan is computed first.
         self._unreported: int | None = None
-        #: Whether a motion was sent since the last report.
-        self._moved = False
+        self._moved = False  #: Whether a motion was sent since the last report.
 
     # Transitions.
 
@@ -158,7 +152,7 @@ class SteeringNode(CompiledNode):
                     f'continuous must be false with {_ACTION}: needle and guide are moved by '
                     'separate trajectories, of which the action follows one'
                 )
-            self._client = TrajectoryClient(self, action, self._hear)
+            self._client = TrajectoryClient(self, action, self._take_answers)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
         self._tip_expected = self.publisher(contract.TIP_EXPECTED)
         self._record = self.publisher(contract.INSERTION_RECORD)
@@ -175,8 +169,7 @@ class SteeringNode(CompiledNode):
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
-        """Discard the steering executive."""
-        self._loop = self._told = self._before = None
+        self._loop = self._published_tip = self._before = None
         if self._client is not None:
             self._client.destroy()
             self._client = None
@@ -197,7 +190,6 @@ class SteeringNode(CompiledNode):
             self._processed = None
 
     def about(self) -> str:
-        """Name constants, steps and topics."""
         values = self.values()
         return (
             f'law {values["law"]}, needle {values["needle"]}, steps of '
@@ -233,9 +225,8 @@ class SteeringNode(CompiledNode):
         if self._moved:
             self._trajectory.wait_for_all_acked(_ARRIVAL)
             self._moved = False
-        whole, part = divmod(stamp, NANOSECONDS)
         message = Header(frame_id=self.get_fully_qualified_name())
-        message.stamp.sec, message.stamp.nanosec = whole, part
+        message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
         processed.publish(message)
 
     def _on_target(self, message: PointStamped) -> None:
@@ -255,17 +246,15 @@ class SteeringNode(CompiledNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Pass other nodes' answers to motions to the executive."""
         if self._client is not None:
-            # The action answers; the topic is not used.
+            # The action answers; receivers of the topic take none of the motions.
             return
         for status in message.status:
-            values = {one.key: one.value for one in status.values}
-            answers = RequestStatus.from_values(values)
-            # With an action, receivers of the topic take none of the motions.
-            if answers.takes and self._client is None:
+            answers = RequestStatus.from_values({one.key: one.value for one in status.values})
+            if answers.takes:
                 node = printable(node_of(status.name).rpartition('/')[2])
-                self._hear(node, answers)
+                self._take_answers(node, answers)
 
-    def _hear(self, receiver: str, answers: RequestStatus) -> None:
+    def _take_answers(self, receiver: str, answers: RequestStatus) -> None:
         """Process the answers of a receiver of the motions."""
         if self._loop is not None and self.is_active:
             self._act(self._loop.hear(receiver, answers, self.now()))
@@ -285,8 +274,7 @@ class SteeringNode(CompiledNode):
 
     def _recall(self, loop: SteeringExecutive) -> None:
         """Use the record before a restart, if the measurements are from the same source."""
-        source = self._source if self._before is not None else ''
-        if not source or self._before is None:
+        if self._before is None or not (source := self._source):
             return
         (record, owner), self._before = self._before, None
         if owner == source:
@@ -305,11 +293,10 @@ class SteeringNode(CompiledNode):
             )
 
     def _obey(self) -> None:
-        """Follow the state of the system."""
         if self._loop is not None and self.is_active:
             self._act(self._loop.obey(self.now()))
 
-    def _watch(self, _came: int = 0) -> None:
+    def _watch(self, _matched: int = 0) -> None:
         """Check for missing inputs, for duplicate publishers, and for a plan that is computed."""
         if self._loop is None or not self.is_active:
             return
@@ -340,10 +327,10 @@ class SteeringNode(CompiledNode):
                 self._trajectory.publish(message)
                 self._moved = True
         self._system.publish()
-        if loop.expected is not self._told:
-            self._told = loop.expected
+        if loop.expected is not self._published_tip:
+            self._published_tip = loop.expected
             if loop.expected is not None:
-                self._tell_tip(loop.expected, loop.depth)
+                self._publish_tip(loop.expected, loop.depth)
         self.publish_events(loop.events)
         if loop.requests.due():
             self.publish_diagnostics()
@@ -354,17 +341,15 @@ class SteeringNode(CompiledNode):
         stamp.sec, stamp.nanosec = divmod(move.stamp, NANOSECONDS)
         rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
         for time, positions, velocities in rows:
-            whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
-            message.points.append(
-                JointTrajectoryPoint(
-                    positions=positions.tolist(),
-                    velocities=velocities.tolist(),
-                    time_from_start=Duration(sec=whole, nanosec=part),
-                )
+            point = JointTrajectoryPoint(
+                positions=positions.tolist(), velocities=velocities.tolist()
             )
+            since = point.time_from_start
+            since.sec, since.nanosec = divmod(round(time * NANOSECONDS), NANOSECONDS)
+            message.points.append(point)
         return message
 
-    def _tell_tip(self, there: TipEstimate, depth: float) -> None:
+    def _publish_tip(self, there: TipEstimate, depth: float) -> None:
         message = PoseWithCovarianceStamped()
         message.header.frame_id = contract.ENTRY
         message.header.stamp = self.get_clock().now().to_msg()
@@ -377,7 +362,6 @@ class SteeringNode(CompiledNode):
         self._tip_expected.publish(message)
 
     def diagnose(self) -> Diagnosis[SteeringStatus]:
-        """Report the state, the expected tip and faults."""
         if self._loop is None:
             return Diagnosis(Severity.INFO, self.state, SteeringStatus())
         if not self.is_active:

@@ -3,17 +3,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from time import monotonic
 from typing import Final
 
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
-from needle_controller.joint_path import follow_path
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
-from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.limits import SafetyLimits
@@ -93,7 +90,6 @@ class Supervisor(StateMachine[ForceCommand]):
         self.safety.stop = stop
 
     def cleanup(self) -> None:
-        """Discard controller and load estimate."""
         self.controller = self._active = None
         self.bending = LoadEstimator(NeedleParameters())
 
@@ -153,7 +149,6 @@ class Supervisor(StateMachine[ForceCommand]):
     # Requests.
 
     def receive(self, *, targets: bool) -> None:
-        """Set which requests are accepted."""
         self._targets = targets
         topics = (TARGET, JOINT_TRAJECTORY) if targets else (JOINT_TRAJECTORY,)
         self._take_requests(dict.fromkeys(topics, (INSERTION,)))
@@ -177,8 +172,11 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
         """Take a path, which starts at its stamp."""
-        act = partial(follow_path, path)
-        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, act)
+
+        def follow(controller: Controller, elapsed: float) -> None:
+            controller.follow_joints(path, elapsed)
+
+        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
         if path.stops and stamp <= now:
             # A stop waits for no sample.
             self._execute_request(stamp + 1)
@@ -283,7 +281,6 @@ class Supervisor(StateMachine[ForceCommand]):
             controller.set_target(min(max(min(self.retract_depth, depth), low), high))
 
     def tip(self, reading: Reading, now: int) -> ForceCommand | None:
-        """Take a `tip_deflection` measurement."""
         if self._active is None:
             return None
         answer, (x, depth, deflection) = self._check_clock(now), reading.values[0]
@@ -295,7 +292,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return answer
 
     def wrench(self, reading: Reading, now: int) -> ForceCommand | None:
-        """Take a `base_wrench` measurement."""
         if self._active is None:
             return None
         answer, values = self._check_clock(now), reading.values[0]
@@ -346,7 +342,8 @@ class Supervisor(StateMachine[ForceCommand]):
         self._execute_request(stamp)
         try:
             robot = self._robot
-            measured = read_encoders(reading) if robot is None else robot.measurement(reading)
+            convert = Measurement.from_reading if robot is None else robot.measurement
+            measured = convert(reading)
         except ParameterError as error:
             return self._release_for(str(error), stamp)
         if measured.is_finite():

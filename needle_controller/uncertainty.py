@@ -13,17 +13,11 @@ from needle_controller.laws.law import Law
 from needle_ros.settings import CheckedSettings, constant
 import numpy as np
 
-#: Fractions of the carriage mass that are checked.
-_PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
-
-#: Initial positions of the simulations for limit cycles [m] or [rad].
-_STARTS: Final = (1e-3, 5e-5)
-
-#: Duration of such a simulation [s]: minimum, maximum. Decrease of errors in each third of it.
-_SHORTEST: Final = 0.5
-_LONGEST: Final = 20.0
-_DECREASE: Final = 0.1
-
+_PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)  #: Checked fractions of the carriage.
+_STARTS: Final = (1e-3, 5e-5)  #: Initial positions of simulated limit cycles [m] or [rad].
+_SHORTEST: Final = 0.5  #: Shortest duration of such a simulation [s].
+_LONGEST: Final = 20.0  #: Longest duration [s].
+_DECREASE: Final = 0.1  #: Decrease of errors in each third of it.
 _LEAST: Final = 1e-6  #: Least range of motion that is a limit cycle [m] or [rad].
 
 
@@ -39,17 +33,7 @@ class Uncertainty(CheckedSettings):
     )
 
     def axes(self, axis: Axis, *, carriage: bool = False) -> list[Axis]:
-        """
-        Return the axes at the uncertainty bounds, also with fractions of the carriage mass.
-
-        Parameters
-        ----------
-        axis : Axis
-            The nominal axis.
-        carriage : bool
-            Whether the axis may carry the carriage.
-
-        """
+        """Return the axes at the uncertainty bounds, with ``carriage`` also with its mass."""
         extra = [part * self.carriage for part in _PARTS if carriage and self.carriage > 0.0]
         inertias = [*_bounds(axis.inertia, self.inertia)]
         inertias += [max(inertias) + mass for mass in extra]
@@ -68,12 +52,11 @@ def _bounds(value: float, share: float) -> list[float]:
 
 def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float) -> float:
     """
-    Simulate a law on another axis; return the amplitude of a limit cycle [m] or [rad], 0 without.
+    Simulate a law on another axis; return the amplitude of a limit cycle [m] or [rad], or 0.
 
     A limit cycle is possible if the law has an integral, or compensates friction in the direction
     of the measured velocity, as inverse dynamics without feedback does. Other laws are not
-    simulated. ``delay`` and ``unmodeled`` are the modeled and unmodeled periods of delay;
-    ``radius`` is the spectral radius of the loop, below 1.
+    simulated. ``radius`` is the spectral radius of the loop, below 1.
     """
     c = law.constants
     measured = c.kind == INVERSE_DYNAMICS and c.kp == 0.0

@@ -47,6 +47,11 @@ def constant(
     return field(default=default, metadata={'unit': unit, 'description': description, **meta})
 
 
+def positive(default: float, unit: str, description: str, *, high: float = inf) -> Any:
+    """Declare a numeric dataclass field that must be above zero; see `constant`."""
+    return constant(default, unit, description, high=high, open_low=True)
+
+
 def choice(default: str, valid: Iterable[str], meaning: str = '') -> Any:
     """Declare a dataclass field with one of the `valid` words, which its description lists."""
     # A mapping by word may get more words later.

@@ -10,7 +10,6 @@ from needle_controller import (
     Axis,
     check_stability,
     DEFAULT_GAINS,
-    Guard,
     LAWS,
     Measurement,
     Reference,
@@ -23,6 +22,7 @@ from needle_controller import (
 from needle_controller.controller import LAW_OF
 from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
+from needle_controller.safety.guard import Guard
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.parameters import PAPER_NEEDLE

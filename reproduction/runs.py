@@ -17,13 +17,8 @@ from itertools import product
 from math import sqrt
 from typing import Final
 
-from needle_controller import (
-    ContinuousInverseDynamics,
-    ContinuousLaw,
-    ContinuousPid,
-    LoopRun,
-    run_continuous,
-)
+from needle_controller import ContinuousInverseDynamics, ContinuousPid, LoopRun, run_continuous
+from needle_controller.laws.continuous import ContinuousLaw
 from needle_dynamics import FORMULATIONS, Integrator, NeedleModel, NeedleParameters, simulate
 import numpy as np
 

@@ -7,6 +7,7 @@ stops, breaks away, or reaches the hub. Friction is not smoothed.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Final
 
@@ -18,11 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _AT_REST: Final = 1e-300  #: Smallest velocity of either sign, for a start from rest [m/s].
-
-#: Relative excess of a force over dry friction at break-away, so that an exponentially decaying
-#: motion ends only once.
-_ROUNDING: Final = 1e-9
-
+_ROUNDING: Final = 1e-9  #: Relative excess of a force at break-away: a decaying motion ends once.
 _MOST_PIECES: Final = 1000  #: Largest number of pieces of a motion; more are chatter.
 
 
@@ -64,12 +61,8 @@ def run_continuous(
 
     Raises
     ------
-    ShapeError, ParameterError
-        If an argument is invalid.
-    InsertionDepthError
-        If the needle leaves its range.
     NeedleError
-        If the solver fails, or law and friction chatter.
+        If the needle leaves its range, the solver fails, or law and friction chatter.
 
     Notes
     -----
@@ -87,7 +80,8 @@ def run_continuous(
             f'{plant.modes.count}'
         )
     y = np.concatenate([plant.checked_state(state), np.zeros(law.integrals)])
-    pieces = _Pieces(law, plant, goal, tolerance, method)
+    desired = goal if callable(goal) else lambda _time: goal
+    pieces = _Pieces(law, plant, desired, tolerance, method)
     time, states = float(wanted[0]), np.empty((len(wanted), len(y)))
     states[0] = y
     events: list[tuple[float, str]] = []
@@ -107,26 +101,24 @@ def run_continuous(
     return LoopRun(plant, wanted, states[:, : 2 * m], np.array(forces), tuple(events))
 
 
+@dataclass
 class _Pieces:
     """Solver of a closed loop between changes of the friction state."""
 
-    def __init__(
-        self,
-        law: ContinuousLaw,
-        plant: NeedleModel,
-        goal: ArrayLike | Callable[[float], ArrayLike],
-        tolerance: float,
-        method: str,
-    ) -> None:
-        self.law, self.plant, self.goal = law, plant, goal
-        self.tolerance, self.method = tolerance, method
-        p, m = plant.parameters, plant.coordinates
-        self.low = -(plant.modes.reach - 1.0) * p.length
+    law: ContinuousLaw
+    plant: NeedleModel
+    goal: Callable[[float], ArrayLike]
+    tolerance: float
+    method: str
+
+    def __post_init__(self) -> None:
+        p, m = self.plant.parameters, self.plant.coordinates
+        self.low = -(self.plant.modes.reach - 1.0) * p.length
         self.high = p.length - p.minimum_depth
         # Sizes: the needle's length, a radian, a deflection of 1 cm; the same per second.
         sizes = np.full(m, 0.01 * sqrt(p.length))
         sizes[:2] = p.length, 1.0
-        self.scale = np.concatenate([sizes, sizes, sizes[: law.integrals]])
+        self.scale = np.concatenate([sizes, sizes, sizes[: self.law.integrals]])
         self.m = m
 
     def _clamped(self, y: FloatArray, direction: int) -> FloatArray:
@@ -141,14 +133,11 @@ class _Pieces:
 
     def forces(self, time: float, y: FloatArray, direction: int | None = None) -> FloatArray:
         x = y[: 2 * self.m] if direction is None else self._clamped(y, direction)
-        return self.law.forces(x, self._goal(time), y[2 * self.m :], time)
-
-    def _goal(self, time: float) -> ArrayLike:
-        return self.goal(time) if callable(self.goal) else self.goal
+        return self.law.forces(x, self.goal(time), y[2 * self.m :], time)
 
     def rate(self, time: float, y: FloatArray, direction: int) -> FloatArray:
         m, x = self.m, self._clamped(y, direction)
-        now = self._goal(time)
+        now = self.goal(time)
         forces = self.law.forces(x, now, y[2 * m :], time)
         result = acceleration(self.plant, x, forces, time)
         errors = self.law.errors(x, now)[0][: self.law.integrals]

@@ -24,11 +24,7 @@ from numpy.typing import ArrayLike
 
 
 class Commander(Protocol):
-    """
-    Interface of the controllers that `run_controller` accepts, such as `Controller`.
-
-    It is called from Python once per period and needs no compiled code.
-    """
+    """Interface of the controllers that `run_controller` accepts, such as `Controller`."""
 
     @property
     def period(self) -> float:
@@ -39,22 +35,7 @@ class Commander(Protocol):
         """Periods from a measurement to the effect of its command."""
 
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
-        """
-        Return the command for a measurement.
-
-        Parameters
-        ----------
-        measured : Measurement
-            Encoder measurement.
-        load : float
-            Force of the bent needle against insertion [N]; 0 if unknown.
-
-        Returns
-        -------
-        ControllerOutput
-            Force and torque.
-
-        """
+        """Return the command for a measurement and the load of the bent needle [N]."""
 
 
 def run_controller(
@@ -98,7 +79,7 @@ def run_controller(
 
     Examples
     --------
-    >>> from needle_controller import Controller, ControllerOutput, run_controller
+    >>> from needle_controller import Controller, run_controller
     >>> from needle_dynamics import NeedleModel, NeedleParameters
     >>> plant = NeedleParameters.preset('phantom')
     >>> start = NeedleModel(plant).state_at(0.02)
@@ -106,16 +87,6 @@ def run_controller(
     >>> controller.set_target(0.022)
     >>> run = run_controller(controller, plant, start, duration=0.5)
     >>> bool(abs(run.depth[-1] - 0.022) < 2e-5)
-    True
-
-    A custom controller, here a proportional law:
-
-    >>> class Proportional:
-    ...     period, delay = 1e-3, 1
-    ...     def command(self, measured, load=0.0):
-    ...         return ControllerOutput(force=2000.0 * (0.022 - measured.depth))
-    >>> run = run_controller(Proportional(), plant, start, duration=0.5)
-    >>> bool(run.depth[-1] < 0.022)
     True
 
     """
@@ -222,10 +193,8 @@ def run_batch(
         Coulomb friction [N] and viscous friction [N s/m] are added, until the next row.
     step : float
         Longest step of the integrator [s].
-    keep : bool
-        Keep the insertion depths of all periods.
-    record : bool
-        Keep the states and the commands of all periods.
+    keep, record : bool
+        Keep the insertion depths of all periods; keep their states and commands.
     workers : int, optional
         Number of threads; one per core by default.
     progress : bool or callable, optional
@@ -235,13 +204,6 @@ def run_batch(
     -------
     LoopBatch
         Results, independent of the number of threads.
-
-    Raises
-    ------
-    ShapeError
-        If the numbers of runs do not agree.
-    ParameterError, InsertionDepthError
-        If a value is invalid.
 
     """
     each_law = [laws] if isinstance(laws, Law) else list(laws)
@@ -264,8 +226,8 @@ def run_batch(
         )
     count, runs = round(duration / period), sizes.pop() if sizes else 1
     # Setpoint of a command: the reference at the time of its effect.
-    course = _setpoints(reference, period, count + delay + 1)
-    setpoints, goal = course[delay:-1], np.ascontiguousarray(course[: count + 1, 0])
+    motion = _setpoints(reference, period, count + delay + 1)
+    setpoints, goal = motion[delay:-1], np.ascontiguousarray(motion[: count + 1, 0])
     blurred = np.array(noise, dtype=np.float64).reshape(-1, 3)
     if len(blurred) not in (0, count) or not np.isfinite(blurred).all():
         raise ShapeError(f'noise must be finite, of shape ({count}, 3), got {blurred.shape}')
@@ -298,16 +260,9 @@ def run_batch(
         run(range(1), each_run)
         shares = [range(1 + k, runs, workers) for k in range(workers)]
         list(pool.map(run, shares, repeat(each_run)))
+    final, largest, squares = errors.T
     return LoopBatch(
-        final=errors[:, 0],
-        largest=errors[:, 1],
-        rms=np.sqrt(errors[:, 2]),
-        states=ends,
-        completed=completed,
-        goal=goal,
-        depths=depths,
-        trajectories=trajectories,
-        commands=commands,
+        final, largest, np.sqrt(squares), ends, completed, goal, depths, trajectories, commands
     )
 
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inverse dynamics with friction adaptation."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import inf
+from typing import Any, ClassVar
 
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_ros.settings import constant, flag
+from needle_ros.settings import constant, flag, positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,10 +19,9 @@ class AdaptiveGains(InverseDynamicsGains):
         0.5, '1', 'largest learned change of dry and of viscous friction, relative to the model',
         high=10.0,
     )  # fmt: skip
-    noise: float = constant(
-        0.05, 'N or N m', 'standard deviation of the force not explained by the friction model',
-        open_low=True,
-    )  # fmt: skip
+    noise: float = positive(
+        0.05, 'N or N m', 'standard deviation of the force not explained by the friction model'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +34,8 @@ class Adaptive(InverseDynamics):
     every measurement: a bounded external force on the loop of inverse dynamics.
     """
 
+    LINEAR: ClassVar[Mapping[str, Any]] = {'learn': False, 'bound': 0.0}
+
     gains: AdaptiveGains
 
     def __post_init__(self) -> None:
@@ -44,8 +45,3 @@ class Adaptive(InverseDynamics):
         constants = self.constants._replace(bound=float(self.gains.bound), noise=float(noise))
         object.__setattr__(self, 'constants', constants)
         object.__setattr__(self, 'packed', tuple(constants))
-
-    def linear(self) -> Adaptive:
-        """Return the law without Coulomb friction and learning; see `Law.linear`."""
-        gains = replace(self.gains, learn=False, bound=0.0)
-        return replace(self, axis=self.axis.without_coulomb(), gains=gains)

@@ -14,7 +14,6 @@ from needle_ros.errors import ParameterError
 
 
 def require_complete(parameters: NeedleParameters) -> None:
-    """Raise `ParameterError` unless the formulation is `complete`."""
     if parameters.formulation != 'complete':
         raise ParameterError(
             "formulation must be 'complete' for controller and observer, got "
@@ -38,15 +37,7 @@ class Response(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis(Friction):
-    """
-    Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction.
-
-    Raises
-    ------
-    ParameterError
-        If a value is not finite or negative, or the inertia is zero.
-
-    """
+    """Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction."""
 
     inertia: float  #: [kg] or [kg m^2]
     coulomb: float = 0.0
@@ -60,85 +51,26 @@ class Axis(Friction):
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
-        """
-        Return the insertion axis of a needle, first row of (16).
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            The needle.
-
-        Returns
-        -------
-        Axis
-            Moving mass [kg] and friction.
-
-        """
+        """Return moving mass [kg] and friction of the insertion axis, row 1 of (16)."""
         return cls(inertia=parameters.moving_mass, **asdict(parameters.friction))
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:
-        """
-        Return the rotation axis of a needle, second row of (16), without friction.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            The needle.
-
-        Returns
-        -------
-        Axis
-            Rotary inertia [kg m^2].
-
-        """
+        """Return the rotary inertia [kg m^2] of the frictionless rotation axis, row 2 of (16)."""
         return cls(inertia=0.5 * parameters.rotary_inertia)
 
     def without_coulomb(self) -> Axis:
-        """Return the axis without Coulomb friction."""
         return replace(self, coulomb=0.0)
 
     def propagate(
         self, position: float, velocity: float, force: float, t: float
     ) -> tuple[float, float]:
-        """
-        Solve the motion under a constant force, exactly.
-
-        Parameters
-        ----------
-        position, velocity : float
-            Initial position and velocity.
-        force : float
-            Force [N].
-        t : float
-            Time [s].
-
-        Returns
-        -------
-        position, velocity : float
-            Final position and velocity.
-
-        """
+        """Return position and velocity after a time t [s] under a constant force [N], exactly."""
         end, moved = friction_flow(self.constants, self.inertia, velocity, force, t)
         return position + moved, end
 
     def response(self, t: float, factor: float = 1.0) -> Response:
-        """
-        Return the linear response over a time [s], exactly.
-
-        Parameters
-        ----------
-        t : float
-            Time [s].
-        factor : float
-            Factor on viscous friction.
-
-        Returns
-        -------
-        Response
-            Response to a velocity and to a constant force.
-
-        """
+        """Return the exact linear response over a time [s], with a factor on viscous friction."""
         x = factor * self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia

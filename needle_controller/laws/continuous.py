@@ -46,9 +46,21 @@ def _gain_matrix(
     return matrix
 
 
+def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    array = np.array(values, dtype=float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ShapeError(f'{name} must be finite with shape {shape}, got {array.tolist()}')
+    return array
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousLaw(ABC):
-    """Control law in continuous time: a function of state, goal and integral of the error."""
+    """
+    Control law in continuous time: a function of state, goal and integral of the error.
+
+    States X = [d, theta, q1, ..., qn] and rates have shape (2 (2 + n),), goals q, q_dot and q_ddot
+    have shape (3, 2 + n).
+    """
 
     model: NeedleModel  #: nominal model of needle and tissue; the plant may differ
     #: ``physical``: f_y and tau only. ``modal``: a generalized force on every coordinate, as in
@@ -66,31 +78,9 @@ class ContinuousLaw(ABC):
         return 0
 
     def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
-        """
-        Return the errors of the driven coordinates.
-
-        Parameters
-        ----------
-        state : ndarray, shape (2 (2 + n),)
-            State X = [d, theta, q1, ..., qn] and rates.
-        goal : array_like, shape (3, 2 + n)
-            Desired q, q_dot and q_ddot.
-
-        Returns
-        -------
-        ndarray, shape (3, driven)
-            e = q_d - q, its rate, and the desired acceleration.
-
-        Raises
-        ------
-        ShapeError
-            If the shape of the goal is wrong or a number is not finite.
-
-        """
+        """Return e = q_d - q, its rate, and the desired acceleration; shape (3, driven)."""
         m, k = self.model.coordinates, self.driven
-        wanted = np.array(goal, dtype=float)
-        if wanted.shape != (3, m) or not np.isfinite(wanted).all():
-            raise ShapeError(f'goal must be finite with shape (3, {m}), got {wanted.tolist()}')
+        wanted = _finite('goal', goal, (3, m))
         wanted[0] -= state[:m]
         wanted[1] -= state[m:]
         return wanted[:, :k]
@@ -100,30 +90,11 @@ class ContinuousLaw(ABC):
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
         """
-        Return the forces.
+        Return the forces at a time [s], for tissue that swells; shape (2 + n,).
 
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State X = [d, theta, q1, ..., qn] and rates.
-        goal : array_like, shape (3, 2 + n)
-            Desired q, q_dot and q_ddot.
-        integral : array_like, shape (integrals,)
-            Integral of the errors of the driven coordinates.
-        time : float
-            Time [s], for tissue that swells.
-
-        Returns
-        -------
-        ndarray, shape (2 + n,)
-            f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i
-            [N m^-1/2].
-
-        Raises
-        ------
-        ShapeError, InsertionDepthError
-            If the state, the goal or the integral is invalid.
-
+        They are f_y [N], positive into the tissue, tau [N m], and the generalized force on each
+        q_i [N m^-1/2]. The integral of the errors of the driven coordinates has shape
+        (integrals,).
         """
 
 
@@ -185,21 +156,12 @@ class ContinuousInverseDynamics(ContinuousLaw):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ContinuousPid(ContinuousLaw):
-    """
-    F = k_p e + k_i int e dt + k_v e_dot, section 3.2.7.2.
+    """F = k_p e + k_i int e dt + k_v e_dot, section 3.2.7.2."""
 
-    Attributes
-    ----------
-    kp, kd : array_like, shape (driven,) or (driven, driven)
-        Gains, positive definite; the paper writes k_v for kd.
-    ki : array_like, shape (driven,) or (driven, driven), optional
-        Integral gain, positive semidefinite; no integral by default.
-
-    """
-
+    #: Gains, positive definite, shape (driven,) or (driven, driven); the paper writes k_v for kd.
     kp: ArrayLike
     kd: ArrayLike
-    ki: ArrayLike | None = None
+    ki: ArrayLike | None = None  #: integral gain, positive semidefinite; None: no integral
     _gains: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -224,11 +186,7 @@ class ContinuousPid(ContinuousLaw):
         del time
         x, k = self.model.checked_state(state), self.driven
         error, rate, _ = self.errors(x, goal)
-        summed = np.array(integral, dtype=float)
-        if summed.shape != (self.integrals,) or not np.isfinite(summed).all():
-            raise ShapeError(
-                f'integral must be finite with shape ({self.integrals},), got {summed.tolist()}'
-            )
+        summed = _finite('integral', integral, (self.integrals,))
         forces = np.zeros(self.model.coordinates)
         forces[:k] = self._gains[0] @ error + self._gains[1] @ rate
         if self.integrals:
@@ -241,17 +199,8 @@ class ContinuousPid(ContinuousLaw):
 def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
 ) -> FloatArray:
-    """
-    Return q_ddot, shape (2 + n,): forward dynamics (16)-(17) with a force on each coordinate.
-
-    ``forces`` are f_y [N], positive into the tissue, tau [N m], and the generalized force on each
-    q_i.
-    """
-    x, applied = model.checked_state(state), np.array(forces, dtype=float)
-    if applied.shape != (model.coordinates,) or not np.isfinite(applied).all():
-        raise ShapeError(
-            f'forces must be finite with shape ({model.coordinates},), got {applied.tolist()}'
-        )
+    """Return q_ddot of (16)-(17) under `ContinuousLaw.forces`; both have shape (2 + n,)."""
+    x, applied = model.checked_state(state), _finite('forces', forces, (model.coordinates,))
     result = model.acceleration(x, float(applied[0]), float(applied[1]), time)
     if applied[_BASE:].any():
         # The mass matrix is block diagonal: forces on q1..qn do not act on the base.

@@ -6,7 +6,7 @@ from typing import Final
 
 from needle_controller.compiled.laws import INVERSE_DYNAMICS
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.settings import constant
+from needle_ros.settings import constant, positive
 
 #: Feedback at a bandwidth b: added damping as a fraction of viscous friction, bandwidth of the
 #: integral as a fraction of b, and the reduction of b to b / (1 + 5 b h). With these values the
@@ -24,10 +24,9 @@ class InverseDynamicsGains(LawGains):
 
     kp: float = constant(900.0, '1/s^2', 'position gain k_p')
     kv: float = constant(60.0, '1/s', 'velocity gain k_v')
-    breakaway_speed: float = constant(
-        1e-4, '(m or rad)/s', 'commanded speed at which Coulomb friction is fully compensated',
-        open_low=True,
-    )  # fmt: skip
+    breakaway_speed: float = positive(
+        1e-4, '(m or rad)/s', 'commanded speed at which Coulomb friction is fully compensated'
+    )
     bandwidth: float = constant(
         BANDWIDTH, '1/s', 'bandwidth of the feedback that corrects deviations from the modeled '
         'motion; 0: no feedback, as in the paper',
@@ -69,7 +68,7 @@ class InverseDynamics(Law):
     The force that starts a needle of 0.2 kg at rest towards a target 1 mm away:
 
     >>> from needle_controller import Axis, InverseDynamics, InverseDynamicsGains, Setpoint
-    >>> from needle_controller import no_memory
+    >>> from needle_controller.laws.law import no_memory
     >>> axis = Axis(inertia=0.2, viscous=300.0, coulomb=0.56)
     >>> law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=1e-3)
     >>> print(f'{law.force(0.02, 0.0, Setpoint(0.021), no_memory()):.2f} N')

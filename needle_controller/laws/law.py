@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from math import exp, inf, sqrt
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from needle_controller.compiled.laws import (
     axis_step,
@@ -32,9 +33,7 @@ import numpy as np
 #: at the end of the period if this is longer: a law then breaks away at any sample rate.
 BREAKAWAY_TIME: Final = 1e-3
 
-#: Time constant with which the force offset after a switch of laws fades [s].
-HANDOVER_TIME: Final = 0.1
-
+HANDOVER_TIME: Final = 0.1  #: Time constant of the force offset after a switch of laws [s].
 
 #: Learned corrections with units, in the order of `needle_controller.compiled.learning`.
 _TERMS: Final = {
@@ -45,13 +44,12 @@ _TERMS: Final = {
 
 
 def no_memory() -> FloatArray:
-    """Return the initial memory of a law, `MEMORY` zeros."""
     return np.zeros(MEMORY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains(CheckedSettings):
-    """Gains of a law on one axis: `scaled` applies to kp, ki, kd, kv and bandwidth only."""
+    """Gains of a law on one axis."""
 
     def scaled(self, factor: float) -> LawGains:
         """Return a copy with kp, ki, kd, kv and bandwidth multiplied by a positive factor."""
@@ -63,6 +61,8 @@ class LawGains(CheckedSettings):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Law:
     """Sampled control law on one axis; its memory is stored by its loop."""
+
+    LINEAR: ClassVar[Mapping[str, Any]] = {}  #: Gains that make the law linear.
 
     axis: Axis  #: nominal model of the axis
     gains: LawGains
@@ -104,69 +104,33 @@ class Law:
         load: float = 0.0,
     ) -> float:
         """
-        Return the force for the next period, before any limit.
+        Return the force for the next period, before any limit [N].
 
-        Parameters
-        ----------
-        position, velocity : float
-            Position and velocity of the axis.
-        setpoint : Setpoint
-            Setpoint.
-        memory : ndarray, shape (MEMORY,)
-            As from `no_memory`.
-        load : float
-            Known force against the motion [N].
-
-        Returns
-        -------
-        float
-            Force [N].
-
+        The memory, shape (MEMORY,), is as from `no_memory`; ``load`` is a known force against the
+        motion [N].
         """
         return law_force(self.packed, memory, _instant(position, velocity, setpoint), float(load))
 
     def linear(self) -> Law:
-        """Return the law without Coulomb friction, for its poles."""
-        return replace(self, axis=self.axis.without_coulomb())
+        """Return the law for its poles: without Coulomb friction, and with the gains `LINEAR`."""
+        gains = replace(self.gains, **self.LINEAR)
+        return replace(self, axis=self.axis.without_coulomb(), gains=gains)
 
     def scaled(self, factor: float) -> Law:
-        """
-        Return the law with all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            The factor, positive.
-
-        Returns
-        -------
-        Law
-            The law, of the same class.
-
-        """
+        """Return the law with all gains multiplied by a positive factor."""
         return replace(self, gains=self.gains.scaled(factor))
 
 
 def _instant(position: float, velocity: float, setpoint: Setpoint) -> tuple[float, ...]:
-    """Return state and setpoint as the plain tuple of `Instant`."""
     return float(position), float(velocity), *setpoint
 
 
 class SampledLoop:
     """
-    Sampled law with delay compensation and a force limit.
+    Sampled law with delay compensation and a force limit [N].
 
     A command computed from a measurement takes effect ``delay`` periods later. The law uses the
     state predicted for this time from the pending commands.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect.
-    limit : float
-        Largest force [N].
     """
 
     def __init__(self, law: Law, delay: int, limit: float) -> None:
@@ -175,10 +139,8 @@ class SampledLoop:
         #: Commands without effect so far [N].
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
-        #: Last command [N].
-        self.last = 0.0
-        #: Force of the period that starts now [N].
-        self._acts = 0.0
+        self.last = 0.0  #: Last command [N].
+        self._acts = 0.0  #: Force of the period that starts now [N].
         self._take_over = False
 
     def stop(self) -> None:
@@ -195,20 +157,7 @@ class SampledLoop:
         self.memory[:] = 0.0
 
     def switch(self, law: Law) -> None:
-        """
-        Continue with another law of the same period; its first force equals the last force.
-
-        Parameters
-        ----------
-        law : Law
-            New law.
-
-        Raises
-        ------
-        ParameterError
-            If its period differs.
-
-        """
+        """Continue with another law of the same period; its first force equals the last force."""
         if law.period != self.law.period:
             raise ParameterError(
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
@@ -241,24 +190,9 @@ class SampledLoop:
         self, position: float, velocity: float, setpoint: Setpoint, load: float = 0.0
     ) -> float:
         """
-        Return the force to apply, within the limit [N]; see `Law.force`.
+        Return the force to apply, within the limit [N] or [N m]; see `Law.force`.
 
-        The state is measured now; the setpoint is for the time of the effect of the command.
-
-        Parameters
-        ----------
-        position, velocity : float
-            Measured position and velocity of the axis [m, m/s] or [rad, rad/s].
-        setpoint : Setpoint
-            Setpoint at the time of the effect of the command.
-        load : float
-            Known force against the motion, added by the law [N] or [N m].
-
-        Returns
-        -------
-        float
-            Force [N] or torque [N m].
-
+        Position and velocity are measured now; the setpoint is for the effect of the command.
         """
         law, load = self.law, float(load)
         law_learn(law.packed, self.memory, float(position), float(velocity), self._acts - load)

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """PID control, section 3.2.7.2 of the paper, in implicit sampled form."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
 
 from needle_controller.compiled.laws import PID
 from needle_controller.laws.law import Law, LawGains
-from needle_ros.settings import choice, constant, flag
+from needle_ros.settings import choice, constant, flag, positive
 
 #: Methods against integrator windup by name.
 ANTI_WINDUP: Final = ('conditional', 'back_calculation')
@@ -28,12 +27,13 @@ class PidGains(LawGains):
         0.0, 's', 'time constant of the low-pass filter of the error rate; 0 for none'
     )
     anti_windup: str = choice('conditional', ANTI_WINDUP)
-    tracking_time: float = constant(0.2, 's', 'time constant of back_calculation', open_low=True)
+    tracking_time: float = positive(0.2, 's', 'time constant of back_calculation')
     feed_forward: bool = flag(False, 'add the force of the reference motion on the modeled axis')
-    breakaway_speed: float = constant(
-        1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward fully includes '
-        'Coulomb friction', open_low=True,
-    )  # fmt: skip
+    breakaway_speed: float = positive(
+        1e-4,
+        '(m or rad)/s',
+        'speed of the reference at which feed_forward fully includes Coulomb friction',
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,13 +56,16 @@ class Pid(Law):
     --------
     The force on a needle of 0.2 kg at rest, 1 mm from its target:
 
-    >>> from needle_controller import Axis, no_memory, Pid, PidGains, Setpoint
+    >>> from needle_controller import Axis, Pid, PidGains, Setpoint
+    >>> from needle_controller.laws.law import no_memory
     >>> axis = Axis(inertia=0.2, viscous=300.0, coulomb=0.56)
     >>> law = Pid(axis=axis, gains=PidGains(), period=1e-3)
     >>> print(f'{law.force(0.02, 0.0, Setpoint(0.021), no_memory()):.2f} N')
     4.75 N
 
     """
+
+    LINEAR: ClassVar[Mapping[str, Any]] = {'tolerance': 0.0}
 
     gains: PidGains
 
@@ -80,10 +83,4 @@ class Pid(Law):
             # Implicit: stable for every tracking time.
             tracking=h / (gains.tracking_time + h) if tracks else 0.0,
             feed_forward=gains.feed_forward,
-        )
-
-    def linear(self) -> Pid:
-        """Return the law without Coulomb friction and tolerance; see `Law.linear`."""
-        return replace(
-            self, axis=self.axis.without_coulomb(), gains=replace(self.gains, tolerance=0.0)
         )

@@ -27,22 +27,7 @@ class Consistency:
 
     @classmethod
     def of(cls, total: float, degrees: int) -> Consistency:
-        """
-        Compute the ratio and band of a sum of NIS or NEES.
-
-        Parameters
-        ----------
-        total : float
-            The sum.
-        degrees : int
-            Number of measurements (NIS), or of runs times 2 n (NEES).
-
-        Returns
-        -------
-        Consistency
-            Ratio and band.
-
-        """
+        """Compute ratio and band of a sum of NIS, or of NEES with 2 n degrees for each run."""
         if degrees == 0:
             return cls(ratio=nan, low=0.0, high=inf, degrees=0)
         low, high = (float(chdtri(degrees, tail)) / degrees for tail in (0.975, 0.025))

@@ -40,18 +40,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _EVEN: Final = 0.01  #: Relative deviation of encoder stamps from the period that is ignored.
-
-#: Relative tolerance of the ratio of the sensor's filter rate to the sample rate.
-_NEAR: Final = 0.1
-
+_NEAR: Final = 0.1  #: Relative tolerance of the filter rate as a multiple of the sample rate.
 _SAME: Final = 0.1  #: Largest stamp difference of a wrench and its encoder sample, in periods.
 _WAITING: Final = 16  #: Largest number of wrenches that wait for their encoder sample.
-
-#: Largest relative overlap of exposures of the tip; above it a sample is a duplicate.
-_OVERLAP: Final = 0.1
-
-#: Largest plausible measurement [m, N or N m]; squares of larger ones overflow.
-_LARGEST: Final = 1e6
+_OVERLAP: Final = 0.1  #: Relative overlap of exposures above which a tip sample is a duplicate.
+_LARGEST: Final = 1e6  #: Largest plausible measurement; squares of larger ones overflow [SI].
 
 
 class _Encoders(NamedTuple):
@@ -76,20 +69,18 @@ class Observer:
     """
     Estimator of q1 to qn and their rates during the motion.
 
+    Depths [m], velocities [m/s] and deflections [m] are floats, stamps integers in ns on one
+    clock.
+
     Parameters
     ----------
     parameters : NeedleParameters
-        Nominal parameters of needle and tissue.
+        Nominal parameters of needle and tissue; the formulation is `complete`.
     settings : ObserverSettings
         Noise and sensors.
     period : float
-        Sample period of encoders and wrench [s].
-
-    Raises
-    ------
-    ParameterError
-        If the formulation is `as_printed`, or the period is not positive, not shorter than the
-        history, or far from a whole number of samples of the force sensor's filter.
+        Sample period of encoders and wrench [s], shorter than the history, and about a whole
+        number of samples of the force sensor's filter.
 
     """
 
@@ -131,8 +122,7 @@ class Observer:
         from needle_dynamics.compiled.boxed import Boxed
 
         self._boxed = Boxed(self._filter)
-        #: Computed when it is needed.
-        self._estimate: _Estimate | None = None
+        self._estimate: _Estimate | None = None  #: Computed when it is needed.
         #: Stamp of the first sample [ns]: times of the filter are relative to it.
         self._origin: int | None = None
         #: Newest and oldest slot of the filter, and number of exposures of the tip.
@@ -153,9 +143,8 @@ class Observer:
         #: that are not finite, repeated, older than the history, far ahead of the encoders, or (a
         #: wrench) between encoder samples.
         self.refused = 0
-        #: Number of automatic restarts, and reason of the last one.
-        self.restarts = 0
-        self.warning: str | None = None
+        self.restarts = 0  #: Number of automatic restarts.
+        self.warning: str | None = None  #: Reason of the last restart.
         self._last: _Encoders | None = None
         self._waiting: list[tuple[int, float, float]] = []
 
@@ -167,28 +156,12 @@ class Observer:
         """
         Process a sample of the encoders, and optionally of the base wrench.
 
-        The observer starts at the first sample, without its wrench. A gap is bridged at constant
-        velocity. A gap longer than the history, a clock set back by more than the history, or a
-        jump of depth restarts the observer with a `warning`.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the sample [ns]. Steps within 1 % of the period count as one period.
-        depth, velocity : float
-            Insertion depth [m] and velocity [m/s], positive into the tissue.
-        wrench : tuple of float, optional
-            Lateral force along z [N] and moment about x at the base [N m], less any torque that
-            turns the base; nan for a missing component.
-
-        Raises
-        ------
-        ParameterError
-            If the stamp is not an integer, depth or velocity is not finite, or the speed is
-            implausible; the estimate does not change.
-        InsertionDepthError
-            If the depth is outside its range; the estimate does not change.
-
+        The observer starts at the first sample, without its wrench. Steps within 1 % of the period
+        count as one period. A gap is bridged at constant velocity. A gap longer than the history,
+        a clock set back by more than the history, or a jump of depth restarts the observer with a
+        `warning`. The wrench is the lateral force along z [N] and the moment about x at the base
+        [N m], less any torque that turns the base; nan for a missing component. An invalid sample
+        raises `ParameterError` or `InsertionDepthError`, and the estimate does not change.
         """
         needle = self._filter.needle
         fastest = needle.length / self.period
@@ -234,18 +207,7 @@ class Observer:
         return (_checked(stamp) - (self._origin or 0)) / NANOSECONDS
 
     def add_wrench(self, stamp: int, lateral: float, moment: float) -> None:
-        """
-        Process a base wrench that arrives separately from the encoder sample of the same time.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the wrench [ns], on the clock of `update`: the time of an encoder sample, which
-            may arrive later.
-        lateral, moment : float
-            As for `update`; nan if missing.
-
-        """
+        """Process a base wrench that arrives apart from the encoder sample of its stamp [ns]."""
         time, lateral, moment = self._seconds(stamp), _finite(lateral), _finite(moment)
         if self._last is None or not (isfinite(lateral) or isfinite(moment)):
             self.refused += 1
@@ -267,19 +229,13 @@ class Observer:
 
     def add_tip(self, stamp: int, deflection: float) -> None:
         """
-        Process a sample of the tip deflection, with any delay within the history.
+        Process a mean tip deflection [m], with any delay within the history.
 
-        Parameters
-        ----------
-        stamp : int
-            End of the exposure [ns], plus ``tip_latency``, on the clock of `update`. It may be
-            later than the last encoder sample, and earlier than previous tip samples.
-        deflection : float
-            Mean deflection over the exposure [m].
-
+        The stamp [ns] is the end of the exposure plus ``tip_latency``. It may be later than the
+        last encoder sample, and earlier than previous tip samples.
         """
         end = self._seconds(stamp) - self.settings.tip_latency
-        if self._last is None or not isfinite(_finite(deflection)):
+        if self._last is None or not abs(deflection) <= _LARGEST:
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
@@ -350,7 +306,6 @@ class Observer:
     # Estimates.
 
     def _estimated(self) -> _Estimate:
-        """Return the present estimate, computed once for each sample."""
         if self._last is None:
             raise NeedleError('the observer has no estimate before the first encoder sample')
         if self._estimate is None:
@@ -388,11 +343,10 @@ class Observer:
     @property
     def load(self) -> float:
         """
-        Force of the bent needle against insertion [N], to be added by inverse dynamics.
+        Force of the bent needle against insertion [N]: row d of the bias forces (13), reversed.
 
-        It is row d of the bias forces (13) with reversed sign. Modes above half the sample rate
-        are left out: the estimates of their rates are noise, and the load depends on the square of
-        the rates.
+        Modes above half the sample rate are left out: the estimates of their rates are noise, and
+        the load depends on the square of the rates.
         """
         return self._estimated().load
 
@@ -405,11 +359,7 @@ class Observer:
 
     @property
     def nis(self) -> Consistency:
-        """
-        Consistency of the measurements over the history: normalized innovations squared.
-
-        Each innovation is relative to all measurements of earlier times, including late arrivals.
-        """
+        """NIS over the history: innovations relative to all earlier measurements, also late."""
         if self._last is None:
             return Consistency.of(0.0, 0)
         slots, first = len(self._filter.samples), self._oldest
@@ -418,25 +368,7 @@ class Observer:
         return Consistency.of(float(samples['nis'].sum()), round(samples['degrees'].sum()))
 
     def nees(self, modal: ArrayLike, rates: ArrayLike) -> float:
-        """
-        Return the normalized estimation error squared (NEES) against the ground truth.
-
-        Parameters
-        ----------
-        modal, rates : array_like, shape (n,)
-            True modal coordinates and rates.
-
-        Returns
-        -------
-        float
-            Distributed as chi^2 with 2 n degrees of freedom if the filter is consistent.
-
-        Raises
-        ------
-        ShapeError
-            If a shape is wrong.
-
-        """
+        """Return NEES of true modal coordinates and rates, (n,) each: chi^2 of 2 n degrees."""
         truth = np.concatenate([np.asarray(modal, dtype=float), np.asarray(rates, dtype=float)])
         estimated = self._estimated()
         if truth.shape != estimated.modal.shape:

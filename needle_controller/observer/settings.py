@@ -11,7 +11,7 @@ from needle_dynamics import FloatArray
 from needle_dynamics.simulated.force_sensor import ForceSensorParameters, low_pass
 from needle_dynamics.simulated.tip_sensor import TipParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, positive
 import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
 
@@ -53,7 +53,6 @@ def _low_pass(
 
 
 def _of_sensor(name: str, channel: int) -> float:
-    """Return a constant of the default force sensor of the plant."""
     return float(_SENSOR.per_axis(name)[channel])
 
 
@@ -65,11 +64,7 @@ def _read_noise(channel: int, digits: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverSettings:
-    """
-    Assumptions of the observer on sensors and tissue in addition to `NeedleParameters`.
-
-    The defaults match the default sensors of the plant.
-    """
+    """Assumed sensors and tissue, beyond `NeedleParameters`; by default those of the plant."""
 
     irregularity: float = constant(
         1e-3, 'N s^(1/2) m^(-1/2)',
@@ -77,29 +72,27 @@ class ObserverSettings:
         'for the model error of the tissue (the default covers a stiffness error of 30 % '
         'down to half the needle)',
     )  # fmt: skip
-    initial_deflection: float = constant(
-        1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
+    initial_deflection: float = positive(
+        1e-3, 'm', 'standard deviation of the tip deflection at the start'
     )
     tip_force: float = constant(
         0.5, 'N', 'standard deviation of a lateral force at the tip, such as a bevel load'
     )
-    tip_force_time: float = constant(1000.0, 's', 'correlation time of this force', open_low=True)
-    tip_noise: float = constant(
-        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
-        open_low=True,
-    )  # fmt: skip
-    tip_exposure: float = constant(
-        1e-3, 's', 'exposure before the stamp over which a tip sample is the mean', open_low=True
+    tip_force_time: float = positive(1000.0, 's', 'correlation time of this force')
+    tip_noise: float = positive(
+        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection'
+    )
+    tip_exposure: float = positive(
+        1e-3, 's', 'exposure before the stamp over which a tip sample is the mean'
     )
     tip_latency: float = constant(
         0.0, 's', 'time from the end of the exposure to the stamp of a tip sample', high=1.0
     )
-    force_noise: float = constant(
-        _read_noise(2, 6), 'N', 'standard deviation of the measured lateral force',
-        open_low=True,
-    )  # fmt: skip
-    torque_noise: float = constant(
-        _read_noise(3, 8), 'N m', 'standard deviation of the measured moment', open_low=True
+    force_noise: float = positive(
+        _read_noise(2, 6), 'N', 'standard deviation of the measured lateral force'
+    )
+    torque_noise: float = positive(
+        _read_noise(3, 8), 'N m', 'standard deviation of the measured moment'
     )
     force_offset: float = constant(
         0.01, 'N', 'standard deviation of the offset of the measured lateral force'
@@ -107,7 +100,7 @@ class ObserverSettings:
     torque_offset: float = constant(
         1e-3, 'N m', 'standard deviation of the offset of the measured moment'
     )
-    offset_time: float = constant(1000.0, 's', 'correlation time of these offsets', open_low=True)
+    offset_time: float = positive(1000.0, 's', 'correlation time of these offsets')
     force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
     torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
     cutoffs: tuple[float, ...] = field(
@@ -117,17 +110,13 @@ class ObserverSettings:
             '(Butterworth, second order) [Hz]'
         },
     )
-    filter_rate: float = constant(
-        _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input',
-        open_low=True,
-    )  # fmt: skip
-    history: float = constant(
-        0.3, 's', 'largest age of a late tip sample; longer gaps restart the observer',
-        open_low=True, high=10.0,
-    )  # fmt: skip
-    jump: float = constant(
-        5e-3, 'm', 'change of depth between samples that restarts the observer', open_low=True
+    filter_rate: float = positive(
+        _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input'
     )
+    history: float = positive(
+        0.3, 's', 'largest age of a late tip sample; longer gaps restart the observer', high=10.0
+    )
+    jump: float = positive(5e-3, 'm', 'change of depth between samples that restarts the observer')
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -151,37 +140,17 @@ class ObserverSettings:
         }
 
     def noise(self) -> Noise:
-        """Return the variances of the filter."""
         gain = _low_pass(self.cutoffs, self.filter_rate)[3]
         # A count of the reading is uniform rounding.
         counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
         white = (self.force_noise / gain) ** 2, (self.torque_noise / gain) ** 2
-        offsets = self.force_offset**2, self.torque_offset**2
-        return Noise(
-            self.irregularity**2,
-            self.initial_deflection**2,
-            self.tip_noise**2,
-            counts,
-            white,
-            (self.tip_force**2, *offsets),
-            (1.0 / self.tip_force_time, 1.0 / self.offset_time, 1.0 / self.offset_time),
-        )
+        loads = self.tip_force**2, self.force_offset**2, self.torque_offset**2
+        decays = 1.0 / self.tip_force_time, 1.0 / self.offset_time, 1.0 / self.offset_time
+        density, start = self.irregularity**2, self.initial_deflection**2
+        return Noise(density, start, self.tip_noise**2, counts, white, loads, decays)
 
     def low_pass(self, ticks: int) -> LowPass:
-        """
-        Return the low-pass of the wrench over a sample.
-
-        Parameters
-        ----------
-        ticks : int
-            Samples of the force sensor in a sample of the observer.
-
-        Returns
-        -------
-        LowPass
-            Transition, noise and responses over this number of samples.
-
-        """
+        """Return the low-pass of the wrench over a number of samples of the force sensor."""
         transition, drive, steady, _ = _low_pass(self.cutoffs, self.filter_rate)
         response = np.empty((ticks, len(drive)))
         response[0] = drive

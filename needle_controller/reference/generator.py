@@ -34,12 +34,10 @@ class ReferenceGenerator:
         self.limits, self._depths = limits, depths
         self._motion: Reference | None = None
         self._start = self.now = 0.0
-        #: Elapsed time of the path at the last change [s].
-        self._passed = 0.0
+        self._passed = 0.0  #: Elapsed time of the path at the last change [s].
         self.forget()
 
     def forget(self) -> None:
-        """Discard target, path and pause."""
         #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
         self._path: Path | None = None

@@ -31,11 +31,7 @@ class ReferenceHold:
         self._error, self._blind, self._reports, self.missing = 0.0, False, False, False
 
     def measure(self, sample: tuple[float, ...], age: float, friction: float) -> bool:
-        """
-        Process time, depth, velocity and reported force of an age [s], and the dry friction [N].
-
-        Returns whether the law must restart at the measurement.
-        """
+        """Process time, depth, velocity and force of an age [s]; return whether to restart."""
         guide, missing, (time, depth, velocity, reported) = self._guide, self.missing, sample
         # Measurements that are always late or rare are no gap.
         before, self._late = self._late, max(time - guide.now, age)

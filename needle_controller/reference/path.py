@@ -37,26 +37,6 @@ class Path:
         limits: ReferenceLimits,
         depths: tuple[float, float],
     ) -> None:
-        self._check(times, positions, velocities, depths)
-        #: Start time, position, velocity, acceleration and jerk of each piece.
-        self._pieces: list[tuple[float, float, float, float, float]] = []
-        #: Times of the first point and of the end [s], and insertion depth at the end [m].
-        self.begin, self.end, self.last = float(times[0]), float(times[-1]), float(positions[-1])
-        self.depths = depths
-        if velocities is None:
-            self._join_lines(times, positions, limits)
-        else:
-            self._join_cubics(times, positions, velocities, limits)
-        self._starts = np.array([piece[0] for piece in self._pieces])
-
-    @staticmethod
-    def _check(
-        times: Sequence[float],
-        positions: Sequence[float],
-        velocities: Sequence[float] | None,
-        depths: tuple[float, float],
-    ) -> None:
-        """Reject points that are missing, not finite, out of order or out of range."""
         if not times or len(times) != len(positions):
             raise ParameterError(
                 f'path needs one position for each of at least one time, got {len(positions)} '
@@ -75,11 +55,19 @@ class Path:
             raise ParameterError(
                 f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
             )
+        #: Start time, position, velocity, acceleration and jerk of each piece.
+        self._pieces: list[tuple[float, float, float, float, float]] = []
+        #: Times of the first point and of the end [s], and insertion depth at the end [m].
+        self.begin, self.end, self.last = float(times[0]), float(times[-1]), float(positions[-1])
+        self.depths, self._limits = depths, limits
+        if velocities is None:
+            self._join_lines(times, positions)
+        else:
+            self._join_cubics(times, positions, velocities)
+        self._starts = np.array([piece[0] for piece in self._pieces])
 
-    def _join_lines(
-        self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
-    ) -> None:
-        """Build the pieces from lines joined by parabolas."""
+    def _join_lines(self, times: Sequence[float], positions: Sequence[float]) -> None:
+        limits = self._limits
         slopes = [*(np.diff(positions) / np.diff(times)).tolist(), 0.0]
         # At the first point the velocity equals the slope of the first line.
         velocity, free = slopes[0], times[0]
@@ -105,16 +93,11 @@ class Path:
         self._pieces[-1] = (free, positions[-1], 0.0, 0.0, 0.0)
 
     def _join_cubics(
-        self,
-        times: Sequence[float],
-        positions: Sequence[float],
-        velocities: Sequence[float],
-        limits: ReferenceLimits,
+        self, times: Sequence[float], positions: Sequence[float], velocities: Sequence[float]
     ) -> None:
-        """Build the pieces from cubics."""
         if velocities[-1] != 0.0:
             raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
-        low, high = self.depths
+        (low, high), limits = self.depths, self._limits
         for k in range(len(times) - 1):
             t = times[k + 1] - times[k]
             p, d, v0, v1 = positions[k], positions[k + 1] - positions[k], *velocities[k : k + 2]
@@ -182,8 +165,7 @@ class Joined(Reference):
         self._joining = joining
         self._halting = self._halt.duration if self._halt else 0.0
         self._joined = self._halting + (joining.duration if joining else 0.0)
-        #: Time of this motion at time zero of the path [s].
-        self.offset = self._joined - entry
+        self.offset = self._joined - entry  #: Time of this motion at time zero of the path [s].
         self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:
@@ -197,11 +179,7 @@ class Joined(Reference):
 
 
 def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float]) -> Reference:
-    """
-    Return the shortest motion to rest, without a limit of jerk.
-
-    It exceeds the acceleration limit only where the range of depths ends before.
-    """
+    """Return the shortest motion to rest; the end of the range may need more acceleration."""
     low, high = depths
     stop = start.position + 0.5 * start.velocity * abs(start.velocity) / limits.acceleration
     slack = ROUNDING * (high - low)

@@ -93,6 +93,7 @@ class MinimumJerk(Reference):
         Limits; values that the start already exceeds are allowed.
     depths : tuple of float
         Lowest and highest position of the motion [m]; the start is always allowed.
+
     """
 
     def __init__(

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import CheckedSettings, positive
 
 ROUNDING: Final = 1e-9  #: Relative rounding error by which a limit may be exceeded.
 SHORTEST: Final = 1e-3  #: Shortest duration of a motion [s].
@@ -23,10 +23,8 @@ class Setpoint(NamedTuple):
 class ReferenceLimits(CheckedSettings):
     """Limits of a reference."""
 
-    speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
-    acceleration: float = constant(
-        0.1, 'm/s^2', 'highest acceleration of the reference', open_low=True
-    )
+    speed: float = positive(0.01, 'm/s', 'highest speed of the reference')
+    acceleration: float = positive(0.1, 'm/s^2', 'highest acceleration of the reference')
 
 
 class Reference(Protocol):
@@ -35,20 +33,7 @@ class Reference(Protocol):
     duration: float  #: Duration of the motion [s].
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time.
-
-        Parameters
-        ----------
-        time : float
-            Time since the start [s]. Before the start and after the end the reference rests.
-
-        Returns
-        -------
-        Setpoint
-            Desired position, velocity and acceleration.
-
-        """
+        """Return the setpoint at a time since the start [s]; it rests before and after."""
 
 
 def around(depths: tuple[float, float], start: Setpoint) -> tuple[float, float]:

@@ -9,8 +9,7 @@ from needle_controller.controller import Measurement
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import euler_loads, NeedleParameters
 
-#: Readings in a row beyond a limit that violate it: a single one may be a sensor fault.
-_IN_A_ROW: Final = 2
+_IN_A_ROW: Final = 2  #: Readings in a row that violate a limit: one may be a sensor fault.
 
 
 def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:
@@ -25,7 +24,6 @@ def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -
 
 
 def _measured(value: float) -> float:
-    """Return zero for a value that is not measured, NaN."""
     return 0.0 if isnan(value) else value
 
 
@@ -33,13 +31,8 @@ class Guard:
     """
     Compare measurements with the limits; two readings in a row beyond a limit violate it.
 
-    Parameters
-    ----------
-    limits : SafetyLimits
-        Limits.
-    depths : tuple of float
-        Least and largest insertion depth to control [m].
-
+    ``depths`` are the least and largest insertion depth to control [m]. Each check returns the
+    description of a violated limit, or None.
     """
 
     def __init__(self, limits: SafetyLimits, depths: tuple[float, float]) -> None:
@@ -68,32 +61,11 @@ class Guard:
         return line if count >= _IN_A_ROW else None
 
     def is_beyond(self, topic: str) -> bool:
-        """
-        Return whether the last reading of a topic is beyond a limit, also a single reading.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        """
+        """Return whether the last reading of a topic is beyond a limit, also a single reading."""
         return topic in self._beyond
 
     def encoders(self, measured: Measurement) -> str | None:
-        """
-        Check the encoder measurements against their limits.
-
-        Parameters
-        ----------
-        measured : Measurement
-            Insertion depth, angle and their velocities.
-
-        Returns
-        -------
-        str or None
-            Description of the violated limit; None within the limits.
-
-        """
+        """Check insertion depth, angle and their velocities."""
         low, high = self._depths
         depth, limits = measured.depth, self.limits
         if not low <= depth <= high:
@@ -111,39 +83,12 @@ class Guard:
         )  # fmt: skip
 
     def tracking(self, error: float) -> str | None:
-        """
-        Check the tracking error against its limit.
-
-        Parameters
-        ----------
-        error : float
-            Distance from the reference [m].
-
-        Returns
-        -------
-        str or None
-            Description of the violated limit; None within the limit.
-
-        """
+        """Check the distance from the reference [m]."""
         limit = self.limits.tracking_error
         return self._hold('reference', ('tracking error', error, limit, 'm', 'tracking_error'))
 
     def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
-        """
-        Check the forces and the torques on the sensor against their limits.
-
-        Parameters
-        ----------
-        force, torque : sequence of float
-            Components x, y and z [N, N m]; y is along the needle. A component that is not
-            measured, NaN, counts as zero.
-
-        Returns
-        -------
-        str or None
-            Description of the violated limit; None within the limits.
-
-        """
+        """Check force [N] and torque [N m] along x, y (needle) and z; NaN counts as zero."""
         x, axial, z = map(_measured, force)
         around_x, torsion, around_z = map(_measured, torque)
         lateral, moment = hypot(x, z), hypot(around_x, around_z)
@@ -156,20 +101,7 @@ class Guard:
         )
 
     def tip(self, deflection: float, depth: float = nan, lateral: float = 0.0) -> str | None:
-        """
-        Check deflection and depth of the tip against their limit.
-
-        Parameters
-        ----------
-        deflection, depth, lateral : float
-            Position of the tip along z, y and x [m]; NaN if it is not measured.
-
-        Returns
-        -------
-        str or None
-            Description of the violated limit; None within the limit.
-
-        """
+        """Check the position of the tip along z, y and x [m]; NaN if it is not measured."""
         limit = self.limits.tip_deflection
         low, high = self._depths
         outside = max(_measured(low - depth), _measured(depth - high), 0.0)
@@ -181,15 +113,7 @@ class Guard:
         )  # fmt: skip
 
     def forget(self, topic: str) -> None:
-        """
-        Discard the last reading of a topic.
-
-        Parameters
-        ----------
-        topic : str
-            The topic.
-
-        """
+        """Discard the last reading of a topic."""
         self._beyond.pop(topic, None)
 
     @property

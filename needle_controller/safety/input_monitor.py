@@ -35,41 +35,17 @@ class Refusal(NamedTuple):
 
 class InputMonitor:
     """
-    Check the messages of one topic.
+    Check the messages of one topic; stamps and times are in ns.
 
-    Parameters
-    ----------
-    name : str
-        Topic.
-    timeout : float
-        Age from which a message is stale [s]; also the largest lead of its stamp.
-    frames : sequence of str
-        Valid frames; none: any.
-    jumps : sequence of float
-        Change of each value between two messages that is implausible.
-    noise : sequence of float
-        Noise of each value: a noisy stream with constant values is frozen. None: constant values
-        are valid.
-    ahead : float, optional
-        Largest lead of a stamp [s]; by default the timeout.
+    A message is stale from the age ``timeout`` on, or if its stamp leads by more than ``ahead``,
+    by default the timeout [s]. ``frames`` are the valid frames, none: any. ``jumps`` are the
+    implausible changes of each value between two messages. ``noise`` is the noise of each value: a
+    noisy stream with constant values is ``frozen``; without noise, constant values are valid.
 
-    Attributes
-    ----------
-    last : int
-        Stamp of the newest message that was in time [ns], -1 before the first.
-    step : int
-        Time between that message and the one before [ns].
-    counted : int or None
-        Time at which the last valid message was received [ns].
-    counts : Counter
-        Messages by result of the check.
-    frozen : bool
-        Whether a noisy stream has had the same values for longer than the timeout.
-    publishers : int
-        Number of nodes that publish the topic. With several publishers no message is valid.
-    window : RateCounter
-        Messages, with a mark for messages out of order.
-
+    ``last`` is the stamp of the newest message that was in time, -1 before the first, and ``step``
+    the time since the message before. ``counted`` is the time at which the last valid message was
+    received, and ``counts`` the messages by result of the check. With several ``publishers`` no
+    message is valid. ``window`` counts messages, and marks those out of order.
     """
 
     def __init__(
@@ -104,24 +80,7 @@ class InputMonitor:
     def check(
         self, stamp: int, now: int, frame: str = '', values: Sequence[float] = ()
     ) -> Refusal | None:
-        """
-        Check a message.
-
-        Parameters
-        ----------
-        stamp, now : int
-            Stamp of the message, and the present time [ns].
-        frame : str
-            Frame of the message.
-        values : sequence of float
-            Values of the message, always as many.
-
-        Returns
-        -------
-        Refusal or None
-            None for a valid message.
-
-        """
+        """Check stamp, frame and values, always as many; None for a valid message."""
         refusal = self._judge(stamp, now, frame, values)
         self.window.add(now, refusal is not None and refusal.kind == DROPPED)
         if refusal is None:
@@ -179,27 +138,10 @@ class InputMonitor:
         return None
 
     def silence(self, now: int) -> float:
-        """
-        Return the time since the last valid message [s]; zero before the first.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Return the time since the last valid message [s]; zero before the first."""
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
     def status(self, now: int) -> InputStatus:
-        """
-        Return rate, age and counts.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
         counted = (ACCEPTED, REPEATED, DROPPED)
         return InputStatus(
             rate=self.window.rate(now),

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 
-from needle_ros.settings import CheckedSettings, constant, flag
+from needle_ros.settings import CheckedSettings, constant, flag, positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,58 +15,51 @@ class SafetyLimits(CheckedSettings):
     presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has almost no friction.
     """
 
-    speed: float = constant(
-        0.1, 'm/s', 'largest insertion speed, in both directions', open_low=True
-    )
-    tracking_error: float = constant(
-        0.01, 'm', 'largest distance of the needle from the reference', open_low=True
+    speed: float = positive(0.1, 'm/s', 'largest insertion speed, in both directions')
+    tracking_error: float = positive(
+        0.01, 'm', 'largest distance of the needle from the reference'
     )
     depth_tolerance: float = constant(
         2e-3, 'm', 'allowed insertion depth beyond lowest_depth and highest_depth'
     )
-    angular_speed: float = constant(
-        100.0, 'rad/s', 'largest angular speed of the base, in both directions', open_low=True
+    angular_speed: float = positive(
+        100.0, 'rad/s', 'largest angular speed of the base, in both directions'
     )
-    angle: float = constant(
-        1000.0, 'rad', 'largest angle of the base, in both directions', open_low=True
-    )
-    tip_deflection: float = constant(
+    angle: float = positive(1000.0, 'rad', 'largest angle of the base, in both directions')
+    tip_deflection: float = positive(
         0.05,
         'm',
         'largest deflection of the tip in any direction, and distance of its depth '
         'from the range of depths',
-        open_low=True,
     )
-    axial_load: float = constant(
-        30.0, 'N', 'largest axial force on the force sensor, in both directions', open_low=True
+    axial_load: float = positive(
+        30.0, 'N', 'largest axial force on the force sensor, in both directions'
     )
-    lateral_load: float = constant(
-        10.0, 'N', 'largest lateral force on the force sensor, in any direction', open_low=True
+    lateral_load: float = positive(
+        10.0, 'N', 'largest lateral force on the force sensor, in any direction'
     )
-    moment_load: float = constant(
-        1.0, 'N m', 'largest bending moment on the force sensor, in any direction', open_low=True
+    moment_load: float = positive(
+        1.0, 'N m', 'largest bending moment on the force sensor, in any direction'
     )
-    torsion_load: float = constant(
-        1.0, 'N m', 'largest torque about the needle on the force sensor, in both directions',
-        open_low=True,
-    )  # fmt: skip
-    tip_jump: float = constant(
-        0.02, 'm', 'change of tip_deflection between two samples that is a sensor fault',
-        open_low=True,
-    )  # fmt: skip
-    lateral_jump: float = constant(
-        5.0, 'N', 'change of the lateral force between two samples that is a sensor fault',
-        open_low=True,
-    )  # fmt: skip
-    moment_jump: float = constant(
-        0.5, 'N m', 'change of the moment between two samples that is a sensor fault',
-        open_low=True,
-    )  # fmt: skip
-    sensor_timeout: float = constant(
-        1.0, 's', 'age at which base_wrench and tip_deflection are stale; time without a '
+    torsion_load: float = positive(
+        1.0, 'N m', 'largest torque about the needle on the force sensor, in both directions'
+    )
+    tip_jump: float = positive(
+        0.02, 'm', 'change of tip_deflection between two samples that is a sensor fault'
+    )
+    lateral_jump: float = positive(
+        5.0, 'N', 'change of the lateral force between two samples that is a sensor fault'
+    )
+    moment_jump: float = positive(
+        0.5, 'N m', 'change of the moment between two samples that is a sensor fault'
+    )
+    sensor_timeout: float = positive(
+        1.0,
+        's',
+        'age at which base_wrench and tip_deflection are stale; time without a '
         'reading, or without a change of a noisy reading, that is reported',
-        open_low=True, high=3600.0,
-    )  # fmt: skip
+        high=3600.0,
+    )
     sensors_required: bool = flag(
         False, 'stop when base_wrench or tip_deflection, which the observer expects, are stale; '
         'else the observer continues without them',

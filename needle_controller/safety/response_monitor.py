@@ -9,19 +9,14 @@ from needle_controller.laws.axis import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 
-#: Time without response after which the plant does not follow [ns].
-_PATIENCE: Final = NANOSECONDS // 10
-
-#: Least response, as a fraction of the commanded force or of the distance of the reference.
-_NOTHING: Final = 0.1
-
+_PATIENCE: Final = NANOSECONDS // 10  #: Time without response until the plant is lost [ns].
+_NOTHING: Final = 0.1  #: Least response, as a fraction of the commanded force or distance.
+_WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 #: Friction as a multiple of the nominal one: the strongest, for a stop while the reference moves;
 #: and at rest as a multiple of the observed one, which is between these bounds.
 _STRONGER, _WEAKER = 1.5, 0.7
 _OBSERVED: Final = 0.1, 4.0
-
-_WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 
 class _Mark(NamedTuple):
@@ -56,8 +51,7 @@ class StallMonitor:
         self.relaxed = False
         self._stamp: int | None = None
         self._begin(0.0)
-        #: Message at the measurement where ``relaxed`` begins.
-        self.notice: str | None = None
+        self.notice: str | None = None  #: Message at the measurement where ``relaxed`` begins.
         #: Force that holds the needle against an unknown load while the reference rests [N].
         self._holding = 0.0
         self._learn()
@@ -67,17 +61,14 @@ class StallMonitor:
         self._depth, self._velocity, self._expected = depth, 0.0, 0.0
 
     def change(self, axis: Axis) -> None:
-        """Continue with another nominal friction."""
         self.axis = axis
         self._learn()
 
     def _learn(self) -> None:
         """Observe the friction from the next measurement on."""
-        #: Friction in the last motion, as a multiple of the nominal one.
-        self._friction = 1.0
+        self._friction = 1.0  #: Friction in the last motion, as a multiple of the nominal one.
         self._mark: _Mark | None = None
-        #: Impulse since the mark [N s].
-        self._impulse = 0.0
+        self._impulse = 0.0  #: Impulse since the mark [N s].
 
     def _observe(self, stamp: int, depth: float, impulse: float) -> None:
         """Compare the mean force of a displacement with the nominal friction."""
@@ -98,14 +89,7 @@ class StallMonitor:
     def update(
         self, stamp: int, depth: float, rate: float, force: float, load: float
     ) -> str | None:
-        """
-        Process a measurement at a stamp [ns] and the force [N] that acted before it.
-
-        Takes insertion depth [m], velocity of the reference [m/s] and the known load against the
-        force [N].
-
-        Returns the fault, or None.
-        """
+        """Process depth [m], velocity of the reference [m/s], and force and load before it [N]."""
         before, self._stamp, self.notice = self._stamp, stamp, None
         elapsed = (stamp - before) / NANOSECONDS if before is not None else 0.0
         if not 0.0 < elapsed <= self._longest:
@@ -175,7 +159,6 @@ class ResponseMonitor:
         self.forget()
 
     def change(self, parameters: NeedleParameters) -> None:
-        """Continue with another nominal friction."""
         self._stall.change(Axis.insertion(parameters))
 
     def forget(self) -> None:
@@ -188,7 +171,6 @@ class ResponseMonitor:
 
     @property
     def relaxed(self) -> bool:
-        """Whether no force may act while the reference rests."""
         return self._stall.relaxed
 
     def update(
@@ -205,9 +187,9 @@ class ResponseMonitor:
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
-        commanded and the reported force [N], the known load against the force [N], and whether
-        the reference is a step; the reported force is NaN if the robot reports none. During a step
-        no stall is detected: the reference rests while the needle moves.
+        commanded and the reported force [N], NaN if there is none, the known load against the
+        force [N], and whether the reference is a step: it rests while the needle moves, and is no
+        stall.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
@@ -215,7 +197,7 @@ class ResponseMonitor:
             self._stall.forget()
         else:
             self.fault = self._stall.update(stamp, depth, rate, applied, load)
-        self.lost = self._follows_not(stamp, depth, rate, commanded, reported)
+        self.lost = self._is_lost(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:
             self.notice = (
@@ -224,10 +206,9 @@ class ResponseMonitor:
             )
         return self.lost
 
-    def _follows_not(
+    def _is_lost(
         self, stamp: int, depth: float, rate: float, commanded: float, reported: float
     ) -> bool:
-        """Return whether the plant does not follow."""
         # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
             self._mark = None
@@ -237,11 +218,8 @@ class ResponseMonitor:
         mark = self._mark
         elapsed = min(stamp - mark.stamp, _PATIENCE) / NANOSECONDS
         moved = abs(depth - mark.depth) > _NOTHING * abs(rate) * elapsed
-        lost = self.lost
-        if lost and moved:
-            lost, self._mark = False, None
-        elif not lost and stamp - mark.stamp > _PATIENCE:
-            lost = not moved and rate != 0.0
-            if not lost:
-                self._mark = None
+        late = stamp - mark.stamp > _PATIENCE
+        lost = not moved and (self.lost or (late and rate != 0.0))
+        if not lost and (self.lost or late):
+            self._mark = None
         return lost

@@ -10,20 +10,14 @@ from needle_controller.safety.guard import Guard
 from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.limits import SafetyLimits
 from needle_dynamics import NeedleParameters
-from needle_ros.contract import BASE
+from needle_ros.contract import BASE, ENTRY
 from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
 
-#: Topics whose absence or duplicate publishers prevent any force.
-_VITAL: Final = ('wrench_command', 'joint_states')
-
-#: Topics with messages in the order of their stamps.
-_MEASURED: Final = ('joint_states', 'ground_truth', 'base_wrench', 'tip_deflection')
-
-#: Fractions of messages out of order for a warning and for a stop; above this rate [Hz].
-_LATE: Final = 0.5
-_MIXED: Final = 0.9
-_FEW: Final = 10.0
+_VITAL: Final = ('wrench_command', 'joint_states')  #: Topics that need exactly one publisher.
+_LATE: Final = 0.5  #: Fraction of messages out of order for a warning.
+_MIXED: Final = 0.9  #: Fraction of messages out of order for a stop.
+_FEW: Final = 10.0  #: Least rate for both [Hz].
 
 
 class Safety:
@@ -45,34 +39,32 @@ class Safety:
         wrench_frame: str = BASE,
     ) -> None:
         self.limits = limits
-        #: Reason of the latched stop, and number of stops so far.
-        self.stop: str | None = None
-        self.stops = 0
+        self.stop: str | None = None  #: Reason of the latched stop.
+        self.stops = 0  #: Number of stops so far.
         #: Topics with duplicate publishers of commands or measurements.
         self.duplicate_publishers: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))
         self.saturation = RateCounter()
         noise = noise or {}
-        timeout = limits.sensor_timeout
+        #: Timeout, valid frames and implausible changes of each input.
+        inputs: dict[str, tuple[float, tuple[str, ...], tuple[float, ...]]] = {
+            'joint_states': (settings.measurement_timeout, (), ()),
+            'ground_truth': (settings.measurement_timeout, (), ()),
+            'base_wrench': (
+                limits.sensor_timeout,
+                (wrench_frame,),
+                (limits.lateral_jump, limits.moment_jump),
+            ),
+            'tip_deflection': (limits.sensor_timeout, (ENTRY,), (limits.tip_jump,)),
+        }
         # A stamp in the future would make the stamps of the true source late.
         ahead = 1.0 / settings.rate
         self.streams = {
-            stream.name: stream
-            for stream in (
-                InputMonitor('joint_states', settings.measurement_timeout, ahead=ahead),
-                InputMonitor('ground_truth', settings.measurement_timeout, ahead=ahead),
-                InputMonitor(
-                    'base_wrench', timeout, frames=(wrench_frame,),
-                    jumps=(limits.lateral_jump, limits.moment_jump),
-                    noise=noise.get('base_wrench', ()), ahead=ahead,
-                ),
-                InputMonitor(
-                    'tip_deflection', timeout, frames=('needle_entry',),
-                    jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
-                    ahead=ahead,
-                ),
+            name: InputMonitor(
+                name, timeout, frames=frames, jumps=jumps, noise=noise.get(name, ()), ahead=ahead
             )
-        }  # fmt: skip
+            for name, (timeout, frames, jumps) in inputs.items()
+        }
         self._expected = expected
         #: Start of encoder measurements without a gap [ns]; 0: no /clock yet.
         self._begun: int | None = None
@@ -110,7 +102,6 @@ class Safety:
         return reason
 
     def obstacle(self, now: int) -> str | None:
-        """Return why a stop cannot be released."""
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
@@ -145,14 +136,11 @@ class Safety:
             self._begun = now or None
             return {}
         begun = self._begun = self._begun or joints.counted
-        silences = {
-            name: (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS
-            for name in self._expected
-        }
         return {
             name: f'{name} is stale: no valid message for {silence:.1f} s'
-            for name, silence in silences.items()
-            if silence > self.limits.sensor_timeout
+            for name in self._expected
+            if (silence := (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS)
+            > self.limits.sensor_timeout
         }
 
     def new_warnings(self, now: int) -> list[str]:
@@ -175,14 +163,11 @@ class Safety:
         late = (
             f'{name} has {share:.0%} of its messages out of order'
             for name, stream in self.streams.items()
-            if name in _MEASURED
-            and (share := stream.window.share(now)) > _LATE
-            and stream.window.rate(now) >= _FEW
+            if (share := stream.window.share(now)) > _LATE and stream.window.rate(now) >= _FEW
         )
         return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def status(self, status: ControllerStatus, now: int) -> ControllerStatus:
-        """Return a status of the controller with stop, publishers, commands and inputs."""
         return replace(
             status,
             stop=self.stop or '',

@@ -3,7 +3,8 @@
 
 from math import exp, sqrt
 
-from needle_controller import Axis, LoopRun, Pid, PidGains, stability_limit
+from needle_controller import Axis, LoopRun, Pid, PidGains
+from needle_controller.stability import stability_limit
 from needle_dynamics import NeedleParameters
 import numpy as np
 from reproduction.claims.claim import Finding, finding

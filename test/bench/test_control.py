@@ -5,7 +5,8 @@ from itertools import pairwise
 
 from benchmarks import control as bench_control
 from benchmarks.control import NumpyInverseDynamics, PERIOD
-from needle_controller import InverseDynamicsGains, SampledLoop, Setpoint
+from needle_controller import InverseDynamicsGains, Setpoint
+from needle_controller.laws.law import SampledLoop
 from needle_dynamics import NeedleParameters
 import numpy as np
 from numpy.testing import assert_allclose

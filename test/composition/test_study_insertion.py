@@ -13,11 +13,11 @@ from needle_controller import (
     Controller,
     ControllerOutput,
     ControllerSettings,
-    Guard,
     Measurement,
     run_controller,
     SafetyLimits,
 )
+from needle_controller.safety.guard import Guard
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_identification import message_counts, read_topic
 from needle_insertion.cli import main

@@ -18,12 +18,12 @@ from needle_controller import (
     MinimumJerk,
     ReferenceLimits,
     run_batch,
-    SampledLoop,
     Setpoint,
-    transition_matrix,
 )
 from needle_controller.compiled.laws import LEARNED, MEASURED
 from needle_controller.compiled.learning import bounds, correction
+from needle_controller.laws.law import SampledLoop
+from needle_controller.stability import transition_matrix
 from needle_dynamics import NeedleModel, NeedleParameters
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal

@@ -8,7 +8,8 @@ from math import exp
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_controller import Admittance, Axis, Controller, ControllerSettings, Measurement
+from needle_controller import Axis, Controller, ControllerSettings, Measurement
+from needle_controller.admittance import Admittance
 from needle_dynamics import NeedleParameters
 import pytest
 

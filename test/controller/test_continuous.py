@@ -12,10 +12,10 @@ from needle_controller import (
     InverseDynamicsGains,
     Pid,
     PidGains,
-    SampledLoop,
     Setpoint,
 )
 from needle_controller.laws.continuous import acceleration
+from needle_controller.laws.law import SampledLoop
 from needle_dynamics import (
     FloatArray,
     Integrator,

@@ -23,9 +23,9 @@ from needle_controller import (
     run_batch,
     run_continuous,
     run_controller,
-    SampledLoop,
     Setpoint,
 )
+from needle_controller.laws.law import SampledLoop
 from needle_dynamics import (
     FloatArray,
     InsertionDepthError,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from needle_controller.safety.latency_monitor import LatencyMonitor
+from needle_controller.safety.timing_monitor import LatencyMonitor
 from needle_ros.timing import NANOSECONDS
 import pytest
 

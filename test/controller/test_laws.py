@@ -12,14 +12,13 @@ from needle_controller import (
     InverseDynamics,
     InverseDynamicsGains,
     MinimumJerk,
-    no_memory,
     Pid,
     PidGains,
     ReferenceLimits,
-    SampledLoop,
     Setpoint,
 )
 from needle_controller.compiled.laws import INTEGRAL, OFFSET, RATE
+from needle_controller.laws.law import no_memory, SampledLoop
 from needle_dynamics import NeedleParameters, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 from needle_controller import ControllerSettings
 from needle_controller.safety.input_monitor import InputMonitor
-from needle_controller.safety.rate_monitor import RateMonitor
-from needle_controller.safety.timing_monitor import TimingMonitor
+from needle_controller.safety.timing_monitor import RateMonitor, TimingMonitor
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.random import Generator

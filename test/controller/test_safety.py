@@ -4,8 +4,9 @@
 from math import inf, nan
 from typing import Any
 
-from needle_controller import ControllerSettings, Guard, InputMonitor, Measurement, SafetyLimits
-from needle_controller.safety.encoders import read_encoders
+from needle_controller import ControllerSettings, Measurement, SafetyLimits
+from needle_controller.safety.guard import Guard
+from needle_controller.safety.input_monitor import InputMonitor
 from needle_controller.safety.safety import Safety
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_ros.wire import Reading
@@ -375,11 +376,11 @@ def joints(names: list[str], positions: list[float], speeds: list[float]) -> Rea
 @pytest.mark.requirement('S-054')
 def test_encoders_are_read_by_name() -> None:
     """In any order, with or without the rotation."""
-    both = read_encoders(joints(['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01]))
+    both = Measurement.from_reading(joints(['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01]))
     assert both == Measurement(
         time=1.0, depth=0.02, velocity=0.01, angle=0.1, angular_velocity=0.2
     )
-    assert read_encoders(joints(['insertion'], [0.02], [0.01])).angle == 0.0
+    assert Measurement.from_reading(joints(['insertion'], [0.02], [0.01])).angle == 0.0
 
 
 @pytest.mark.requirement('S-054', 'S-071')
@@ -398,4 +399,4 @@ def test_incomplete_joint_states_are_rejected(
 ) -> None:
     """In one line with the received names."""
     with pytest.raises(ParameterError, match=r"needs position and velocity of 'insertion', got"):
-        read_encoders(joints(names, positions, speeds))
+        Measurement.from_reading(joints(names, positions, speeds))

@@ -15,13 +15,11 @@ from needle_controller import (
     InverseDynamicsGains,
     Pid,
     PidGains,
-    SampledLoop,
     Setpoint,
-    spectral_radius,
-    stability_limit,
-    transition_matrix,
     Uncertainty,
 )
+from needle_controller.laws.law import SampledLoop
+from needle_controller.stability import spectral_radius, stability_limit, transition_matrix
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from needle_controller import ContinuousLaw
-from needle_controller.laws.continuous import acceleration
+from needle_controller.laws.continuous import acceleration, ContinuousLaw
 from needle_dynamics import FloatArray, NeedleModel
 import numpy as np
 from numpy.typing import ArrayLike
