@@ -127,8 +127,7 @@ class InsertionScenario(Scenario):
 
     `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``controller`` of
     `CONTROLLERS` with ``gains`` that are stable for the ``uncertainty``; ``reference`` of
-    `REFERENCES`; and the fields of `InsertionStudy`. Raises `ParameterError` if a setting is
-    not valid.
+    `REFERENCES`; and the fields of `InsertionStudy`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -236,7 +235,6 @@ class InsertionScenario(Scenario):
     def insert(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[dict[str, float]]:
-        """Simulate insertions; return the metrics of each."""
         return map(self._judged, rows, self._courses(rows, streams))
 
     def replay(
@@ -273,7 +271,6 @@ class InsertionScenario(Scenario):
     def _courses(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[_Course]:
-        """Simulate the insertions."""
         law = self._law
         if law is None:
             return self._open(rows, streams)

@@ -101,8 +101,7 @@ class SteeringScenario(Scenario):
     Steer needles that differ from the nominal model to a target.
 
     `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``prior``, their
-    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises
-    `ParameterError`.
+    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -175,7 +174,6 @@ class SteeringScenario(Scenario):
     def insert(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[dict[str, float]]:
-        """Simulate insertions; yield the metrics of each."""
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
         steered = map(self._steered, truths, rows, streams)
         each = self._open(truths) if self._law == _OPEN_LOOP else steered
@@ -254,7 +252,6 @@ class SteeringScenario(Scenario):
         rng: np.random.Generator,
         watch: Callable[[SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
-        """Simulate one insertion under the law."""
         try:
             law = build_law(
                 self._law, self._model, (row['target_x'], row['target_z']), self._numbers

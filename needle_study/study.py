@@ -104,21 +104,9 @@ class Study:
 
     def simulate(self, progress: Progress | None = None) -> StudyTable:
         """
-        Simulate all samples in this process.
+        Simulate all samples in this process, with their progress as for `progress_of`.
 
         `needle study` computes large studies on all cores, and writes them to files.
-
-        Parameters
-        ----------
-        progress : bool or callable, optional
-            True shows a progress bar; a function is called after each part. The samples are then
-            simulated in up to 50 parts, with the same results.
-
-        Returns
-        -------
-        StudyTable
-            Variables and metrics of each sample.
-
         """
         if not progress:
             return StudyTable(self, self.rows(0, self.samples))
@@ -132,7 +120,7 @@ class Study:
         return StudyTable(self, values)
 
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
-        """Compute `count` samples from number `first` on: number, sampled values and metrics."""
+        """Compute samples from a number on: number, sampled values and metrics."""
         numbers = range(first, first + count)
         drawn = self.draw(numbers)
         streams = [self.rng(number, 1) for number in numbers]
@@ -157,20 +145,7 @@ class StudyTable(Displayed):
         return {f'{name} [{units.get(name) or 1}]': one for name, one in self.values.items()}
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
-        """
-        Draw the distribution of the primary metric, and the metric over each variable.
-
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure, optional
-            Figure to draw in; by default a new one of ``matplotlib.pyplot``.
-
-        Returns
-        -------
-        list of matplotlib.axes.Axes
-            The histogram, and a panel for each variable of the population.
-
-        """
+        """Draw the distribution of the primary metric, and the metric over each variable."""
         scenario, (name, *_) = self.study.scenario, self.study.scenario.metrics
         label, factor = shown(f'{name} [{scenario.metrics[name].unit}]')
         values = factor * self.values[name]
@@ -187,32 +162,14 @@ class StudyTable(Displayed):
 
 @lru_cache(maxsize=64)
 def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
-    """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
+    """Return the strata of a dimension by sample number."""
     # The generators of samples have two numbers in their key, this generator has three.
     key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
     return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))
 
 
 def read_study(path: Path | str) -> Study:
-    """
-    Read a study file.
-
-    Parameters
-    ----------
-    path : Path or str
-        File (.yaml).
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If the file is not a valid study; the message has its name.
-
-    """
+    """Read a study file (.yaml), or raise `ParameterError` with its name."""
     path = Path(path)
     try:
         return build_study(read_document(path.read_text(encoding='utf-8')))
@@ -224,25 +181,7 @@ def read_study(path: Path | str) -> Study:
 
 
 def build_study(document: Any) -> Study:
-    """
-    Build a study from the content of a study file.
-
-    Parameters
-    ----------
-    document : mapping
-        Keys and values as in a study file, in SI units.
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown or a value is not valid.
-
-    """
+    """Build a study from the content of a study file, in SI units, or raise `ParameterError`."""
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)

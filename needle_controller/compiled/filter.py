@@ -98,7 +98,6 @@ class Filter(NamedTuple):
 
 @inlined
 def _modes(f: Filter, slot: int) -> NormalModes:
-    """Return the normal modes of a sample."""
     return NormalModes(f.shapes[slot], f.inverses[slot], f.squares[slot])
 
 
@@ -238,7 +237,7 @@ def _expose(
     covariance: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add a part of the sample, in times from its start [s], to the running mean of the tip."""
+    """Add a part of a sample, with times from its start [s], to the running mean of the tip."""
     n = f.squares.shape[1]
     change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n + 1]
     by_force = 0.0
@@ -381,11 +380,9 @@ def estimate(  # noqa: C901
     Transform the newest slot to modal coordinates at the present depth, half a sample later.
 
     ``modal``, shape (2 n,), takes q [m^3/2] and q_dot [m^3/2 / s], ``jacobian``, shape (2 n, 2 n),
-    their derivatives by c and b of the slot.
-
-    Returns the tip deflection and its standard deviation [m], and the force of the bent needle
-    against insertion [N] by the modes below half the sample rate: the estimated rates of faster
-    modes are noise, which their square would add to the force.
+    their derivatives by c and b of the slot. Returns the tip deflection and its standard deviation
+    [m], and the force of the bent needle against insertion [N] by the modes below half the sample
+    rate: the estimated rates of faster modes are noise, which their square would add to the force.
     """
     f = boxed.value
     needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]

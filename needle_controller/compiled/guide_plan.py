@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reachable set of the tip, and the next position of the guide.
-
-`needle_controller.compiled.hypotheses` has the distributions of the tip by hypothesis.
-"""
+"""Reachable set of the tip, and the next position of the guide."""
 
 from __future__ import annotations
 
@@ -115,12 +111,7 @@ def _reachable(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
 
 @kernel
 def reachable_set(boxed: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """
-    Return the reachable set of the tip by hypothesis, shape (h,) each.
-
-    Its middle x + i z [m], its half widths along x + i along z [m], and the standard deviation of
-    the middle along each axis [m].
-    """
+    """Return middle, half widths, x + i z, and error of the reachable set [m], shape (h,)."""
     return _reachable(boxed.value)
 
 
@@ -146,11 +137,7 @@ def hit_probability(boxed: Boxed[Steering]) -> float:
 
 @kernel
 def choose_guide(boxed: Boxed[Steering]) -> complex:
-    """
-    Return the next position of the guide, x + i z [m], and turn the needle if worthwhile.
-
-    Updates the roll and the bevel directions of the state.
-    """
+    """Return the next position of the guide, x + i z [m], and turn the needle if worthwhile."""
     c = boxed.value
     k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
     turns, candidates = c.counts[TURNS], _candidates(c, _FINE)
@@ -196,7 +183,6 @@ def _tip_roll(c: Steering, g: int, base: float) -> float:
 
 @inlined
 def _direction(roll: float) -> complex:
-    """Return the direction of the bevel relative to zero roll."""
     return complex(cos(roll), -sin(roll))
 
 

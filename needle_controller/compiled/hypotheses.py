@@ -139,12 +139,8 @@ class Steering(NamedTuple):
     turned: ComplexMatrix
     roll: Vector  #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
     last: Vector  #: last tip measurement [m], shape (2,)
-    #: Tip measurements so far, remaining turns, successive equal, gross and missing measurements,
-    #: shape (5,).
-    counts: IntVector
-    #: Expected number of gross errors, number of measurements, evidence of a sensor fault, and the
-    #: last innovation along x and z [m], shape (5,).
-    gross: Vector
+    counts: IntVector  #: numbers with the index `STEP` and so on, shape (5,)
+    gross: Vector  #: numbers with the index `_ERRORS` and so on, shape (5,)
 
 
 class TipDistribution(NamedTuple):
@@ -156,12 +152,10 @@ class TipDistribution(NamedTuple):
 
 
 class TipMoments(NamedTuple):
-    """Mean and covariance of the tip over all hypotheses."""
+    """Mean [m] and covariance [m^2] of the tip over all hypotheses."""
 
-    #: Mean [m].
     x: float
     z: float
-    #: Covariance [m^2].
     xx: float
     xz: float
     zz: float
@@ -183,7 +177,6 @@ def weights(logs: Vector) -> FloatArray:
 
 @inlined
 def _guide_at_rest(c: Steering) -> ComplexArray:
-    """Return the positions of the guide, shape (n,), with the guide at rest from now on."""
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
     if done > 0:
         for j in range(done, len(guide)):
@@ -241,7 +234,6 @@ def tip_distribution(
 
 @compiled
 def _moments(w: FloatArray, tip: TipDistribution) -> TipMoments:
-    """Return mean and covariance of the tip over all hypotheses."""
     x = z = xx = xz = zz = 0.0
     for i in range(len(w)):
         x += w[i] * tip.means[i].real
@@ -312,10 +304,9 @@ def _update_hypotheses(
     c: Steering, w: FloatArray, tip: TipDistribution, measured: complex
 ) -> tuple[float, float]:
     """
-    Update all hypotheses and their weights with a tip measurement [m].
+    Update all hypotheses and their weights with a tip measurement [m] of a distribution.
 
-    ``tip`` is the distribution of the measured tip with the noise of the measurement. Returns the
-    probability that the measurement has no gross error, and the logarithm of its likelihood.
+    Returns the probability that it has no gross error, and the logarithm of its likelihood.
     """
     share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.gross[_MEASURED])
     likely, sounds, largest = np.full(len(w), -inf), np.zeros(len(w)), -inf

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Sampled control laws on one axis.
+Sampled control laws on one axis, for the node and for the compiled loop over thousands of runs.
 
-The same functions serve the node, call by call, and the compiled loop over thousands of runs.
-They take `LawConstants` and `Instant` as plain tuples and name their fields inside: Numba
+The functions take `LawConstants` and `Instant` as plain tuples and name their fields inside: Numba
 recognizes a plain tuple several times faster than a named tuple.
 """
 
@@ -107,7 +106,7 @@ class _Implicit(NamedTuple):
     Feedback as an equation for its own force: force = forward + push / divisor.
 
     The filtered rate of the error at the end of the period is rate - slope times the feedback.
-    `end` and `reached` are the goal position and velocity at the end of the period.
+    `end` and `reached` are the goal position and velocity then.
     """
 
     forward: float
@@ -185,8 +184,8 @@ def law_learn(
     """
     Update the learned friction with the last period, if the law learns and the axis was sliding.
 
-    ``constants`` and ``memory`` as in `law_force`; ``position`` and ``velocity`` are measured now,
-    ``force`` is the force of the period less known loads [N].
+    ``position`` and ``velocity`` are measured now, ``force`` is the force of the period less known
+    loads [N]; else as in `law_force`.
     """
     c = LawConstants(*constants)
     if c.bound == 0.0:
@@ -283,9 +282,7 @@ def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: 
     """
     Return the force for the next period before any limit [N]; see the classes of the laws.
 
-    ``constants`` are the fields of `LawConstants`, ``memory`` the memory of the law, shape
-    (MEMORY,), ``instant`` the fields of `Instant`, and ``load`` a known force against the motion
-    [N].
+    ``memory`` has shape (MEMORY,), and ``load`` is a known force against the motion [N].
     """
     return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 

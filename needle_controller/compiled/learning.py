@@ -38,10 +38,10 @@ def correction(
     block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
     """
-    Return the learned additional friction [N] in the direction of a block, within bounds.
+    Return the learned additional friction [N] in the direction of a block (BLOCK,), within bounds.
 
-    ``block`` has shape (BLOCK,), ``limits`` are from `bounds`, ``depth`` is the position of the
-    axis [m] and ``speed`` the modulus of its velocity [m/s].
+    ``limits`` are from `bounds`, ``depth`` is the position [m], ``speed`` the speed of the axis
+    [m/s].
     """
     dry, viscous, slope = limits
     dry_part = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
@@ -61,8 +61,7 @@ def learn(
     """
     Update the estimate of one direction, shape (BLOCK,), with one period of sliding.
 
-    ``missing`` is the friction of the period beyond the model [N] and ``noise`` its standard
-    deviation. A block of zeros starts at the prior.
+    ``missing`` is the friction beyond the model [N], and ``noise`` its standard deviation.
     """
     covariance = block[TERMS:].reshape((TERMS, TERMS))
     prior = (0.5 * limits[0], 0.5 * limits[1], 0.5 * limits[2])

@@ -14,12 +14,7 @@ import numpy as np
 
 
 class ContinuousInsertion(InsertionStrategy):
-    """
-    Insert a needle without rests; the guide follows the measured insertion depth.
-
-    The tip is measured during the motion through each depth, and at rest at the first and last
-    one.
-    """
+    """Insert a needle without rests, with measurements in motion; the guide follows its depth."""
 
     def __init__(
         self, law: GuardedLaw, motions: MotionControl, settings: ExecutiveSettings
@@ -36,13 +31,11 @@ class ContinuousInsertion(InsertionStrategy):
         self._moved = False
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
-        """Begin the insertion to the last depth."""
         self._between = np.array([[0.0, 0.0], [to.x, to.z]])
         self.phase, self._rest = Phase.INSERTING, None
         return self._insert(now, float(self.law.depths[0]))
 
     def _insert(self, now: int, begin: float, *, again: bool = False) -> JointMotion:
-        """Send the needle to the target depth."""
         motions, depths = self._motions, self.law.depths
         motions.origin = np.array([depths[0], *self._between[0]])
         motions.goal = np.array([depths[-1], *self._between[1]])

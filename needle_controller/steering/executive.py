@@ -52,16 +52,15 @@ class SteeringExecutive(StateMachine[JointMotion]):
     """
     Execute a steered insertion, and stop it on any fault.
 
-    Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns a `JointMotion` of needle and guide to send; None leaves the last motion in effect.
-    A motion is sent again until the joints follow it, see `MotionMonitor`.
+    Every event is a method: it takes the time ``now`` [ns] of the clock that stamps the messages,
+    and returns a `JointMotion` of needle and guide to send; None leaves the last motion in effect.
+    A motion is sent again until the joints follow it, see `MotionMonitor`. `fault` is the reason
+    of the stop, '' without a stop.
 
     Parameters
     ----------
-    needle : NeedleParameters
-        Nominal needle and tissue.
-    steering : SteeringParameters
-        Their constants for steering.
+    needle, steering : NeedleParameters, SteeringParameters
+        Nominal needle and tissue, and their constants for steering.
     prior : SteeringPrior
         Prior uncertainty of all constants.
     settings : ExecutiveSettings
@@ -72,12 +71,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         Starts the computation of a plan, see `StartJob`.
     law : str
         Steering law, see `build_law`.
-
-    Attributes
-    ----------
-    fault : str
-        Reason of the stop, '' without a stop.
-
     """
 
     def __init__(
@@ -152,24 +145,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> JointMotion | None:
         """
-        Plan an insertion to a target and begin it; during an insertion, change its target.
+        Plan an insertion to a target x, y, z [m], or change the target of the insertion under way.
 
-        Parameters
-        ----------
-        stamp : int
-            Stamp of the message [ns]; 0 if it has none.
-        frame : str
-            Frame of the message.
-        point : tuple of float
-            Target of the tip, x, y, z [m].
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        JointMotion or None
-            Motion to send.
-
+        ``stamp`` and ``frame`` are of the message; a stamp of 0 is none.
         """
         if not self._is_new(TARGET, stamp, frame, now):
             return None
@@ -298,17 +276,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self.obey(now)
 
     def halt(self, why: str, now: int) -> JointMotion | None:
-        """
-        End the insertion or retraction: needle and guide brake to rest; cancel a plan.
-
-        Parameters
-        ----------
-        why : str
-            Reason for the user.
-        now : int
-            Time [ns].
-
-        """
+        """End the insertion or retraction for a reason: brake to rest, and cancel a plan."""
         self.requests.supersede(now)
         self._cancel(Verdict.REJECTED, f'stopped: {why}')
         moves = self._moves
@@ -322,19 +290,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._motions.stop(now) if moves else None
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
-        """
-        Process the status of another node: its answers to the motions.
-
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-        status : RequestStatus
-            Status of the node.
-        now : int
-            Time [ns].
-
-        """
+        """Process the status of another node by name: its answers to the motions."""
         refusal = self._motions.monitor.hear(node, status)
         if refusal is None:
             return None
@@ -347,17 +303,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return None
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
-        """
-        Process `joint_states`.
-
-        Parameters
-        ----------
-        reading : Reading
-            The message.
-        now : int
-            Time [ns].
-
-        """
+        """Process `joint_states`."""
         found = dict(zip(reading.names, reading.values[0], strict=False))
         if missing := [name for name in self.settings.joints if name not in found]:
             got = f'got names {list(reading.names)}'
@@ -404,15 +350,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
-        """
-        Process `tip_deflection`.
-
-        Parameters
-        ----------
-        reading, now
-            As for `joints`.
-
-        """
+        """Process `tip_deflection`."""
         tip = reading.values[0]
         if not self._is_valid(self._tip_stream, reading, tip, now):
             return None
@@ -423,15 +361,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.events.reject(f'{stream.name} refused: {refusal.line}')
 
     def watch(self, now: int) -> JointMotion | None:
-        """
-        Check for missing inputs, and whether a plan is computed; call it ten times a second.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Check for missing inputs, and whether a plan is computed; call it ten times a second."""
         timeout = self.settings.measurement_timeout
         back = self.clock_went_back(now, self._joint_stream.timeout)
         if back:
@@ -457,28 +387,12 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
-        """
-        Set the numbers of publishers of the measurements: each must have one source only.
-
-        Parameters
-        ----------
-        joint_states, tip_deflection : int
-            Number of publishers.
-
-        """
+        """Set the numbers of publishers of the measurements: each must have one source only."""
         self._joint_stream.publishers = joint_states
         self._tip_stream.publishers = tip_deflection
 
     def diagnose(self, now: int) -> tuple[Severity, str, SteeringStatus]:
-        """
-        Return severity, the state in one line, and status.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Return severity, the state in one line, and status."""
         insertion, job = self._insertion, self.planner.job
         status, warning = describe(insertion, self._motions.goal, self._noise, active=self.steers)
         status = replace(

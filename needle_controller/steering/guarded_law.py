@@ -31,8 +31,8 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`, for every law. ``depths`` are the depths of the tip measurements
-    [m], shape (n + 1,), and ``noise`` is the configured standard deviation of a measurement [m].
+    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,), and
+    ``noise`` is the configured standard deviation of a measurement [m].
     """
 
     def __init__(
@@ -67,12 +67,10 @@ class GuardedLaw:
 
     @property
     def steps(self) -> int:
-        """Number of steps n."""
         return len(self.depths) - 1
 
     @property
     def setpoint(self) -> GuideSetpoint:
-        """Last setpoint of guide and roll."""
         return self._setpoint
 
     def aim(self, target: FloatArray) -> None:

@@ -19,9 +19,8 @@ class InsertionStrategy(ABC):
     """
     Insert a needle under a steering law: straighten the guide, measure, plan, move.
 
-    Every event is a method that returns a motion to send, as in `SteeringExecutive`. A fault is
-    raised as a `NeedleError`, after which the executive stops the insertion. `phase` is GUIDING,
-    INSERTING, MEASURING or DONE.
+    Every event is a method that returns a motion to send, or raises a `NeedleError`, which ends
+    the insertion. `phase` is GUIDING, INSERTING, MEASURING or DONE.
     """
 
     def __init__(
@@ -36,11 +35,7 @@ class InsertionStrategy(ABC):
         self._span = 0, 0
 
     def begin(self, at: FloatArray, now: int) -> JointMotion | None:
-        """
-        Send the guide to its zero, from positions of the joints [m, rad].
-
-        A law with plans continues: the guide is sent to its last setpoint.
-        """
+        """Send the guide from joint positions [m, rad] to its zero, or to its last setpoint."""
         if self.law.step:
             self._motions.goal = at.copy()
             return self._begin_step(self.law.setpoint, now)
@@ -50,7 +45,6 @@ class InsertionStrategy(ABC):
         return self._send(Phase.GUIDING, straight, now)
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> JointMotion | None:
-        """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         return self._motions.send(goal, now)
 

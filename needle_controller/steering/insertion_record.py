@@ -34,18 +34,13 @@ class PlannedInsertion(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringRecord:
-    """
-    Plan and estimate of an insertion; its fields are values of JSON.
-
-    `history` has the inputs of the steering law in their order and its setpoints, see
-    `GuardedLaw.history`: a law with the same inputs has the same estimate.
-    """
+    """Plan and estimate of an insertion; its fields are values of JSON."""
 
     point: Sequence[float]  #: target of the tip at the start, x, y, z [m]
     depths: Sequence[float]  #: depths of the tip measurements [m]
     start: Sequence[float]  #: positions of the joints at the start [m, rad]
     continuous: bool  #: whether the needle is inserted without rests
-    history: Sequence[Mapping[str, Any]]
+    history: Sequence[Mapping[str, Any]]  #: `GuardedLaw.history`, which determines the estimate
     #: Expected position of the tip at the target depth, x, z [m], and its covariance [m^2].
     expected: Sequence[float]
     covariance: Sequence[Sequence[float]]
@@ -73,10 +68,10 @@ class SteeringRecord:
         self, at: FloatArray, tip: Sequence[float] | None, state: int, own: ExecutiveSettings
     ) -> None:
         """
-        Check that needle, guide and tip are where the record leaves them, or raise `JobError`.
+        Raise `JobError` if needle, guide and tip are not where the record leaves them.
 
-        ``at`` are the positions of the joints [m, rad], ``tip`` is a reading of the tip, x, y, z
-        [m], and ``state`` the time of the newest change of the system state [ns].
+        ``at`` are the positions of the joints [m, rad], ``tip`` is a reading x, y, z [m], and
+        ``state`` the time of the newest change of the system state [ns].
         """
         if self.ended:
             raise JobError(self.ended)
@@ -103,7 +98,6 @@ class SteeringRecord:
         return before, np.array([self.depths[min(step, len(self.depths) - 1)], *plans[step]])
 
     def _check_tip(self, depth: float, tip: Sequence[float] | None, slip: float) -> None:
-        """Compare a reading of the tip [m] with the last measurement."""
         looks = [entry for entry in self.history if entry.get('tip') is not None]
         if tip is None or not looks:
             raise JobError('the tip is not measured')

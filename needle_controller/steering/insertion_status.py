@@ -33,7 +33,7 @@ def describe(
     Return the status of an insertion, and its warning or ''.
 
     ``goal`` are the goals of the joints [m, rad], ``noise`` is the configured noise of a tip
-    measurement [m], and ``active`` whether the insertion is under way.
+    measurement [m], and a law has no warning unless ``active``.
     """
     if insertion is None:
         return SteeringStatus(), ''
@@ -80,8 +80,7 @@ def summarize(
     """
     Return severity and state in one line, for users.
 
-    ``failure`` is the reason why a retraction has failed, and ``advice`` follows the line of an
-    idle node; both may be ''.
+    ``failure`` of a retraction, and ``advice`` for an idle node, may be ''.
     """
     if status.phase is Phase.STOPPED:
         return Severity.ERROR, f'stopped: {status.fault}'

@@ -50,15 +50,7 @@ class TipEstimate:
         return np.asarray(NORMAL * np.sqrt(np.diag(self.covariance)))
 
     def contains(self, tip: FloatArray) -> bool:
-        """
-        Return whether the 95 % ellipse contains a position.
-
-        Parameters
-        ----------
-        tip : ndarray, shape (2,)
-            Position in x and z [m].
-
-        """
+        """Return whether the 95 % ellipse contains a position x, z [m], shape (2,)."""
         off = tip - self.mean
         return bool(off @ np.linalg.solve(self.covariance, off) <= _CHI_SQUARED)
 
@@ -94,43 +86,18 @@ class SteeringLaw(Protocol):
         """Warning for the user, '' without a warning."""
 
     def aim(self, target: ArrayLike) -> None:
-        """
-        Continue to another target at the same depth.
-
-        Parameters
-        ----------
-        target : array_like, shape (2,)
-            Target position of the tip at the last depth, x and z [m].
-
-        Raises
-        ------
-        NeedleError
-            If the target is not possible. The target is then unchanged.
-
-        """
+        """Change the target x, z [m], or raise `NeedleError` and keep the old one."""
 
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
         """
-        Process an averaged tip measurement.
+        Process an averaged tip measurement x, z [m] in the frame of the sensor; None if missing.
 
-        Parameters
-        ----------
-        tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
-        at : int
-            Number of its depth, not greater than `step`: the present or, if the needle does not
-            rest, the depth before.
-        noise : float
-            Standard deviation of the measurement along each axis, if above the configured one [m].
-
-        Raises
-        ------
-        SteeringFaultError
-            If the needle must stop, because the measurements are missing for too long, have
-            frozen, or are implausible.
-
+        ``at`` is the number of its depth, not greater than `step`: the present or, if the needle
+        does not rest, the depth before. ``noise`` is its standard deviation along each axis, if
+        above the configured one [m]. Raises `SteeringFaultError` if the needle must stop, because
+        the measurements are missing for too long, frozen or implausible.
         """
 
     def plan(self) -> GuideSetpoint:
@@ -184,18 +151,10 @@ def build_law(
     roll : float
         Roll of the needle at the start [rad].
 
-    Returns
-    -------
-    SteeringLaw
-        The law.
-
     Raises
     ------
-    ParameterError
-        If there is no such law, or its class cannot be constructed.
     OutOfReachError
         If the law detects that the target is out of reach.
-
     """
     of_class = find_law(name)
     try:
@@ -213,14 +172,13 @@ def build_law(
 
 
 def checked_roll(roll: float) -> float:
-    """Return the roll at the start [rad], if it is finite."""
     if not isfinite(roll):
         raise ParameterError(f'roll must be finite, got {roll!r} rad')
     return roll
 
 
 def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
-    """Return a tip measurement x, z [m] as an array, nan if it is missing."""
+    """Return a tip measurement x, z [m], nan if it is missing."""
     found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
     if found.shape != (2,):
         raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
@@ -228,7 +186,7 @@ def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
 
 
 def checked_target(target: ArrayLike) -> FloatArray:
-    """Return a target x, z [m] as an array, if it is two finite numbers."""
+    """Return a target x, z [m], if it is two finite numbers."""
     found = np.array(target, dtype=np.float64)
     if found.shape != (2,):
         raise ShapeError(f'target must be x and z, got shape {found.shape}')

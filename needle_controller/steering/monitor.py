@@ -33,9 +33,9 @@ class MotionRefusal(NamedTuple):
 
 class MotionMonitor:
     """
-    Compare the last motion with the joint positions, and with the answers to it.
+    Compare the last motion with the positions of the ``joints`` [m, rad], and with its answers.
 
-    ``tolerances``, shape (joints,), are of the positions of the ``joints`` [m, rad].
+    ``tolerances`` of the positions, and all positions, have shape (joints,).
     """
 
     def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:
@@ -64,7 +64,7 @@ class MotionMonitor:
         self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False
     ) -> None:
         """
-        Start to monitor a motion from measured positions ``at`` [m, rad], shape (joints,).
+        Start to monitor a motion from measured positions [m, rad].
 
         ``again`` marks a repetition of the motion. With ``arrives`` the joints must arrive in
         time, where a part of the motion may have been followed already; otherwise they must begin
@@ -95,12 +95,7 @@ class MotionMonitor:
         self._streamed.append(move.stamp)
 
     def is_late(self, at: FloatArray, stamp: int) -> bool:
-        """
-        Return whether the motion is overdue and must be repeated.
-
-        ``at`` are the positions of the joints [m, rad], shape (joints,), and ``stamp`` is their
-        time [ns].
-        """
+        """Return whether the motion is overdue at positions [m, rad] with their stamp [ns]."""
         if not self._pending.any():
             return False
         if self._arrives:
@@ -116,11 +111,7 @@ class MotionMonitor:
         return len(self._stamps) > REPEATS
 
     def hear(self, node: str, status: RequestStatus) -> MotionRefusal | None:
-        """
-        Process the status of a node that takes trajectories.
-
-        Returns once that the node does not execute the motion, None if it does.
-        """
+        """Process the status of a node; return once that it does not execute the motion."""
         joints = status.takes.get(JOINT_TRAJECTORY.name)
         if joints is None:
             return None
@@ -134,7 +125,6 @@ class MotionMonitor:
         return None
 
     def _refuses(self, answer: Acknowledgement) -> bool:
-        """Return whether an answer rejects the last motion."""
         if answer.verdict is Verdict.REJECTED:
             return answer.stamp in self._stamps or answer.stamp in self._streamed
         # The motions before the newest are superseded by it.
@@ -172,6 +162,5 @@ class MotionMonitor:
 
 
 def _is_late(status: RequestStatus, stamp: int) -> bool:
-    """Return whether a node has received a motion after its end."""
     answer = status.answer_to(JOINT_TRAJECTORY.name, stamp)
     return answer is not None and answer.verdict is Verdict.LATE

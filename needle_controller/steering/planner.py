@@ -101,8 +101,8 @@ class InsertionPlanner:
         """
         Return the depths of the steps to a target, if an insertion can begin.
 
-        ``at`` are the positions of the joints [m, rad], and ``begun`` is the depth at which the
-        last insertion began, if there was one [m].
+        ``at`` are joint positions [m, rad], ``begun`` the depth at the last begin [m], if there
+        was one.
         """
         settings = self._settings
         if at[0] < -_OUTSIDE:

@@ -12,7 +12,7 @@ from needle_ros.files import write_whole
 
 class RecordFile:
     """
-    The record of a node on a domain, and the source of its measurements.
+    File with the record of a node on a domain, and with the source of its measurements.
 
     The source identifies the process of the robot: with another one, the needle may be another.
     """

@@ -129,11 +129,6 @@ class SteeringModel:
         behind the base at each depth [rad]. ``guide_load``, ``causes_load`` and ``bevel_load``,
         with n rows, are the same for the force on the guide at its position of each step [N].
 
-    Raises
-    ------
-    ParameterError
-        If the depths do not increase, or the needle does not reach so deep.
-
     """
 
     def __init__(
@@ -247,7 +242,7 @@ def _respond(
 def _kinematic(
     base: Steered, steering: SteeringParameters, depths: FloatArray, lead: float
 ) -> tuple[FloatArray, ...]:
-    """Return the responses, as `_respond`, of a tip ahead of the arcs that it cuts [m]."""
+    """Return the responses, as `_respond`, of a tip that is a distance ahead of its arcs [m]."""
     n, edges = len(depths) - 1, np.append(0.0, depths)
     middles = 0.5 * (edges[1:] + edges[:-1])
     layers = _layers(base.starts, middles)

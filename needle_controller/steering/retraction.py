@@ -19,10 +19,10 @@ class Retraction:
     Withdraw a needle to `retract_depth`, and reduce the guide offset with the insertion depth.
 
     It begins with the first positions, and is one motion of needle and guide in proportion, so
-    that the needle leaves along its path. A needle that is not deeper rests. A controller that
-    withdraws the needle by itself supersedes the motion: then the guide follows the depth, and
-    the retraction ends where the needle rests. `ended` is whether it is over: needle and guide
-    rest at the end, or it has failed, with the reason `failure`.
+    that the needle leaves along its path. If a controller withdraws the needle by itself, which
+    supersedes the motion, the guide follows the depth, and the retraction ends where the needle
+    rests. `ended` is whether needle and guide rest at the end, or it has failed, with the reason
+    `failure`.
     """
 
     def __init__(
@@ -40,7 +40,6 @@ class Retraction:
         self._rest = 0, np.inf
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
-        """Return the next motion at the present positions."""
         try:
             return None if self.ended else self._follow(stamp, now)
         except SteeringFaultError as error:
@@ -101,7 +100,6 @@ class Retraction:
     # Another node withdraws the needle.
 
     def _follow_depth(self, now: int) -> JointMotion | None:
-        """Move the guide with the measured depth."""
         motions, interval = self._motions, 1.0 / self._settings.rate
         if self._begin is None or now - self._guided < interval * NANOSECONDS:
             return None

@@ -57,8 +57,7 @@ def sample_truth(
     """
     Sample a true needle from the prior uncertainty of a nominal needle.
 
-    The spread of ``prior`` is uniform, its standard deviations are normal; it also gives bevel
-    and path noise. ``seed`` is the seed of the path noise.
+    The spread is uniform, standard deviations are normal. ``seed`` is the seed of the path noise.
     """
     length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
@@ -80,8 +79,8 @@ class SteeringPlant:
     """
     Simulated needle that is inserted in steps, and its tip in the frame of the sensor.
 
-    The needle is at the first of the ``depths`` of the tip measurements [m], shape (n + 1,), and
-    ``step`` is the number of its present depth; ``frame`` as in `GroundTruth`.
+    `step` is the number of its present depth among ``depths`` of the tip measurements [m], shape
+    (n + 1,); ``frame`` as in `GroundTruth`.
     """
 
     def __init__(
@@ -123,8 +122,8 @@ class SteppedTipSensor:
     """
     Averaged tip measurement of a plant at rest, in the frame of its sensor; None if it is lost.
 
-    ``noise`` is the standard deviation of the white noise [m], with random numbers ``random``;
-    ``losses`` are the random numbers of losses. ``seed`` determines all other ``errors``.
+    ``random`` generates white noise with the standard deviation ``noise`` [m], ``losses`` the
+    losses, and ``seed`` all other ``errors``.
     """
 
     def __init__(

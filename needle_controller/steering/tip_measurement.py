@@ -38,8 +38,7 @@ class TipMeasurements:
         """
         Return the mean without outliers, or during motion a fitted line at the depth; or None.
 
-        ``noise`` is the configured standard deviation of a measurement [m], a lower bound in the
-        outlier test.
+        ``noise`` is the least standard deviation of a measurement in the outlier test [m].
         """
         if not self._readings:
             return None

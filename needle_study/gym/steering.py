@@ -96,7 +96,6 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         return observation, -1e3 * miss, True, False, {'tip': tip, 'miss': miss}
 
     def render(self) -> Any:
-        """Return an image of needle and target, or None without a render mode or an episode."""
         plant = self._plant
         if self.render_mode is None or plant is None:
             return None

@@ -68,7 +68,6 @@ class BroydenLaw(GuideLaw):
         self._before = tip.copy(), at
 
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
-        """Return the position of the guide with the least predicted distance."""
         guide, depth = self.guides[at], self.depths[at]
         self._learn(tip, np.array([*guide, depth]))
         if depth < _FIXED_BELOW:

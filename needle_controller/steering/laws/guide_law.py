@@ -44,7 +44,6 @@ class GuideLaw(ABC):
         """Compute constants before the first step; the default computes nothing."""
 
     def aim(self, target: ArrayLike) -> None:
-        """Continue to another target at the same depth, x and z [m]."""
         self.target = checked_target(target)
 
     def update(
@@ -59,7 +58,6 @@ class GuideLaw(ABC):
             self._newest = measured, at
 
     def plan(self) -> GuideSetpoint:
-        """Return guide and roll for the next step, and advance to it; unchanged at the end."""
         guide, most, change = self.guides[-1], self.limits.guide_limit, self.limits.guide_step
         if self._newest is not None and self.step < len(self.depths) - 1:
             wanted = np.clip(self.choose(*self._newest), guide - change, guide + change)
@@ -79,5 +77,4 @@ class GuideLaw(ABC):
         return None
 
     def status(self) -> Mapping[str, float]:
-        """Return values for the status, by name."""
         return {'turns_left': self.turns}

@@ -106,8 +106,6 @@ class MultiHypothesisLaw(SteeringLaw):
 
     Raises
     ------
-    ShapeError, ParameterError
-        If the target is not two finite numbers, the roll is not finite, or nothing can move.
     OutOfReachError
         If the target is out of reach; the message contains the reachable set.
 
@@ -189,17 +187,14 @@ class MultiHypothesisLaw(SteeringLaw):
 
     @property
     def target(self) -> FloatArray:
-        """The target [m], shape (2,)."""
         return self._now.target.copy()
 
     @property
     def step(self) -> int:
-        """Number of tip measurements so far."""
         return int(self._now.counts[STEP])
 
     @property
     def turns(self) -> int:
-        """Number of turns left."""
         return int(self._now.counts[TURNS])
 
     @property
@@ -214,19 +209,9 @@ class MultiHypothesisLaw(SteeringLaw):
 
     def expected(self, at: int = -1) -> TipEstimate:
         """
-        Return the predicted position of the tip.
+        Return the predicted position of the tip at a depth number, by default the last one.
 
-        Parameters
-        ----------
-        at : int
-            Number of the depth; by default the last one. Guide and roll are assumed to stay at
-            their last setpoint.
-
-        Returns
-        -------
-        TipEstimate
-            Mean and covariance over all hypotheses.
-
+        Guide and roll are assumed to stay at their last setpoint.
         """
         x, z, xx, xz, zz = predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
@@ -240,12 +225,10 @@ class MultiHypothesisLaw(SteeringLaw):
 
     @property
     def reach(self) -> Reach:
-        """Reachable set of the tip."""
         middles, sizes, _ = reachable_set(self._boxed)
         return Reach(middles, sizes, self.weights)
 
     def status(self) -> Mapping[str, float]:
-        """Return values for the status, by name."""
         return {
             'turns_left': self.turns,
             'hit_probability': self.hit_probability,
@@ -303,5 +286,4 @@ class MultiHypothesisLaw(SteeringLaw):
         return GuideSetpoint(there.real, there.imag, float(now.roll[-1]))
 
     def _choose(self) -> complex:
-        """Return the next position of the guide, x + i z [m]."""
         return choose_guide(self._boxed)

@@ -23,21 +23,15 @@ _LEAST: Final = 1e-3  #: Least response of the springs that is inverted.
 
 
 class SpringsLaw(GuideLaw):
-    """
-    The inverse of a beam on springs, along a straight line to the target.
-
-    Parameters as for `GuideLaw`.
-    """
+    """Follow a straight line to the target by the inverse of a beam on springs; see `GuideLaw`."""
 
     def prepare(self, model: SteeringModel) -> None:
-        """Compute the response of the springs at each depth."""
         self._responses = [
             float(springs(model.needle, model.steering, float(depth))[0][0, 0])
             for depth in self.depths
         ]
 
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
-        """Return the position of the guide for the next point of the line."""
         now, then = self._responses[at], self._responses[self.step + 1]
         if abs(then) < _LEAST:
             return self.guides[-1]
