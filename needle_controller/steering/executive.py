@@ -16,18 +16,17 @@ from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import InsertionStrategy, SteppedInsertion
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl
 from needle_controller.steering.planner import describe_target, InsertionPlanner
-from needle_controller.steering.planning import ComputedJob, StartJob
+from needle_controller.steering.planning import Job, StartJob
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.retraction import Retraction
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.steering.stepped import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -80,7 +79,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         prior: SteeringPrior,
         settings: ExecutiveSettings,
         steady: Callable[[], float] = monotonic,
-        start: StartJob = ComputedJob,
+        start: StartJob = Job,
         law: str = DEFAULT_LAW,
     ) -> None:
         super().__init__(steady, {TARGET: (INSERTION,)})
@@ -320,15 +319,14 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return None
         if not self.steers:
             if self.phase is Phase.DONE and motions.beyond:
-                self.fault = f'after the insertion {motions.astray()}'
+                self.fault = f'after the insertion {motions.departure()}'
                 return self._stop(self.fault, now)
             return None if self._retraction is None else self._retraction.follow(stamp, now)
-        if motions.astray():
-            return self._stop(motions.astray(), now)
+        if departure := motions.departure():
+            return self._stop(departure, now)
         if self.phase is Phase.MEASURING:
-            missed = motions.missed()
-            line = f'during the measurement of the tip {missed}'
-            return self._stop(line, now) if missed else None
+            line = f'during the measurement of the tip {motions.missed()}'
+            return self._stop(line, now) if motions.missed() else None
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)

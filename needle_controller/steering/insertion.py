@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common part of stepped and continuous insertions: motions, rest, and measurement of the tip."""
+"""Stepped insertion, and its common part with the continuous insertion."""
 
 from abc import ABC, abstractmethod
 
@@ -118,3 +118,22 @@ class InsertionStrategy(ABC):
     @abstractmethod
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         """Begin the step after a measurement at rest."""
+
+
+class SteppedInsertion(InsertionStrategy):
+    """
+    Insert a needle in steps, with a measurement at rest at the end of each.
+
+    The needle moves when the guide has arrived: the path is independent of their speeds.
+    """
+
+    def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
+        goal = self._motions.goal
+        goal = np.array([goal[0], to.x, to.z, to.roll])[: len(goal)]
+        return self._send(Phase.GUIDING, goal, now)
+
+    def _arrive(self, stamp: int, now: int) -> JointMotion | None:
+        if self.phase is Phase.GUIDING and self.law.step:
+            goal = np.array([self.law.depths[self.law.step], *self._motions.goal[1:]])
+            return self._send(Phase.INSERTING, goal, now)
+        return super()._arrive(stamp, now)

@@ -120,12 +120,6 @@ class MotionControl:
         )
         return self._stamped(move, now)
 
-    def guide_toward(self, position: FloatArray, duration: float, now: int) -> JointMotion:
-        """Send the guide to rest at a position [m], in a duration [s] or at `guide_speed`."""
-        way = position - self.at[1:3]
-        duration = max(duration, float(np.hypot(*way)) / self._settings.guide_speed)
-        return self.guide_to(position, np.zeros(2), duration, now)
-
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
         self._stamp = max(now, self._stamp + 1)
@@ -142,7 +136,7 @@ class MotionControl:
         self._events.add(Severity.WARNING, f'{failure}; sent again')
         return self.again(now)
 
-    def astray(self) -> str:
+    def departure(self) -> str:
         """Describe the first joint outside its motion, '' if none is."""
         low, high = np.minimum(self.origin, self.goal), np.maximum(self.origin, self.goal)
         room = LAGGING * self._settings.tolerances
@@ -163,15 +157,13 @@ class MotionControl:
         """Describe the joints (or given joints) that are not at their goal, '' if all are."""
         far = np.abs(self.at - self.goal) > self._settings.tolerances
         far = far if which is None else which
-        missed = []
-        for k, name in enumerate(self._settings.joints):
-            scale, unit = (1.0, 'rad') if name == ROLL else (1e3, 'mm')
-            if far[k]:
-                missed.append(
-                    f'{name} is at {scale * self.at[k]:.3f} {unit}, not at '
-                    f'{scale * self.goal[k]:.3f} {unit}'
-                )
-        return ' and '.join(missed)
+        scaled = [(1.0, 'rad') if name == ROLL else (1e3, 'mm') for name in self._settings.joints]
+        rows = zip(self._settings.joints, scaled, self.at, self.goal, far, strict=True)
+        return ' and '.join(
+            f'{name} is at {scale * at:.3f} {unit}, not at {scale * goal:.3f} {unit}'
+            for name, (scale, unit), at, goal, missed in rows
+            if missed
+        )
 
     # Stops.
 

@@ -108,7 +108,10 @@ class Retraction:
         # At the end of the guide motion.
         depth = motions.at[0] + motions.velocity * interval
         part = (depth - self._end) / max(begin - self._end, self._settings.depth_tolerance)
-        move = motions.guide_toward(min(max(part, 0.0), 1.0) * np.array(guide), interval, now)
+        to = min(max(part, 0.0), 1.0) * np.array(guide)
+        distance = float(np.hypot(*(to - motions.at[1:3])))
+        duration = max(interval, distance / self._settings.guide_speed)
+        move = motions.guide_to(to, np.zeros(2), duration, now)
         motions.monitor.stream(move)
         return move
 
