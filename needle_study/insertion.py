@@ -31,8 +31,15 @@ from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
+from needle_study.scenario import (
+    check_names,
+    mapping,
+    MeasuredRun,
+    Metric,
+    one_of,
+    Scenario,
+    Variable,
+)
 import numpy as np
 from scipy.optimize import brentq
 

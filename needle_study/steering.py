@@ -37,8 +37,7 @@ from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.reading import check_names, mapping
-from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
+from needle_study.scenario import check_names, mapping, MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 
 #: Law of a guide at rest, for which a batch is simulated without a law.

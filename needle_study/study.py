@@ -17,8 +17,15 @@ from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_study.distribution import Distribution, distribution
-from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import Metric, Scenario, SCENARIOS, Variable
+from needle_study.scenario import (
+    check_names,
+    mapping,
+    Metric,
+    one_of,
+    Scenario,
+    SCENARIOS,
+    Variable,
+)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri

@@ -97,18 +97,21 @@ VALID, LOST, FROZEN, OUTLIER = range(4)  #: Result of the check of a tip measure
 
 
 class HypothesisResponses(NamedTuple):
-    """Responses of the tip by point of the grid: arrays of `SteeringModel`, and sums."""
+    """Shifts of the tip at each depth, for g points of the grid, and their sums."""
 
-    #: As in `SteeringModel`.
-    guide: Array3
+    guide: Array3  #: per position of the guide in each step, shape (g, n + 1, n)
+    #: Per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without roll, and
+    #: curvature of the path at each depth [1/m], shape (g, n + 1, 5 + n).
     causes: Array3
-    bevel: Array3
-    elastic: Matrix
+    bevel: Array3  #: per load of the bevel [N] on the skin, and in each step, (g, n + 1, n + 1)
+    elastic: Matrix  #: of the resting tip per load of the bevel [m/N], shape (g, n + 1)
+    #: The same for the force on the guide at its position of each step [N], with n rows.
     guide_load: Array3
     causes_load: Array3
     bevel_load: Array3
+    #: Change of `guide` to the next bending length, and to the next skin, shape (2, g, n + 1, n).
     between: Array4
-    lags: Matrix
+    lags: Matrix  #: largest lag of the roll of the tip behind the base [rad], shape (g, n + 1)
     #: Sums of the absolute values of `guide` at the last depth, from each step on,
     #: shape (g, n + 1).
     later_guide: Matrix

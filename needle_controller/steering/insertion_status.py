@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Status of a steered insertion: phase, law, expected tip and last measurement."""
 
-from dataclasses import replace
 from typing import Final
 
 from needle_controller.steering.insertion import InsertionStrategy
@@ -38,6 +37,7 @@ def describe(
     if insertion is None:
         return SteeringStatus(), ''
     guarded, law = insertion.law, insertion.law.law
+    expected, measured = guarded.expected, guarded.measured
     x, z = np.asarray(law.target).tolist()
     _, guide_x, guide_z = goal[:3].tolist()
     values = dict(law.status())
@@ -51,26 +51,17 @@ def describe(
         hit_probability=values.pop('hit_probability', None),
         bending_length_ratio=values.pop('bending_length_ratio', None),
         law=values,
+        expected_tip=expected and tuple(expected.mean.tolist()),
+        expected_tip_half_width=expected and tuple(expected.half_width.tolist()),
+        last_measurement_readings=measured and measured.readings,
+        last_measurement_error=measured and measured.error,
     )
-    if guarded.expected is not None:
-        half = guarded.expected.half_width
-        status = replace(
-            status,
-            expected_tip=tuple(guarded.expected.mean.tolist()),
-            expected_tip_half_width=tuple(half.tolist()),
+    warning = law.warning if active else ''
+    if not warning and measured is not None and measured.error > _SCATTERED * noise:
+        warning = (
+            f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
+            f'configured {1e3 * noise:.2f} mm (prior.noise)'
         )
-    warning, measured = law.warning if active else '', guarded.measured
-    if measured is not None:
-        status = replace(
-            status,
-            last_measurement_readings=measured.readings,
-            last_measurement_error=measured.error,
-        )
-        if not warning and measured.error > _SCATTERED * noise:
-            warning = (
-                f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
-                f'configured {1e3 * noise:.2f} mm (prior.noise)'
-            )
     return status, warning
 
 

@@ -118,16 +118,7 @@ class SteeringModel:
         Prior covariance of the causes, of the position between two points of the grid, and of
         the slow error, by path noise and slow error; hypothesis i has that of number i // g.
     responses : HypothesisResponses
-        Responses at the g points of the grid; hypothesis i has those of point i modulo g. Shifts
-        of the tip at each depth: ``guide``, shape (g, n + 1, n), per position of the guide
-        in each step; ``causes``, shape (g, n + 1, 5 + n), per origin [m], turn of the frame [rad],
-        tilt, load of the bevel [N] without roll, and curvature of the path at each depth [1/m];
-        ``bevel``, shape (g, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
-        step; ``elastic``, shape (g, n + 1), of the resting tip per load of the bevel [m/N];
-        ``between``, shape (2, g, n + 1, n), change of ``guide`` from one point to the next in
-        bending length, and in skin; ``lags``, shape (g, n + 1), largest lag of the roll of the tip
-        behind the base at each depth [rad]. ``guide_load``, ``causes_load`` and ``bevel_load``,
-        with n rows, are the same for the force on the guide at its position of each step [N].
+        Responses at the g points of the grid; hypothesis i has those of point i modulo g.
 
     """
 

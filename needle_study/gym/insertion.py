@@ -13,8 +13,7 @@ from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.boxed import Boxed
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
-from needle_study.gym.actions import checked_actions
-from needle_study.gym.picture import picture
+from needle_study.gym.environment import checked_actions, picture
 from needle_study.gym.pushed import BOUND, FORCE, observe, push, Pushed, START, Tissues, UNITS
 import numpy as np
 

@@ -12,8 +12,7 @@ from needle_controller.steering.simulation import sample_truth, SteeringPlant, s
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
-from needle_study.gym.actions import checked_actions
-from needle_study.gym.picture import picture
+from needle_study.gym.environment import checked_actions, picture
 from needle_study.gym.pushed import BOUND
 import numpy as np
 

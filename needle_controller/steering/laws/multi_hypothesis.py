@@ -33,22 +33,7 @@ from collections.abc import Mapping, Sequence
 from math import cos, nan, sin
 from typing import NamedTuple
 
-from needle_controller.compiled.guide_plan import choose_guide, hit_probability, reachable_set
-from needle_controller.compiled.hypotheses import (
-    advance,
-    BEVEL,
-    FROZEN,
-    LOST,
-    MISSING,
-    predict,
-    SAME,
-    Steering,
-    STEP,
-    TURNS,
-    update,
-    VALID,
-    weights,
-)
+from needle_controller.compiled import guide_plan, hypotheses
 from needle_controller.steering.law import (
     checked_roll,
     checked_target,
@@ -145,9 +130,9 @@ class MultiHypothesisLaw(SteeringLaw):
         prior, count = model.prior_covariance, len(model.lengths)
         points = len(model.responses.guide)
         mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
-        mean[:, BEVEL] = 1j * model.push
+        mean[:, hypotheses.BEVEL] = 1j * model.push
         self._model = model
-        self._now = Steering(
+        self._now = hypotheses.Steering(
             responses=model.responses,
             drifts=model.drifts,
             decay=model.decay,
@@ -191,16 +176,16 @@ class MultiHypothesisLaw(SteeringLaw):
 
     @property
     def step(self) -> int:
-        return int(self._now.counts[STEP])
+        return int(self._now.counts[hypotheses.STEP])
 
     @property
     def turns(self) -> int:
-        return int(self._now.counts[TURNS])
+        return int(self._now.counts[hypotheses.TURNS])
 
     @property
     def weights(self) -> FloatArray:
         """Probability of each hypothesis, shape (h,)."""
-        return weights(self._now.logs)
+        return hypotheses.weights(self._now.logs)
 
     @property
     def bending(self) -> float:
@@ -213,19 +198,19 @@ class MultiHypothesisLaw(SteeringLaw):
 
         Guide and roll are assumed to stay at their last setpoint.
         """
-        x, z, xx, xz, zz = predict(self._boxed, range(self._model.steps + 1)[at])
+        x, z, xx, xz, zz = hypotheses.predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
     def hit_probability(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
         if self._hit_probability is None:
-            self._hit_probability = hit_probability(self._boxed)
+            self._hit_probability = guide_plan.hit_probability(self._boxed)
         return self._hit_probability
 
     @property
     def reach(self) -> Reach:
-        middles, sizes, _ = reachable_set(self._boxed)
+        middles, sizes, _ = guide_plan.reachable_set(self._boxed)
         return Reach(middles, sizes, self.weights)
 
     def status(self) -> Mapping[str, float]:
@@ -262,14 +247,14 @@ class MultiHypothesisLaw(SteeringLaw):
         x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
         self._hit_probability = None
-        kind, off_x, off_z = update(self._boxed, at, x, z, variance)
-        if kind == VALID:
+        kind, off_x, off_z = hypotheses.update(self._boxed, at, x, z, variance)
+        if kind == hypotheses.VALID:
             return
-        if kind == LOST:
-            missing = self._now.counts[MISSING]
+        if kind == hypotheses.LOST:
+            missing = self._now.counts[hypotheses.MISSING]
             raise SteeringFaultError(f'{missing} tip measurements are missing')
-        if kind == FROZEN:
-            same = self._now.counts[SAME] + 1
+        if kind == hypotheses.FROZEN:
+            same = self._now.counts[hypotheses.SAME] + 1
             raise SteeringFaultError(f'the tip sensor is frozen: {same} identical measurements')
         raise SteeringFaultError(
             f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from its '
@@ -281,9 +266,9 @@ class MultiHypothesisLaw(SteeringLaw):
         self._hit_probability = None
         if k <= last:
             now.guide[k] = self._choose()
-        advance(self._boxed)
+        hypotheses.advance(self._boxed)
         there = complex(now.guide[min(k, last)])
         return GuideSetpoint(there.real, there.imag, float(now.roll[-1]))
 
     def _choose(self) -> complex:
-        return choose_guide(self._boxed)
+        return guide_plan.choose_guide(self._boxed)
