@@ -99,7 +99,7 @@ def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
 
 def distribution(name: str, given: Any) -> Distribution:
     """Parse a distribution: a number, or a mapping as ``{normal: [0, 0.02], within: [0, 1]}``."""
-    if _is_number(given):
+    if is_number(given):
         return Distribution(_CHOICE, (float(given),))
     if not isinstance(given, Mapping):
         raise ParameterError(f'{name} must be a number or one of {_kinds()}, got {given!r}')
@@ -136,7 +136,7 @@ def _kinds() -> str:
     return ', '.join([*kinds, f'{{{_CHOICE}: [values]}}'])
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and abs(value) <= _LARGEST
 
@@ -144,7 +144,7 @@ def _is_number(value: Any) -> bool:
 def _numbers(name: str, given: Any) -> tuple[float, ...]:
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{name} takes a list of numbers, got {given!r}')
-    if not all(map(_is_number, given)):
+    if not all(map(is_number, given)):
         raise ParameterError(
             f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
         )

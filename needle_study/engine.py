@@ -113,8 +113,10 @@ class Results:
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
-        self._parts = folder / 'parts'
-        self._file = folder / STUDY
+        #: File of all samples.
+        self.table = folder / TABLE
+        self._sum = self.table.with_suffix('.crc32')
+        self._parts, self._file = folder / 'parts', folder / STUDY
         if self._file.is_file():
             if self._begun()['study'] != json.loads(order(study))['study']:
                 raise ParameterError(f'{folder} belongs to another study; name another folder')
@@ -157,11 +159,6 @@ class Results:
                     end = part.end
             yield
 
-    @property
-    def table(self) -> Path:
-        """File of all samples."""
-        return self.folder / TABLE
-
     def missing(self) -> list[tuple[int, int]]:
         """Return the samples to compute, as ranges of first and last + 1."""
         begin, gaps = 0, list[tuple[int, int]]()
@@ -197,10 +194,6 @@ class Results:
             draft.replace(self.table)
         self._clear()
 
-    @property
-    def _sum(self) -> Path:
-        return self.table.with_suffix('.crc32')
-
     def _is_intact(self) -> bool:
         """Return whether the table has its checksum."""
         with suppress(OSError, UnicodeDecodeError):
@@ -232,12 +225,11 @@ class Results:
             with ExitStack() as stack:
                 writer = None
                 for one in tables:
-                    if writer is None:
-                        writer = stack.enter_context(
-                            parquet.ParquetWriter(
-                                draft, one.schema, compression='zstd', use_dictionary=False
-                            )
+                    writer = writer or stack.enter_context(
+                        parquet.ParquetWriter(
+                            draft, one.schema, compression='zstd', use_dictionary=False
                         )
+                    )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
             if durable:
                 # The parts are removed afterwards. A lost part is computed again.

@@ -16,7 +16,7 @@ from needle_dynamics.display import Displayed, new_figure, shown
 from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
-from needle_study.distribution import Distribution, distribution
+from needle_study.distribution import Distribution, distribution, is_number
 from needle_study.scenario import (
     check_names,
     mapping,
@@ -42,9 +42,8 @@ _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population
 _PARTS: Final = 50  # largest number of parts of a study that shows its progress
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 
-#: Largest number of samples and of dimensions, as limited by the Sobol sequence.
+#: Largest number of samples, as limited by the Sobol sequence.
 _MOST: Final = 2**30
-_DIMENSIONS: Final = 21201
 
 #: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
 _MOST_LATIN: Final = 2**24
@@ -115,12 +114,9 @@ class Study:
 
         `needle study` computes large studies on all cores, and writes them to files.
         """
-        if not progress:
-            return StudyTable(self, self.rows(0, self.samples))
-        parts = []
-        shares = np.array_split(np.arange(self.samples), min(self.samples, _PARTS))
-        with progress_of(progress, len(shares), 'parts') as advance:
-            for share in shares:
+        parts, count = [], min(self.samples, _PARTS) if progress else 1
+        with progress_of(progress, count, 'parts') as advance:
+            for share in np.array_split(np.arange(self.samples), count):
                 parts.append(self.rows(int(share[0]), len(share)))
                 advance()
         values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -237,15 +233,13 @@ def _factor(given: Any, names: Sequence[str]) -> FloatArray:
         raise ParameterError(f'{form}, got {given!r}')
     for one in given:
         valid = isinstance(one, Sequence) and not isinstance(one, str) and len(one) == 3
-        if not valid or one[0] not in names or one[1] not in names or one[0] == one[1]:
-            raise ParameterError(f'{form}, got {one!r}')
-        value = one[2]
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1.0:
+        valid = valid and one[0] in names and one[1] in names and one[0] != one[1]
+        if not (valid and is_number(one[2]) and abs(one[2]) < 1.0):
             raise ParameterError(f'{form}, got {one!r}')
         i, k = names.index(one[0]), names.index(one[1])
         if matrix[i, k] != 0.0:
             raise ParameterError(f'correlations has {one[0]} with {one[1]} twice')
-        matrix[i, k] = matrix[k, i] = value
+        matrix[i, k] = matrix[k, i] = one[2]
     try:
         return np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError as error:

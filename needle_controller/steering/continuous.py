@@ -23,12 +23,9 @@ class ContinuousInsertion(InsertionStrategy):
         #: Measurements at the depths, and the last depth that was passed.
         self._passing: dict[int, TipMeasurements] = {}
         self._passed = 0
-        #: Positions of the guide before and after the next depth [m].
-        self._between = np.zeros((2, 2))
-        #: Time of the last guide motion [ns].
-        self._sent = 0
-        #: Whether the needle has begun to move.
-        self._moved = False
+        self._between = np.zeros((2, 2))  #: positions of the guide around the next depth [m]
+        self._sent = 0  #: time of the last guide motion [ns]
+        self._moved = False  #: whether the needle has begun to move
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         self._between = np.array([[0.0, 0.0], [to.x, to.z]])
@@ -39,14 +36,11 @@ class ContinuousInsertion(InsertionStrategy):
         motions, depths = self._motions, self.law.depths
         motions.origin = np.array([depths[0], *self._between[0]])
         motions.goal = np.array([depths[-1], *self._between[1]])
-        motions.again = lambda later: self._insert(later, self._depth_now, again=True)
+        # From the present depth, within the motion.
+        motions.again = lambda later: self._insert(
+            later, float(np.clip(motions.at[0], motions.origin[0], motions.goal[0])), again=True
+        )
         return motions.insert(begin, now, again=again)
-
-    @property
-    def _depth_now(self) -> float:
-        """Insertion depth now, within the motion [m]."""
-        motions = self._motions
-        return min(max(float(motions.at[0]), float(motions.origin[0])), float(motions.goal[0]))
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Send the guide with the needle, and plan at each passed depth."""
@@ -76,9 +70,8 @@ class ContinuousInsertion(InsertionStrategy):
         low, high = depths[self._passed : self._passed + 2].tolist()
         begin, end = self._between
         part = min(max((depth + motions.velocity * interval - low) / (high - low), 0.0), 1.0)
-        way = end - begin
-        rate = way * motions.velocity / (high - low)
-        move = motions.guide_to(begin + part * way, rate, interval, now)
+        rate = (end - begin) * motions.velocity / (high - low)
+        move = motions.guide_to(begin + part * (end - begin), rate, interval, now)
         motions.monitor.stream(move)
         return move
 
@@ -108,9 +101,9 @@ class ContinuousInsertion(InsertionStrategy):
     def _end_measurement(self, now: int) -> JointMotion | None:
         """Pass the measurement in motion before it to the law as well."""
         k = self.law.step - 1
-        look = self._passing.pop(k, None)
-        if look is not None:
-            self.law.update(look, k)
+        readings = self._passing.pop(k, None)
+        if readings is not None:
+            self.law.update(readings, k)
         return super()._end_measurement(now)
 
     def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
@@ -122,6 +115,6 @@ class ContinuousInsertion(InsertionStrategy):
         depth = float(motions.at[0]) - motions.velocity * (now - stamp) / NANOSECONDS
         at = int(np.searchsorted(depths, depth))
         if 0 < at < len(depths):
-            look = self._passing.setdefault(at, TipMeasurements())
-            look.take(tip, float(depths[at]) - depth)
+            readings = self._passing.setdefault(at, TipMeasurements())
+            readings.take(tip, float(depths[at]) - depth)
         return None

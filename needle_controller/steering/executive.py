@@ -91,13 +91,10 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.fault, self._noise = '', prior.noise
         self.planner = InsertionPlanner(needle, steering, prior, settings, start, law)
         self._motions = MotionControl(settings, self.events)
-        #: The latest insertion.
+        self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
+        self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]
+        #: The latest insertion, and the retraction after it.
         self._insertion: InsertionStrategy | None = None
-        #: Record of it, for an executive after a restart.
-        self.keeper = RecordKeeper()
-        #: The newest reading of the tip [m].
-        self._tip: tuple[float, ...] | None = None
-        #: The retraction after it.
         self._retraction: Retraction | None = None
 
     @property
@@ -392,14 +389,12 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def diagnose(self, now: int) -> tuple[Severity, str, SteeringStatus]:
         """Return severity, the state in one line, and status."""
         insertion, job = self._insertion, self.planner.job
-        status, warning = describe(insertion, self._motions.goal, self._noise, active=self.steers)
         status = replace(
-            status,
+            describe(insertion, self._motions.goal, self._noise, active=self.steers),
             phase=self.phase,
             system=self.authority.mode,
             fault=self.fault,
             planned_fraction=None if job is None else job.fraction,
-            warning=warning,
             input={stream.name: stream.status(now) for stream in self._streams},
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,

@@ -102,10 +102,10 @@ class SteeringRecord:
         return before, np.array([self.depths[min(step, len(self.depths) - 1)], *plans[step]])
 
     def _check_tip(self, depth: float, tip: Sequence[float] | None, slip: float) -> None:
-        looks = [entry for entry in self.history if entry.get('tip') is not None]
-        if tip is None or not looks:
+        measured = [entry for entry in self.history if entry.get('tip') is not None]
+        if tip is None or not measured:
             raise JobError('the tip is not measured')
-        last = looks[-1]
+        last = measured[-1]
         off, moved = np.subtract(tip, last['tip']), depth - last['depth']
         across = slip + _STEEPEST * abs(moved)
         if abs(off[1] - moved) > slip or np.hypot(off[0], off[2]) > across:

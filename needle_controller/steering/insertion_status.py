@@ -27,22 +27,28 @@ _SCATTERED: Final = 3.0
 
 def describe(
     insertion: InsertionStrategy | None, goal: FloatArray, noise: float, *, active: bool
-) -> tuple[SteeringStatus, str]:
+) -> SteeringStatus:
     """
-    Return the status of an insertion, and its warning or ''.
+    Return the status of an insertion, with its warning.
 
     ``goal`` are the goals of the joints [m, rad], ``noise`` is the configured noise of a tip
     measurement [m], and a law has no warning unless ``active``.
     """
     if insertion is None:
-        return SteeringStatus(), ''
+        return SteeringStatus()
     guarded, law = insertion.law, insertion.law.law
     expected, measured = guarded.expected, guarded.measured
     x, z = np.asarray(law.target).tolist()
     _, guide_x, guide_z = goal[:3].tolist()
+    warning = law.warning if active else ''
+    if not warning and measured is not None and measured.error > _SCATTERED * noise:
+        warning = (
+            f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
+            f'configured {1e3 * noise:.2f} mm (prior.noise)'
+        )
     values = dict(law.status())
     turns = values.pop('turns_left', None)
-    status = SteeringStatus(
+    return SteeringStatus(
         target=(x, float(guarded.depths[-1]), z),
         step=min(guarded.step, guarded.steps),
         steps=guarded.steps,
@@ -55,14 +61,8 @@ def describe(
         expected_tip_half_width=expected and tuple(expected.half_width.tolist()),
         last_measurement_readings=measured and measured.readings,
         last_measurement_error=measured and measured.error,
+        warning=warning,
     )
-    warning = law.warning if active else ''
-    if not warning and measured is not None and measured.error > _SCATTERED * noise:
-        warning = (
-            f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
-            f'configured {1e3 * noise:.2f} mm (prior.noise)'
-        )
-    return status, warning
 
 
 def summarize(

@@ -40,6 +40,8 @@ class MotionMonitor:
 
     def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:
         self._joints, self._tolerances = list(joints), tolerances
+        #: Displacement of joints that follow.
+        self._moved = np.minimum(tolerances, _MOVED)
         #: Status of the nodes that take trajectories, by name.
         self._receivers: dict[str, RequestStatus] = {}
         #: Stamps of the motion with its repetitions, and of the motions of a stream [ns].
@@ -76,19 +78,15 @@ class MotionMonitor:
         columns = [self._joints.index(name) for name in move.joints]
         self._begin, self._goal = at.copy(), at.copy()
         self._goal[columns] = move.positions[-1]
-        way, room = np.abs(self._goal - self._begin), self._room
-        self._pending = way > (self._tolerances if arrives else room)
+        distance, moved = np.abs(self._goal - self._begin), self._moved
+        self._pending = distance > (self._tolerances if arrives else moved)
         self._arrives = arrives
         for k in np.flatnonzero(self._pending):
-            gone = move.positions[:, columns.index(int(k))] - at[k]
-            gone = gone * np.sign(self._goal[k] - at[k])
-            seen = len(gone) - 1 if arrives else int(np.argmax(gone >= min(room[k], way[k])))
-            wait = max(REPEAT_AFTER, float(move.times[seen]) + _REACTION)
+            shift = move.positions[:, columns.index(int(k))] - at[k]
+            shift = shift * np.sign(self._goal[k] - at[k])
+            point = -1 if arrives else int(np.argmax(shift >= min(moved[k], distance[k])))
+            wait = max(REPEAT_AFTER, float(move.times[point]) + _REACTION)
             self._overdue[k] = move.stamp + round(wait * NANOSECONDS)
-
-    @property
-    def _room(self) -> FloatArray:
-        return np.minimum(self._tolerances, _MOVED)
 
     def stream(self, move: JointMotion) -> None:
         """Add a motion that is soon replaced by the next: only its answers are monitored."""
@@ -102,7 +100,7 @@ class MotionMonitor:
             self._pending &= np.abs(at - self._goal) > self._tolerances
         else:
             gone = (at - self._begin) * np.sign(self._goal - self._begin)
-            self._pending &= gone < self._room
+            self._pending &= gone < self._moved
         return bool((self._pending & (stamp >= self._overdue)).any())
 
     @property
@@ -137,30 +135,22 @@ class MotionMonitor:
 
     def failure(self) -> str:
         """Describe how often the motion was sent, and which nodes answered."""
+        topic, count = JOINT_TRAJECTORY.name, len(self._stamps)
         late = np.flatnonzero(self._pending) if self._pending.any() else range(len(self._joints))
         names = {self._joints[k] for k in late}
-        takers = {
-            node: status
+        answers = {
+            node: [status.answer_to(topic, stamp) for stamp in self._stamps]
             for node, status in self._receivers.items()
-            if names & {*status.takes[JOINT_TRAJECTORY.name]}
+            if names & {*status.takes[topic]}
         }
-        silent = [
-            node
-            for node, status in takers.items()
-            if not any(status.answer_to(JOINT_TRAJECTORY.name, one) for one in self._stamps)
-        ]
-        if not takers:
-            why = f'no node reports that it takes {JOINT_TRAJECTORY.name}'
+        silent = [node for node, found in answers.items() if not any(found)]
+        last = [found[-1] for found in answers.values()]
+        if not answers:
+            why = f'no node reports that it takes {topic}'
         elif silent:
             why = f'no answer of {" and ".join(silent)}'
-        elif any(_is_late(status, self._stamps[-1]) for status in takers.values()):
+        elif any(answer and answer.verdict is Verdict.LATE for answer in last):
             why = 'it arrived too late'
         else:
-            why = f'{" and ".join(takers)} accepted it'
-        count = len(self._stamps)
-        return f'{JOINT_TRAJECTORY.name} sent {count} time{"s" * (count > 1)}, {why}'
-
-
-def _is_late(status: RequestStatus, stamp: int) -> bool:
-    answer = status.answer_to(JOINT_TRAJECTORY.name, stamp)
-    return answer is not None and answer.verdict is Verdict.LATE
+            why = f'{" and ".join(answers)} accepted it'
+        return f'{topic} sent {count} time{"s" * (count > 1)}, {why}'
