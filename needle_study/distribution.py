@@ -84,12 +84,6 @@ class Distribution:
             low, high = self.quantiles(np.array([least, most])).tolist()
         return low, high
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no value is between the ends of the truncation."""
-        low, high = _frozen(self.kind, self.numbers).cdf(self.within)
-        return not low < high
-
 
 @lru_cache(maxsize=256)
 def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
@@ -108,11 +102,10 @@ def distribution(name: str, given: Any) -> Distribution:
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
     numbers = _numbers(f'{name}: {kind}', given[kind])
-    found = Distribution(kind, numbers)
     if kind == _CHOICE:
         if not numbers or _WITHIN in given:
             raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
-        return found
+        return Distribution(kind, numbers)
     row = KINDS[kind]
     if len(numbers) != len(row.parameters):
         takes = ', '.join(row.parameters)
@@ -120,15 +113,15 @@ def distribution(name: str, given: Any) -> Distribution:
     if not row.valid(*numbers):
         raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
     if _WITHIN not in given:
-        return found
+        return Distribution(kind, numbers)
     ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN])
-    found = Distribution(kind, numbers, ends)  # type: ignore[arg-type]
-    if len(ends) != 2 or found.is_empty:
+    # The probabilities differ if a value is between the ends.
+    if len(ends) != 2 or not np.diff(_frozen(kind, numbers).cdf(ends)) > 0.0:
         raise ParameterError(
             f'{name}: {_WITHIN} takes [low, high] with values of the {kind} distribution between '
             f'them, got {list(ends)}'
         )
-    return found
+    return Distribution(kind, numbers, ends)  # type: ignore[arg-type]
 
 
 def _kinds() -> str:

@@ -103,10 +103,6 @@ class _Part(NamedTuple):
     checksum: str
     path: Path
 
-    @property
-    def is_intact(self) -> bool:
-        return _checksum(self.first, self.end, self.path) == self.checksum
-
 
 class Results:
     """Folder of a study; ParameterError for other content, JobError for a damaged table."""
@@ -153,7 +149,8 @@ class Results:
                 raise JobError(f'another process computes {self.folder}') from error
             end = 0
             for part in [] if self.table.exists() else self._done():
-                if part.first < end or not part.is_intact:
+                intact = _checksum(part.first, part.end, part.path) == part.checksum
+                if part.first < end or not intact:
                     part.path.unlink()
                 else:
                     end = part.end

@@ -76,9 +76,8 @@ def change_basis(
     q and the momenta rho A G q_dot are continuous. The depth changes at a constant rate from
     ``since`` to ``until`` [s], relative to the time of the new modes: the coupling between modes
     is the mean over the rotation in between. Slow modes do not rotate in this time and take the
-    full change; fast modes keep only the part that conserves the action energy / omega.
-
-    The new modes take the signs of the old modes. ``change``, shape (2 n, 2 n), is overwritten.
+    full change; fast modes keep only the part that conserves the action energy / omega. The new
+    modes take the signs of the old modes. ``change``, shape (2 n, 2 n), is overwritten.
     """
     n = new.squares.shape[0]
     for i in range(n):

@@ -75,11 +75,10 @@ class Noise(NamedTuple):
 class Filter(NamedTuple):
     """Filter and its history: arrays with one row per stored sample."""
 
-    needle: CompiledNeedle  #: nominal model of needle and tissue
-    noise: Noise  #: noise model
-    low_pass: LowPass  #: low-pass of the wrench
-    #: Scalars of each sample, see `SAMPLE`, shape (slots,).
-    samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]
+    needle: CompiledNeedle
+    noise: Noise
+    low_pass: LowPass
+    samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]  #: shape (slots,)
     states: Matrix  #: state after the sample, see `kalman`, shape (slots, N)
     #: Its covariance, and the transition over the sample, shape (slots, N, N).
     covariances: Array3

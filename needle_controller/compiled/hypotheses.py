@@ -123,7 +123,7 @@ class HypothesisResponses(NamedTuple):
 class Steering(NamedTuple):
     """State and limits of a steering controller: h hypotheses, n steps and m constants."""
 
-    responses: HypothesisResponses  #: responses of the tip
+    responses: HypothesisResponses
     drifts: Vector  #: standard deviation of the slow error by hypothesis [m], shape (h,)
     decay: Vector  #: correlation of the slow error over a step, shape (n,)
     path: Vector  #: depths relative to the target depth, from 0 to 1, shape (n + 1,)

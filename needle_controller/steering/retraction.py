@@ -74,8 +74,12 @@ class Retraction:
         if abs(depth - self._rest[1]) > STILL:
             self._rest = stamp, depth
         rest = (stamp - self._rest[0]) / NANOSECONDS
+        if self._follows and rest < REPEAT_AFTER:
+            return self._follow_depth(now)
         if self._follows:
-            return self._end_follow(now) if rest >= REPEAT_AFTER else self._follow_depth(now)
+            # The needle rests at the depth of the other node: the guide returns to its zero.
+            self._follows, self._end = False, depth
+            return self._withdraw(now)
         if self._is_deep or np.abs(motions.at[1:3]).max() > settings.guide_tolerance:
             late = stamp > motions.due + settings.patience * NANOSECONDS
             overdue = late or motions.monitor.is_late(motions.at, stamp)
@@ -114,8 +118,3 @@ class Retraction:
         move = motions.guide_to(to, np.zeros(2), duration, now)
         motions.monitor.stream(move)
         return move
-
-    def _end_follow(self, now: int) -> JointMotion | None:
-        """Return the guide to its zero: the needle rests at the depth of the other node."""
-        self._follows, self._end = False, float(self._motions.at[0])
-        return self._withdraw(now)
