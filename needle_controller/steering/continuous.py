@@ -2,7 +2,7 @@
 """Continuous insertion: the needle moves without rest, and the guide follows its depth."""
 
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl, STILL
@@ -13,7 +13,7 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 
-class ContinuousInsertion(InsertionStrategy):
+class ContinuousInsertion(SteppedInsertion):
     """Insert a needle without rests, with measurements in motion; the guide follows its depth."""
 
     def __init__(
@@ -45,7 +45,7 @@ class ContinuousInsertion(InsertionStrategy):
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Send the guide with the needle, and plan at each passed depth."""
         if self.phase is not Phase.INSERTING:
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         motions, depths, settings = self._motions, self.law.depths, self._settings
         depth, last = float(motions.at[0]), self.law.steps
         self._moved |= depth >= depths[0] + STILL
@@ -55,14 +55,14 @@ class ContinuousInsertion(InsertionStrategy):
             self._passed += 1
             self._pass()
         if self._passed == last:
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         if depth >= depths[last] - settings.depth_tolerance:
             self._passed, motions.due = last, stamp
             return self._end_guide(now)
         if stamp > motions.due + settings.patience * NANOSECONDS:
             # The guide is at its setpoint of this depth.
             motions.goal[1:] = motions.at[1:]
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         interval = 1.0 / settings.rate
         if stamp - self._sent < interval * NANOSECONDS:
             return None
@@ -98,13 +98,13 @@ class ContinuousInsertion(InsertionStrategy):
         self._between = np.array([there, [to.x, to.z]])
         self._motions.origin[1:], self._motions.goal[1:] = there, self._between[1]
 
-    def _end_measurement(self, now: int) -> JointMotion | None:
+    def _end_measurement(self, measured: TipMeasurements, now: int) -> JointMotion | None:
         """Pass the measurement in motion before it to the law as well."""
         k = self.law.step - 1
         readings = self._passing.pop(k, None)
         if readings is not None:
             self.law.update(readings, k)
-        return super()._end_measurement(now)
+        return super()._end_measurement(measured, now)
 
     def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
         """Process a reading of the tip, x, y, z [m], at rest or in motion."""

@@ -16,7 +16,7 @@ from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy, SteppedInsertion
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
@@ -94,7 +94,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
         self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]
         #: The latest insertion, and the retraction after it.
-        self._insertion: InsertionStrategy | None = None
+        self._insertion: SteppedInsertion | None = None
         self._retraction: Retraction | None = None
 
     @property
@@ -329,7 +329,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._run(lambda insertion: insertion.follow(stamp, now), now)
 
     def _run(
-        self, process: Callable[[InsertionStrategy], JointMotion | None], now: int
+        self, process: Callable[[SteppedInsertion], JointMotion | None], now: int
     ) -> JointMotion | None:
         """Pass an event to the insertion under way, and stop it on a fault."""
         insertion = self._insertion

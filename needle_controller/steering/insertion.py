@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stepped insertion, and its common part with the continuous insertion."""
-
-from abc import ABC, abstractmethod
+"""Stepped insertion: guide and needle move in turn, with a measurement at rest after each step."""
 
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
@@ -15,10 +13,11 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 
-class InsertionStrategy(ABC):
+class SteppedInsertion:
     """
     Insert a needle under a steering law: straighten the guide, measure, plan, move.
 
+    The needle moves when the guide has arrived: the path is independent of their speeds.
     Every event is a method that returns a motion to send, or raises a `NeedleError`, which ends
     the insertion. `phase` is GUIDING, INSERTING, MEASURING or DONE.
     """
@@ -58,11 +57,7 @@ class InsertionStrategy(ABC):
         return None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
-        """Process new positions of the joints during a motion."""
-        return self._wait(stamp, now)
-
-    def _wait(self, stamp: int, now: int) -> JointMotion | None:
-        """Wait until needle and guide rest at their goal."""
+        """Process new positions of the joints: wait until needle and guide rest at their goal."""
         motions = self._motions
         if stamp < motions.due:
             return None
@@ -75,8 +70,11 @@ class InsertionStrategy(ABC):
             raise SteeringFaultError(f'{missed}, {late:.1f} s late')
         return None
 
-    def _arrive(self, stamp: int, _now: int) -> JointMotion | None:
-        """Wait for rest at the goal, then begin a measurement."""
+    def _arrive(self, stamp: int, now: int) -> JointMotion | None:
+        """Insert the needle after the guide, or wait for rest, then begin a measurement."""
+        if self.phase is Phase.GUIDING and self.law.step:
+            goal = np.array([self.law.depths[self.law.step], *self._motions.goal[1:]])
+            return self._send(Phase.INSERTING, goal, now)
         depth = float(self._motions.at[0])
         if self._rest is None or abs(depth - self._rest[1]) > STILL:
             self._rest = stamp, depth
@@ -93,21 +91,18 @@ class InsertionStrategy(ABC):
         since, until = self._span
         if since < stamp <= until:
             self._measured.take(tip)
-        return self._end_measurement(now) if stamp >= until else None
+        return self._end_measurement(self._measured, now) if stamp >= until else None
 
     def watch(self, now: int) -> JointMotion | None:
         """End a measurement whose last readings do not arrive."""
         timeout = self._settings.measurement_timeout
         if self._measured is not None and now > self._span[1] + timeout * NANOSECONDS:
-            return self._end_measurement(now)
+            return self._end_measurement(self._measured, now)
         return None
 
-    def _end_measurement(self, now: int) -> JointMotion | None:
+    def _end_measurement(self, measured: TipMeasurements, now: int) -> JointMotion | None:
         """End a measurement of the tip, and begin the next step."""
-        measured, self._measured = self._measured, None
-        if measured is None:
-            return None
-        k = self.law.step
+        k, self._measured = self.law.step, None
         self.law.update(measured, k, float(self._motions.at[0]))
         to = self.law.plan()
         if k == self.law.steps:
@@ -115,25 +110,8 @@ class InsertionStrategy(ABC):
             return None
         return self._begin_step(to, now)
 
-    @abstractmethod
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         """Begin the step after a measurement at rest."""
-
-
-class SteppedInsertion(InsertionStrategy):
-    """
-    Insert a needle in steps, with a measurement at rest at the end of each.
-
-    The needle moves when the guide has arrived: the path is independent of their speeds.
-    """
-
-    def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         goal = self._motions.goal
         goal = np.array([goal[0], to.x, to.z, to.roll])[: len(goal)]
         return self._send(Phase.GUIDING, goal, now)
-
-    def _arrive(self, stamp: int, now: int) -> JointMotion | None:
-        if self.phase is Phase.GUIDING and self.law.step:
-            goal = np.array([self.law.depths[self.law.step], *self._motions.goal[1:]])
-            return self._send(Phase.INSERTING, goal, now)
-        return super()._arrive(stamp, now)

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.motion_control import LAGGING
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
@@ -128,11 +128,11 @@ class RecordKeeper:
     """The record of the latest insertion, created when it has changed."""
 
     def __init__(self) -> None:
-        self._insertion: InsertionStrategy | None = None
+        self._insertion: SteppedInsertion | None = None
         self._key: tuple[Any, ...] = ()
 
     def begin(
-        self, request: PlannedInsertion, insertion: InsertionStrategy, authority: Authority
+        self, request: PlannedInsertion, insertion: SteppedInsertion, authority: Authority
     ) -> None:
         """Keep the record of an insertion from now on."""
         self._insertion, self._request, self._authority = insertion, request, authority

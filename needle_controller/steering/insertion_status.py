@@ -3,7 +3,7 @@
 
 from typing import Final
 
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
 from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase
@@ -26,7 +26,7 @@ _SCATTERED: Final = 3.0
 
 
 def describe(
-    insertion: InsertionStrategy | None, goal: FloatArray, noise: float, *, active: bool
+    insertion: SteppedInsertion | None, goal: FloatArray, noise: float, *, active: bool
 ) -> SteeringStatus:
     """
     Return the status of an insertion, with its warning.
@@ -66,7 +66,7 @@ def describe(
 
 
 def summarize(
-    status: SteeringStatus, insertion: InsertionStrategy | None, failure: str, advice: str
+    status: SteeringStatus, insertion: SteppedInsertion | None, failure: str, advice: str
 ) -> tuple[Severity, str]:
     """
     Return severity and state in one line, for users.
