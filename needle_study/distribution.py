@@ -52,7 +52,6 @@ KINDS: Final = {
 }
 
 _LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
-
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
 
@@ -63,8 +62,7 @@ class Distribution:
 
     kind: str  #: one of `KINDS`, or ``choice``
     numbers: tuple[float, ...]  #: parameters of the kind, or equally probable values
-    #: Low and high end of a truncated distribution.
-    within: tuple[float, float] = (-np.inf, np.inf)
+    within: tuple[float, float] = (-np.inf, np.inf)  #: ends of a truncated distribution
 
     def quantiles(self, parts: FloatArray) -> FloatArray:
         """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""

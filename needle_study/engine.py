@@ -32,13 +32,11 @@ from pyarrow import parquet
 #: Samples of the first chunk, and the target duration of the others [s].
 _FIRST, _WANTED = 16, 1.0
 _LARGEST: Final = 2**13
-
 _GROUP: Final = 2**13  #: rows per group of the table; the bytes of the table depend on it
+_BLOCK: Final = 2**20  #: bytes that are read at once
 
 # The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
-
-_BLOCK: Final = 2**20  #: bytes that are read at once
 
 #: Name of a part: first sample, end, and checksum.
 _PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
@@ -109,8 +107,7 @@ class Results:
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
-        #: File of all samples.
-        self.table = folder / TABLE
+        self.table = folder / TABLE  #: file of all samples
         self._sum = self.table.with_suffix('.crc32')
         self._parts, self._file = folder / 'parts', folder / STUDY
         if self._file.is_file():

@@ -94,13 +94,11 @@ class _Insertion(NamedTuple):
 
     model: NeedleModel  #: the true needle
     states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
-    #: Command of each sample, and the force that acts from that sample on [N], shape (k,).
-    commands: FloatArray
-    forces: FloatArray
+    commands: FloatArray  #: command of each sample [N], shape (k,)
+    forces: FloatArray  #: force that acts from each sample on [N], shape (k,)
     noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k, 2)
     goal: FloatArray  #: reference [m], shape (k + 1,); NaN without a reference
-    #: As in `METRICS`.
-    stopped: float
+    stopped: float  #: as in `METRICS`
     left: float
 
     @property

@@ -17,19 +17,16 @@ class Variable(NamedTuple):
     """A variable that may differ from sample to sample."""
 
     default: float  #: value if it is not in the population
-    #: SI unit.
-    unit: str
+    unit: str  #: SI unit
     meaning: str
-    #: Valid range.
-    low: float = -inf
+    low: float = -inf  #: valid range
     high: float = inf
 
 
 class Metric(NamedTuple):
     """A metric of a sample."""
 
-    #: SI unit; '' for yes or no.
-    unit: str
+    unit: str  #: SI unit; '' for yes or no
     meaning: str
 
 

@@ -39,11 +39,9 @@ if TYPE_CHECKING:
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
-_PARTS: Final = 50  # largest number of parts of a study that shows its progress
+_PARTS: Final = 50  #: largest number of parts of a study that shows its progress
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
-
-#: Largest number of samples, as limited by the Sobol sequence.
-_MOST: Final = 2**30
+_MOST: Final = 2**30  #: largest number of samples, as limited by the Sobol sequence
 
 #: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
 _MOST_LATIN: Final = 2**24
@@ -61,8 +59,7 @@ class Study:
     samples: int
     seed: int
     design: str  #: one of `DESIGNS`
-    #: Distributions by variable; the other variables have their defaults.
-    population: Mapping[str, Distribution]
+    population: Mapping[str, Distribution]  #: by variable; the others have their defaults
     factor: FloatArray  #: Cholesky factor of the correlations of the normal scores, shape (d, d)
     document: Mapping[str, Any]  #: content of the study file
 

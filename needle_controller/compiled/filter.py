@@ -90,9 +90,7 @@ class Filter(NamedTuple):
     squares: Matrix
     tips: Matrix
     changes: Array3  #: change of basis from the previous sample, shape (slots, 2 n, 2 n)
-    #: Samples of the tip deflection in order: start and end of the exposure [s], mean [m],
-    #: shape (m, 3).
-    exposures: Matrix
+    exposures: Matrix  #: start and end [s] and mean [m] of the tip deflection, shape (m, 3)
 
 
 @inlined

@@ -31,11 +31,8 @@ _FINE: Final = np.linspace(-1.0, 1.0, 121)
 _ROLLS: Final = 16
 _COARSE: Final = np.linspace(-1.0, 1.0, 13)
 
-#: Least decrease of the mean square distance from the reachable set by a turn [m^2].
-_TURN: Final = 1e-4**2
-
-#: Cost of a load on the guide above its limit [m^2/N^2]: dominates every distance.
-_OVERLOAD: Final = 1.0
+_TURN: Final = 1e-4**2  #: Least decrease of the mean square distance by a turn [m^2].
+_OVERLOAD: Final = 1.0  #: Cost of a load above its limit [m^2/N^2]: dominates every distance.
 
 #: Abscissas and weights of the quadrature over a normal distribution.
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])

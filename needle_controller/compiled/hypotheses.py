@@ -74,15 +74,9 @@ _FAULT, _FAULT_CHANGE = 0.03, 2e-4
 #: the needle: a single measurement never does.
 _MOST_EVIDENCE, _STOP_EVIDENCE = 8.0, 10.0
 
-#: Squared distance beyond which each measurement has a gross error [m^2].
-_FARTHEST: Final = 0.1**2
-
-#: Least logarithm of the weight of a hypothesis, relative to the largest; then it is discarded.
-_LEAST_LOG: Final = -30.0
-
-#: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
-MOST_SAME: Final = 2
-
+_FARTHEST: Final = 0.1**2  #: Squared distance of a measurement with a gross error [m^2].
+_LEAST_LOG: Final = -30.0  #: Logarithm of the relative weight of a hypothesis to discard.
+MOST_SAME: Final = 2  #: Number of equal successive tip measurements that is a frozen sensor.
 MOST_MISSING: Final = 6  #: Largest number of successive missing tip measurements.
 
 #: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
@@ -112,11 +106,9 @@ class HypothesisResponses(NamedTuple):
     #: Change of `guide` to the next bending length, and to the next skin, shape (2, g, n + 1, n).
     between: Array4
     lags: Matrix  #: largest lag of the roll of the tip behind the base [rad], shape (g, n + 1)
-    #: Sums of the absolute values of `guide` at the last depth, from each step on,
-    #: shape (g, n + 1).
+    #: Sums of the absolute values at the last depth: of `guide` from each step on, shape
+    #: (g, n + 1), and of `bevel` from the skin and each step on, shape (g, n + 3).
     later_guide: Matrix
-    #: Sums of the absolute values of `bevel` at the last depth, from the skin and each step on,
-    #: shape (g, n + 3).
     later_bevel: Matrix
 
 
@@ -133,9 +125,7 @@ class Steering(NamedTuple):
     target: Vector  #: target of the tip, x and z [m], shape (2,)
     mean: ComplexMatrix  #: mean of the constants, shape (h, m)
     covariance: ComplexArray3  #: their covariance, shape (h, m, m)
-    #: Logarithm of the probability of each hypothesis, up to a constant; -inf if discarded,
-    #: shape (h,).
-    logs: Vector
+    logs: Vector  #: logarithm of the hypothesis weights; -inf if discarded, shape (h,)
     guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
     #: Direction of the bevel relative to zero roll, on the skin and in each step, by point of the
     #: grid, shape (g, n + 1).

@@ -43,13 +43,11 @@ class LawConstants(NamedTuple):
 
     kind: float  #: `INVERSE_DYNAMICS` or `PID`
     period: float  #: sample period h [s]
-    #: Response of the axis over one period of insertion to its velocity and to a constant force;
-    #: see `Response`.
+    #: Response of the axis over one period of insertion, and of withdrawal; see `Response`.
     pv: float
     vv: float
     pf: float
     vf: float
-    #: Response on withdrawal.
     back_pv: float
     back_vv: float
     back_pf: float
@@ -74,8 +72,7 @@ class LawConstants(NamedTuple):
     model_kv: float
     filter_time: float  #: time constant of the filter of the error rate [s]
     tolerance: float  #: error at rest below which the integral is frozen [m]
-    #: Fraction of an excess force that back-calculation removes in one period; 0 for conditional
-    #: integration.
+    #: Fraction of an excess force that back-calculation removes in one period; 0: conditional.
     tracking: float
     feed_forward: float  #: 1 with feed-forward, 0 without
     fade: float  #: factor by which the offset after a switch decreases in one period

@@ -22,9 +22,7 @@ BLOCK: Final = TERMS + TERMS * TERMS
 
 LENGTH: Final = 0.05  #: Insertion depth over which dry friction may change by its bound [m].
 _CORRELATED: Final = 0.01  #: Correlation time of the measurement noise [s].
-
-#: Time in which the covariance of a correction grows to its prior, without measurements [s].
-_MEMORY: Final = 60.0
+_MEMORY: Final = 60.0  #: Time in which a covariance grows to its prior, without measurements [s].
 
 
 @compiled

@@ -43,7 +43,6 @@ import numpy as np
 #: Changes from one message to the next that are implausible [m, rad].
 _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
-#: Phases with motions of this executive.
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
 
 

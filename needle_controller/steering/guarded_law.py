@@ -45,21 +45,15 @@ class GuardedLaw:
     ) -> None:
         self.law, self.depths, self.steps = law, depths, len(depths) - 1
         self._noise, self._settings, self._events = noise, settings, events
-        #: Number of plans so far: the number of the present depth.
-        self.step = 0
-        #: Expected position of the tip at the target depth, new after each plan.
-        self.expected: TipEstimate | None = None
-        #: Last measurement.
-        self.measured: AveragedTipMeasurement | None = None
-        #: Largest deviation of a reading of the tip so far [m].
-        self._scatter = 0.0
-        #: Depth of the tip less the insertion depth, at the first measurement [m].
-        self._ahead: float | None = None
+        self.step = 0  #: number of plans so far: the number of the present depth
+        self.expected: TipEstimate | None = None  #: tip at the target depth, new after each plan
+        self.measured: AveragedTipMeasurement | None = None  #: last measurement
+        self._scatter = 0.0  #: largest deviation of a reading of the tip so far [m]
+        self._ahead: float | None = None  #: first depth of the tip less the insertion depth [m]
         #: Successive missing and identical measurements, and the last measurement [m].
         self._missing = self._same = 0
         self._last = np.full(2, nan)
-        #: Last setpoint of guide and roll.
-        self.setpoint = GuideSetpoint(0.0, 0.0)
+        self.setpoint = GuideSetpoint(0.0, 0.0)  #: last setpoint of guide and roll
         self._warned = False
         #: Inputs of the law in their order, and its setpoints: ``aim`` x, z [m]; ``tip``, x, y, z
         #: [m], or None, with the fields of `AveragedTipMeasurement`, ``at`` and ``depth`` as in

@@ -27,11 +27,9 @@ class SteppedInsertion:
     ) -> None:
         self.law, self._motions, self._settings = law, motions, settings
         self.phase = Phase.GUIDING
-        #: Stamp [ns] and insertion depth [m] at the start of rest.
-        self._rest: tuple[int, float] | None = None
+        self._rest: tuple[int, float] | None = None  #: stamp [ns] and depth [m] at its start
         self._measured: TipMeasurements | None = None
-        #: Stamps between which readings belong to a measurement at rest [ns].
-        self._span = 0, 0
+        self._span = 0, 0  #: stamps between which readings belong to a measurement at rest [ns]
 
     def begin(self, at: FloatArray, now: int) -> JointMotion | None:
         """Send the guide from joint positions [m, rad] to its zero, or to its last setpoint."""

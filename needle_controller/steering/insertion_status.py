@@ -20,9 +20,7 @@ _DESCRIPTIONS: Final = {
     Phase.MEASURING: 'measures the tip',
     Phase.RETRACTING: 'the needle is withdrawn',
 }
-
-#: Noise of the readings of the tip, as a multiple of the configured noise, that is reported.
-_SCATTERED: Final = 3.0
+_SCATTERED: Final = 3.0  #: Multiple of the configured noise of a measurement that is reported.
 
 
 def describe(

@@ -24,10 +24,7 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
     'roll_to_target': f'{_LAWS}.roll_to_target:RollToTargetLaw',
     'open_loop': f'{_LAWS}.open_loop:OpenLoopLaw',
 }
-
-#: Default law of the node, of `needle steer` and of studies.
-DEFAULT_LAW: Final = 'multi_hypothesis'
-
+DEFAULT_LAW: Final = 'multi_hypothesis'  #: Default law of node, `needle steer` and studies.
 
 #: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
 NORMAL, _CHI_SQUARED = 1.96, 5.991

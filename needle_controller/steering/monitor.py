@@ -12,9 +12,9 @@ from needle_ros.requests import Acknowledgement, REPEAT_AFTER, REPEATS, RequestS
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-#: Least displacement of a joint that follows, if less than its tolerance [m, rad].
-_MOVED: Final = 1e-4
-
+_MOVED: Final = (
+    1e-4  #: Displacement of a joint that follows, unless its tolerance is less [m, rad].
+)
 _REACTION: Final = 0.3  #: Time for a robot to react to a motion [s].
 _STREAMED: Final = 64  #: Number of kept stamps of a stream of motions: more than in a second.
 
@@ -40,10 +40,8 @@ class MotionMonitor:
 
     def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:
         self._joints, self._tolerances = list(joints), tolerances
-        #: Displacement of joints that follow.
         self._moved = np.minimum(tolerances, _MOVED)
-        #: Status of the nodes that take trajectories, by name.
-        self._receivers: dict[str, RequestStatus] = {}
+        self._receivers: dict[str, RequestStatus] = {}  #: nodes that take trajectories, by name
         #: Stamps of the motion with its repetitions, and of the motions of a stream [ns].
         self._stamps: list[int] = []
         self._streamed: deque[int] = deque(maxlen=_STREAMED)
@@ -59,8 +57,7 @@ class MotionMonitor:
         self._begin = self._goal = np.zeros(len(self._joints))
         self._pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
         self._arrives = False
-        #: Time from which each joint is late [ns].
-        self._overdue = np.zeros(len(self._joints), dtype=np.int64)
+        self._overdue = np.zeros(len(self._joints), dtype=np.int64)  #: times of late joints [ns]
 
     def begin(
         self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False

@@ -16,16 +16,11 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 BRAKING: Final = 0.2  #: Time in which needle and guide brake to rest after a stop [s].
-
-#: Number of points of a stop: one that arrives within a second is not in the past yet.
-_HELD: Final = 6
-
+_HELD: Final = 6  #: Number of points of a stop: if it arrives within a second, one is not past.
 LAGGING: Final = 5.0  #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 
-#: Time after which a stop is sent again to a needle that still moves [s], and number of times that
-#: it is sent.
+#: Time after which a stop is sent again to a needle that still moves [s], and number of stops.
 _STOP_AGAIN, _STOPS = 0.5, 4
-
 _SPAN: Final = 0.05  #: Time over which the velocity of the needle is measured [s].
 STILL: Final = 1e-4  #: Largest displacement of a needle at rest [m].
 
@@ -36,8 +31,7 @@ class MotionControl:
     def __init__(self, settings: ExecutiveSettings, events: EventLog) -> None:
         self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
-        #: Measured positions [m, rad], shape (joints,); nan before the first measurement.
-        self.at = np.full(len(settings.joints), np.nan)
+        self.at = np.full(len(settings.joints), np.nan)  #: measured positions [m, rad]
         #: Velocity of the needle [m/s]; stamp [ns] and depth [m] from which it is measured.
         self.velocity = 0.0
         self._before: tuple[int, float] | None = None
@@ -46,8 +40,7 @@ class MotionControl:
         self.origin = self.goal = np.zeros(len(settings.joints))
         self.due = 0
         self.again: Callable[[int], JointMotion | None] = lambda _now: None
-        #: Stamp of the newest motion [ns], unique for each motion.
-        self._stamp = 0
+        self._stamp = 0  #: stamp of the newest motion [ns], unique for each motion
         #: Positions of the stop, stamp [ns] and insertion depth [m] of the last check for rest,
         #: and number of stops left to send.
         self._halt: FloatArray | None = None

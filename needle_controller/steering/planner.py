@@ -19,9 +19,7 @@ from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import JobError, NeedleError, ParameterError
 import numpy as np
 
-#: Largest depth of a needle outside tissue, where the guide may move freely [m].
-_OUTSIDE: Final = 1e-3
-
+_OUTSIDE: Final = 1e-3  #: Depth of a needle outside tissue, where the guide may move freely [m].
 _SAME: Final = 1e-6  #: Tolerance of equal numbers of steps.
 _MOST_STEPS: Final = 200  #: Most steps of a plan.
 
@@ -36,9 +34,8 @@ class InsertionPlanner:
     settings: ExecutiveSettings
     start_job: StartJob
     law: str
-    #: Computation under way, and its request.
-    job: Job[SteeringLaw] | None = None
-    request: PlannedInsertion | None = None
+    job: Job[SteeringLaw] | None = None  #: computation under way
+    request: PlannedInsertion | None = None  #: its request
     recalled: SteeringRecord | None = None  #: record of the insertion before a restart
 
     def advice(self, depth: float) -> str:

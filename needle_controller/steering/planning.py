@@ -24,8 +24,8 @@ class Job(Generic[_Result]):
 
     def __init__(self, work: Callable[[Progress], _Result]) -> None:
         self._work = work
-        #: Fraction that is done, 0 to 1, and whether it has ended, with a result or an error.
-        self.fraction, self.done = 0.0, False
+        self.fraction = 0.0  #: fraction that is done, 0 to 1
+        self.done = False  #: whether it has ended, with a result or an error
         self.cancelled = False
         self._error: Exception | None = JobError('the job is not done')
         self._start()

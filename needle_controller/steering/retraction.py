@@ -31,13 +31,11 @@ class Retraction:
         self._motions, self._settings, self._events = motions, settings, events
         self.ended, self.failure = False, ''
         events.add(Severity.INFO, 'the needle is withdrawn')
-        #: Positions at the begin [m, rad], shape (joints,), None before; depth at the end [m].
-        self._begin: FloatArray | None = None
-        self._end = settings.retract_depth
+        self._begin: FloatArray | None = None  #: positions at the begin [m, rad], shape (joints,)
+        self._end = settings.retract_depth  #: depth at the end [m]
         #: Whether another node withdraws the needle; time of the last guide motion then [ns].
         self._follows, self._guided = False, 0
-        #: Stamp [ns] and insertion depth [m] since which the needle rests.
-        self._rest = 0, np.inf
+        self._rest = 0, np.inf  #: stamp [ns] and insertion depth [m] since which the needle rests
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         try:

@@ -29,8 +29,7 @@ class GroundTruth:
     steering: SteeringParameters
     tilt: tuple[float, float]  #: Tilt of the guide in x and z [rad].
     bevel: FloatArray  #: Load of the bevel in x and z [N], shape (2,).
-    #: Rotation of the sensor's frame: shift of the tip in x and z per depth [rad], shape (2,).
-    frame: FloatArray
+    frame: FloatArray  #: Shift of the tip in x and z per depth by the sensor [rad], shape (2,).
     seed: int  #: Seed of the noise of the path.
 
     def plant(self, depths: FloatArray) -> SteeringPlant:
@@ -150,12 +149,10 @@ class SteppedTipSensor:
 class SteeringRun(NamedTuple):
     """Simulated insertion under a steering law."""
 
-    #: Distance traveled by the guide [m], and number of turns of the needle.
-    travel: float
-    turns: int
+    travel: float  #: Distance traveled by the guide [m].
+    turns: int  #: Number of turns of the needle.
     load: float  #: Largest force on the guide after a motion of the guide [N].
-    #: First warning of the law before the last depth, with its depth; '' without one.
-    warning: str
+    warning: str  #: First warning of the law before the last depth, with its depth, or ''.
     times: list[float]  #: Computation time of the law at each depth [s].
 
 

@@ -34,8 +34,7 @@ class GuideLaw(ABC):
         self.depths, self.limits = model.depths, limits
         self.turns, self.roll = limits.turns, checked_roll(roll)
         self.step = 0
-        #: Position of the guide at each depth so far [m]; the last one is the present setpoint.
-        self.guides = [np.zeros(2)]
+        self.guides = [np.zeros(2)]  #: guide at each depth so far [m], at last its setpoint
         self._newest: tuple[FloatArray, int] | None = None
         self.aim(target)
         self.prepare(model)

@@ -50,8 +50,7 @@ from needle_ros.errors import JobError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Probability of a hit below which a target is rejected at the start, or warned of during the
-#: insertion.
+#: Probability of a hit below which a target is rejected at the start, or is warned of later.
 _REFUSED, _WARNED = 0.05, 0.5
 
 #: Logarithm of the weight of a kinematic hypothesis at the start, over the others, with turns.
@@ -152,8 +151,7 @@ class MultiHypothesisLaw(SteeringLaw):
             gross=np.zeros(5),
         )
         self._boxed = Boxed(self._now)
-        #: Probability of a hit after the last change of the state; None if not computed yet.
-        self._hit_probability: float | None = None
+        self._hit_probability: float | None = None  #: None until it is computed for this state
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
