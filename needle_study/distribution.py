@@ -119,7 +119,7 @@ def distribution(name: str, given: Any) -> Distribution:
             f'{name}: {_WITHIN} takes [low, high] with values of the {kind} distribution between '
             f'them, got {list(ends)}'
         )
-    return Distribution(kind, numbers, ends)  # type: ignore[arg-type]
+    return Distribution(kind, numbers, ends)
 
 
 def _kinds() -> str:

@@ -120,7 +120,7 @@ class _Insertion(NamedTuple):
     def measured(self) -> FloatArray:
         """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
         noise = np.concatenate([self.noise, np.zeros((1, 2))])[: len(self.states)]
-        return np.stack([self.depth, self.speed]) + noise.T
+        return np.asarray(np.stack([self.depth, self.speed]) + noise.T)
 
     def until(self, end: int) -> '_Insertion':
         """Truncate it at a sample."""

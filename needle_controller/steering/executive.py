@@ -286,13 +286,13 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
         """Process the status of another node by name: its answers to the motions."""
-        refusal = self._motions.monitor.hear(node, status)
+        refusal = self._motions.monitor.process(node, status)
         if refusal is None:
             return None
         if self.steers:
             return self._stop(str(refusal), now)
         if self._retraction is not None:
-            self._retraction.hear(refusal)
+            self._retraction.refuse(refusal)
         elif self.phase is Phase.STOPPED:
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None

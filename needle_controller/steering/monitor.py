@@ -105,7 +105,7 @@ class MotionMonitor:
         """Whether the largest number of repetitions is reached."""
         return len(self._stamps) > REPEATS
 
-    def hear(self, node: str, status: RequestStatus) -> MotionRefusal | None:
+    def process(self, node: str, status: RequestStatus) -> MotionRefusal | None:
         """Process the status of a node; return once that it does not execute the motion."""
         joints = status.takes.get(JOINT_TRAJECTORY.name)
         if joints is None:

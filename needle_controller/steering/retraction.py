@@ -44,7 +44,7 @@ class Retraction:
             self._fail(str(error))
             return None
 
-    def hear(self, refusal: MotionRefusal) -> None:
+    def refuse(self, refusal: MotionRefusal) -> None:
         """Process that a node does not execute the motion."""
         if self.ended:
             return

@@ -155,16 +155,12 @@ class MultiHypothesisLaw(SteeringLaw):
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
-        new = checked_target(target)
-        before = self.target
-        self._set_target(new)
+        before, self._now.target[:] = self.target, checked_target(target)
+        self._hit_probability = None
         if self.hit_probability < _REFUSED:
             error = OutOfReachError(self._unreachable(), self.reach)
-            self._set_target(before)
+            self._now.target[:], self._hit_probability = before, None
             raise error
-
-    def _set_target(self, target: FloatArray) -> None:
-        self._now.target[:], self._hit_probability = target, None
 
     # Estimates.
 
