@@ -134,7 +134,7 @@ class GuardedLaw:
             return
         self._missing = 0
         self._same = self._same + 1 if np.array_equal(tip, self._last) else 0
-        self._last = tip
+        self._last = tip.copy()
         if self._same >= MOST_SAME:
             raise SteeringFaultError(
                 f'the tip sensor is frozen: {self._same + 1} identical measurements'

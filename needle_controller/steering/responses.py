@@ -94,20 +94,16 @@ class SteeringModel:
         Whether the guide moves in proportion to the depth and reaches the position of a step at
         its end; otherwise it moves while the needle rests, and rests during the insertion.
     progress : callable, optional
-        Called before each hypothesis, with the number of those done and of all. An exception that
-        it raises cancels the construction and reaches the caller. A hypothesis of 200 steps takes
-        some 10 ms, in compiled code that releases the GIL.
+        Called before each hypothesis, with the number of those done and of all. Its exception
+        cancels the construction. A hypothesis of 200 steps takes 10 ms, without the GIL.
 
     Attributes
     ----------
     needle, steering, depths, prior
         As given.
-    lengths : ndarray, shape (h,)
-        Bending length of each hypothesis, relative to the nominal one.
-    skins : ndarray, shape (h,)
-        Skin stiffness of each hypothesis, relative to the stiffness of the tissue [m].
-    drifts : ndarray, shape (h,)
-        Standard deviation of the slow error of the sensor of each hypothesis [m].
+    lengths, skins, drifts : ndarray, shape (h,)
+        By hypothesis: bending length relative to the nominal one, skin stiffness relative to the
+        stiffness of the tissue [m], standard deviation of the slow error of the sensor [m].
     rolled : ndarray of bool, shape (h,)
         Whether a hypothesis is kinematic: of a needle that is turned.
     decay : ndarray, shape (n,)
