@@ -44,9 +44,7 @@ import numpy as np
 _OPEN_LOOP: Final = 'open_loop'
 
 _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
-
 _JOINTS: Final = contract.steered_states().without_efforts()
-
 _EXACT: Final = SteppedTipErrors()  # of a sensor with white noise alone
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion

@@ -113,19 +113,15 @@ LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float]
 
 def find_law(name: str) -> LawClass:
     """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
+    valid = f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class'
     module, _, of_class = STEERING_LAWS.get(name, name).partition(':')
     if not module or not of_class:
-        raise ParameterError(
-            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class, got {name!r}'
-        )
+        raise ParameterError(f'{valid}, got {name!r}')
     try:
         found: LawClass = getattr(import_module(module), of_class)
     # The module is any code of the user.
     except Exception as error:
-        raise ParameterError(
-            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class; {name!r} cannot be '
-            f'imported: {error}'
-        ) from error
+        raise ParameterError(f'{valid}; {name!r} cannot be imported: {error}') from error
     return found
 
 
@@ -174,19 +170,17 @@ def checked_roll(roll: float) -> float:
     return roll
 
 
-def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
+def checked_tip(tip: ArrayLike | None, name: str = 'a tip measurement') -> FloatArray:
     """Return a tip measurement x, z [m], nan if it is missing."""
     found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
     if found.shape != (2,):
-        raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
+        raise ShapeError(f'{name} must be x and z, got shape {found.shape}')
     return found
 
 
 def checked_target(target: ArrayLike) -> FloatArray:
     """Return a target x, z [m], if it is two finite numbers."""
-    found = np.array(target, dtype=np.float64)
-    if found.shape != (2,):
-        raise ShapeError(f'target must be x and z, got shape {found.shape}')
+    found = checked_tip(target, 'target')
     if not np.isfinite(found).all():
         raise ParameterError(f'target must be finite, got {found.tolist()} m')
     return found

@@ -79,14 +79,8 @@ class MultiHypothesisLaw(SteeringLaw):
 
     Parameters
     ----------
-    model : SteeringModel
-        Hypotheses, with the depths of the tip measurements.
-    target : array_like, shape (2,)
-        Target position of the tip at the last depth, x and z in the frame of the sensor [m].
-    limits : SteeringLimits
-        Limits of the guide setpoints.
-    roll : float
-        Roll of the needle at the start [rad].
+    model, target, limits, roll
+        As for `build_law`.
 
     Raises
     ------
