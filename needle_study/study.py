@@ -106,11 +106,7 @@ class Study:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
 
     def simulate(self, progress: Progress | None = None) -> StudyTable:
-        """
-        Simulate all samples in this process, with their progress as for `progress_of`.
-
-        `needle study` computes large studies on all cores, and writes them to files.
-        """
+        """Simulate all samples in this process; `needle study` uses all cores, and files."""
         parts, count = [], min(self.samples, _PARTS) if progress else 1
         with progress_of(progress, count, 'parts') as advance:
             for share in np.array_split(np.arange(self.samples), count):

@@ -296,11 +296,7 @@ def _log_density(off: complex, variance: float) -> float:
 def _update_hypotheses(
     c: Steering, w: FloatArray, tip: TipDistribution, measured: complex
 ) -> tuple[float, float]:
-    """
-    Update all hypotheses and their weights with a tip measurement [m] of a distribution.
-
-    Returns the probability that it has no gross error, and the logarithm of its likelihood.
-    """
+    """Update all hypotheses; return the probability of no gross error, and the log-likelihood."""
     share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.gross[_MEASURED])
     likely, sounds, largest = np.full(len(w), -inf), np.zeros(len(w)), -inf
     for i in range(len(w)):

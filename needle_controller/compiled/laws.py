@@ -144,11 +144,7 @@ def _dry(c: LawConstants, velocity: float, acceleration: float) -> float:
 
 @compiled
 def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
-    """
-    Return the motion to follow: the reference, or the modeled motion of inverse dynamics.
-
-    The modeled motion starts at the measurement and converges to the reference with k_p and k_v.
-    """
+    """Return the motion to follow: the reference, or the modeled motion, which converges to it."""
     if c.kind == PID:
         return at
     position, velocity = at.position, at.velocity

@@ -35,12 +35,7 @@ def bounds(share: float, coulomb: float, viscous: float) -> tuple[float, float, 
 def correction(
     block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
-    """
-    Return the learned additional friction [N] in the direction of a block (BLOCK,), within bounds.
-
-    ``limits`` are from `bounds`, ``depth`` is the position [m], ``speed`` the speed of the axis
-    [m/s].
-    """
+    """Return the learned friction [N] of a block (BLOCK,) at a depth [m] and a speed [m/s]."""
     dry, viscous, slope = limits
     dry_part = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
     return float(min(max(dry_part, -dry), dry) + min(max(block[1], -viscous), viscous) * speed)

@@ -139,11 +139,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def target(
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> JointMotion | None:
-        """
-        Plan an insertion to a target x, y, z [m], or change the target of the insertion under way.
-
-        ``stamp`` and ``frame`` are of the message; a stamp of 0 is none.
-        """
+        """Plan an insertion to a target x, y, z [m], or change its target; a stamp may be 0."""
         if not self._is_new(TARGET, stamp, frame, now):
             return None
         try:

@@ -71,12 +71,7 @@ class SteeringRecord:
     def check(
         self, at: FloatArray, tip: Sequence[float] | None, state: int, own: ExecutiveSettings
     ) -> None:
-        """
-        Raise `JobError` if needle, guide and tip are not where the record leaves them.
-
-        ``at`` are the positions of the joints [m, rad], ``tip`` is a reading x, y, z [m], and
-        ``state`` the time of the newest change of the system state [ns].
-        """
+        """Raise `JobError` if joints [m, rad], tip x, y, z [m] or state [ns] have changed."""
         if self.ended:
             raise JobError(self.ended)
         if self.continuous or own.continuous:

@@ -66,11 +66,7 @@ def describe(
 def summarize(
     status: SteeringStatus, insertion: SteppedInsertion | None, failure: str, advice: str
 ) -> tuple[Severity, str]:
-    """
-    Return severity and state in one line, for users.
-
-    ``failure`` of a retraction, and ``advice`` for an idle node, may be ''.
-    """
+    """Return severity and state in one line, with the failure or the advice, if not empty."""
     if status.phase is Phase.STOPPED:
         return Severity.ERROR, f'stopped: {status.fault}'
     if failure and status.phase is Phase.IDLE:

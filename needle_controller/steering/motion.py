@@ -33,11 +33,7 @@ class JointMotion(NamedTuple):
 def smooth(
     joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float
 ) -> JointMotion:
-    """
-    Return a minimum-jerk motion from rest to rest of proportional joints.
-
-    ``begin`` and ``end`` are positions [m, rad], shape (joints,); ``duration`` is in s.
-    """
+    """Return a minimum-jerk motion from rest to rest [m, rad] in a duration [s]."""
     count = max(_POINTS, ceil(duration / _INTERVAL))
     times = duration * (np.arange(1, count + 1) / count)
     unit, shift = Quintic(Setpoint(0.0), Setpoint(1.0), duration), end - begin

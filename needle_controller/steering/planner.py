@@ -59,11 +59,7 @@ class InsertionPlanner:
         tip: Sequence[float] | None,
         state: int,
     ) -> PlannedInsertion:
-        """
-        Return a request with the depths of its steps, if an insertion can begin or resume.
-
-        ``begun`` is as for `depths`, ``tip`` and ``state`` are as for `SteeringRecord.check`.
-        """
+        """Return a request with its depths, if an insertion can begin or resume."""
         record, depth = self.recalled, float(request.at[0])
         if begun is None and record is not None:
             begun = float(record.depths[0])

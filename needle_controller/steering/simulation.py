@@ -53,11 +53,7 @@ def sample_truth(
     rng: np.random.Generator,
     seed: int,
 ) -> GroundTruth:
-    """
-    Sample a true needle from the prior uncertainty of a nominal needle.
-
-    The spread is uniform, standard deviations are normal. ``seed`` is the seed of the path noise.
-    """
+    """Sample a true needle: uniform in the spread of the prior, normal in its deviations."""
     length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
     tilt, frame, bevel = (size * rng.standard_normal(2) for size in sizes)

@@ -181,11 +181,7 @@ class MultiHypothesisLaw(SteeringLaw):
         return float(self.weights @ self._model.lengths)
 
     def expected(self, at: int = -1) -> TipEstimate:
-        """
-        Return the predicted position of the tip at a depth number, by default the last one.
-
-        Guide and roll are assumed to stay at their last setpoint.
-        """
+        """Predict the tip at a depth number, with guide and roll at their last setpoint."""
         x, z, xx, xz, zz = hypotheses.predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
