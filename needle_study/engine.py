@@ -158,12 +158,11 @@ class Results:
         begin, gaps = 0, list[tuple[int, int]]()
         if self.table.exists():
             return gaps
-        for part in self._done():
-            if part.first > begin:
-                gaps.append((begin, part.first))
-            begin = max(begin, part.end)
-        if begin < self.study.samples:
-            gaps.append((begin, self.study.samples))
+        parts = [(part.first, part.end) for part in self._done()]
+        for first, end in [*parts, (self.study.samples, self.study.samples)]:
+            if first > begin:
+                gaps.append((begin, first))
+            begin = max(begin, end)
         return gaps
 
     def _done(self) -> list[_Part]:

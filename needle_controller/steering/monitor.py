@@ -55,7 +55,8 @@ class MotionMonitor:
         self._streamed.clear()
         self._refused.clear()
         self._begin = self._goal = np.zeros(len(self._joints))
-        self._pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
+        #: Whether each joint still has to follow the motion, shape (joints,).
+        self.pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
         self._arrives = False
         self._overdue = np.zeros(len(self._joints), dtype=np.int64)  #: times of late joints [ns]
 
@@ -76,9 +77,9 @@ class MotionMonitor:
         self._begin, self._goal = at.copy(), at.copy()
         self._goal[columns] = move.positions[-1]
         distance, moved = np.abs(self._goal - self._begin), self._moved
-        self._pending = distance > (self._tolerances if arrives else moved)
+        self.pending = distance > (self._tolerances if arrives else moved)
         self._arrives = arrives
-        for k in np.flatnonzero(self._pending):
+        for k in np.flatnonzero(self.pending):
             shift = move.positions[:, columns.index(int(k))] - at[k]
             shift = shift * np.sign(self._goal[k] - at[k])
             point = -1 if arrives else int(np.argmax(shift >= min(moved[k], distance[k])))
@@ -91,14 +92,14 @@ class MotionMonitor:
 
     def is_late(self, at: FloatArray, stamp: int) -> bool:
         """Return whether the motion is overdue at positions [m, rad] with their stamp [ns]."""
-        if not self._pending.any():
+        if not self.pending.any():
             return False
         if self._arrives:
-            self._pending &= np.abs(at - self._goal) > self._tolerances
+            self.pending &= np.abs(at - self._goal) > self._tolerances
         else:
             gone = (at - self._begin) * np.sign(self._goal - self._begin)
-            self._pending &= gone < self._moved
-        return bool((self._pending & (stamp >= self._overdue)).any())
+            self.pending &= gone < self._moved
+        return bool((self.pending & (stamp >= self._overdue)).any())
 
     @property
     def exhausted(self) -> bool:
@@ -125,15 +126,10 @@ class MotionMonitor:
         # The motions before the newest are superseded by it.
         return answer.verdict is Verdict.SUPERSEDED and answer.stamp in self._stamps[-1:]
 
-    @property
-    def pending(self) -> BoolArray:
-        """Whether each joint still has to follow the motion, shape (joints,)."""
-        return self._pending
-
     def failure(self) -> str:
         """Describe how often the motion was sent, and which nodes answered."""
         topic, count = JOINT_TRAJECTORY.name, len(self._stamps)
-        late = np.flatnonzero(self._pending) if self._pending.any() else range(len(self._joints))
+        late = np.flatnonzero(self.pending) if self.pending.any() else range(len(self._joints))
         names = {self._joints[k] for k in late}
         answers = {
             node: [status.answer_to(topic, stamp) for stamp in self._stamps]

@@ -70,7 +70,7 @@ class InsertionPlanner:
                 except JobError as error:
                     raise _cannot_resume(error, begun) from error
                 return request._replace(depths=np.array(record.depths), record=record)
-        return request._replace(depths=self.depths(request.point, request.at, begun))
+        return request._replace(depths=self._depths(request, begun))
 
     def resume(self, request: PlannedInsertion, law: GuardedLaw) -> None:
         """Restore a law to the record of its request, if it has one."""
@@ -84,16 +84,9 @@ class InsertionPlanner:
         if np.abs(np.subtract(law.law.target, (x, z))).max() > _SAME:
             law.aim(np.array([x, z]))
 
-    def depths(
-        self, point: tuple[float, float, float], at: FloatArray, begun: float | None
-    ) -> FloatArray:
-        """
-        Return the depths of the steps to a target, if an insertion can begin.
-
-        ``at`` are joint positions [m, rad], ``begun`` the depth at the last begin [m], if there
-        was one.
-        """
-        settings = self.settings
+    def _depths(self, request: PlannedInsertion, begun: float | None) -> FloatArray:
+        """Return the depths of the steps, if an insertion can begin; the last began at a depth."""
+        point, at, settings = request.point, request.at, self.settings
         if at[0] < -_OUTSIDE:
             raise JobError(f'the needle is {-1e3 * at[0]:.2f} mm before the skin')
         depth, straight = max(0.0, float(at[0])), begun or 0.0
