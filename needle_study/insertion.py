@@ -6,24 +6,12 @@ from dataclasses import asdict, dataclass, field, replace
 from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
-from needle_controller import (
-    Axis,
-    check_stability,
-    ControllerSettings,
-    DEFAULT_GAINS,
-    Guard,
-    LAWS,
-    Measurement,
-    Reference,
-    ReferenceLimits,
-    REFERENCES,
-    run_batch,
-    SafetyLimits,
-    Setpoint,
-)
-from needle_controller.controller import LAW_OF
-from needle_controller.laws.axis import require_complete
+from needle_controller import check_stability, ControllerSettings, Guard, run_batch, SafetyLimits
+from needle_controller.controller import DEFAULT_GAINS, LAW_OF, LAWS, Measurement
+from needle_controller.laws.axis import Axis, require_complete
 from needle_controller.laws.law import Law
+from needle_controller.reference.generator import REFERENCES
+from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.parameters import PAPER_NEEDLE
@@ -44,7 +32,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 OPEN_LOOP: Final = 'open loop'
-
 CONTROLLERS: Final = (*LAWS, OPEN_LOOP)  #: control laws, and the open loop
 _REST: Final = 1e-5  #: largest speed of a needle at rest [m/s]
 _MOST: Final = 1_000_000  #: most samples of an insertion

@@ -7,15 +7,9 @@ from functools import cached_property
 from math import nan
 from typing import Any, Final
 
-from needle_controller import (
-    OutOfReachError,
-    SIMULATION_LIMITS,
-    SteeringLimits,
-    SteeringModel,
-    SteeringPrior,
-)
+from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
-from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits, STEP_LENGTH
 from needle_controller.steering.simulation import (
     GroundTruth,
     simulate_steering,
@@ -24,15 +18,9 @@ from needle_controller.steering.simulation import (
     SteppedTipErrors,
     SteppedTipSensor,
 )
-from needle_dynamics import (
-    DEFAULT_NEEDLE,
-    find_needle,
-    insert_batch,
-    NeedleParameters,
-    SteeringParameters,
-)
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
 from needle_dynamics.simulated.tip_errors import TipErrorParameters
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values

@@ -17,15 +17,7 @@ from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_study.distribution import Distribution, distribution, is_number
-from needle_study.scenario import (
-    check_names,
-    mapping,
-    Metric,
-    one_of,
-    Scenario,
-    SCENARIOS,
-    Variable,
-)
+from needle_study.scenario import check_names, mapping, one_of, Scenario, SCENARIOS
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
@@ -136,8 +128,8 @@ class StudyTable(Displayed):
 
     def columns(self) -> dict[str, FloatArray]:
         scenario = self.study.scenario
-        known: dict[str, Metric | Variable] = {**scenario.variables, **scenario.metrics}
-        units = {name: one.unit for name, one in known.items()}
+        units = {name: one.unit for name, one in scenario.variables.items()}
+        units |= {name: one.unit for name, one in scenario.metrics.items()}
         return {f'{name} [{units.get(name) or 1}]': one for name, one in self.values.items()}
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
