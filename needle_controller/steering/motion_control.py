@@ -105,13 +105,8 @@ class MotionControl:
         self, position: FloatArray, velocity: FloatArray, duration: float, now: int
     ) -> JointMotion:
         """Send the guide to a position [m] with a velocity [m/s] in a duration [s]."""
-        move = JointMotion(
-            self._settings.joints[1:3],
-            np.array([duration]),
-            position[np.newaxis],
-            velocity[np.newaxis],
-        )
-        return self._stamped(move, now)
+        guide, times = self._settings.joints[1:3], np.array([duration])
+        return self._stamped(JointMotion(guide, times, position[None], velocity[None]), now)
 
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
@@ -198,10 +193,10 @@ class MotionControl:
         held = np.tile(end, (_HELD, 1))
         times = BRAKING * np.arange(1.0, _HELD + 1.0)
         move = JointMotion(self._settings.joints, times, held, np.zeros_like(held))
-        halt = self._stamped(move, now)
+        move = self._stamped(move, now)
         self.monitor.forget()
-        self.monitor.stream(halt)
-        return halt
+        self.monitor.stream(move)
+        return move
 
     def stop_again(self, stamp: int, now: int) -> JointMotion | None:
         """Send the stop again to a needle that still advances; never beyond its present depth."""
