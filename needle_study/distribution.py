@@ -52,7 +52,6 @@ KINDS: Final = {
 }
 
 _LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
-
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
 
@@ -63,8 +62,7 @@ class Distribution:
 
     kind: str  #: one of `KINDS`, or ``choice``
     numbers: tuple[float, ...]  #: parameters of the kind, or equally probable values
-    #: Low and high end of a truncated distribution.
-    within: tuple[float, float] = (-np.inf, np.inf)
+    within: tuple[float, float] = (-np.inf, np.inf)  #: ends of a truncated distribution
 
     def quantiles(self, parts: FloatArray) -> FloatArray:
         """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""
@@ -84,12 +82,6 @@ class Distribution:
             low, high = self.quantiles(np.array([least, most])).tolist()
         return low, high
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether no value is between the ends of the truncation."""
-        low, high = _frozen(self.kind, self.numbers).cdf(self.within)
-        return not low < high
-
 
 @lru_cache(maxsize=256)
 def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
@@ -99,7 +91,7 @@ def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
 
 def distribution(name: str, given: Any) -> Distribution:
     """Parse a distribution: a number, or a mapping as ``{normal: [0, 0.02], within: [0, 1]}``."""
-    if _is_number(given):
+    if is_number(given):
         return Distribution(_CHOICE, (float(given),))
     if not isinstance(given, Mapping):
         raise ParameterError(f'{name} must be a number or one of {_kinds()}, got {given!r}')
@@ -108,11 +100,10 @@ def distribution(name: str, given: Any) -> Distribution:
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
     numbers = _numbers(f'{name}: {kind}', given[kind])
-    found = Distribution(kind, numbers)
     if kind == _CHOICE:
         if not numbers or _WITHIN in given:
             raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
-        return found
+        return Distribution(kind, numbers)
     row = KINDS[kind]
     if len(numbers) != len(row.parameters):
         takes = ', '.join(row.parameters)
@@ -120,15 +111,15 @@ def distribution(name: str, given: Any) -> Distribution:
     if not row.valid(*numbers):
         raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
     if _WITHIN not in given:
-        return found
+        return Distribution(kind, numbers)
     ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN])
-    found = Distribution(kind, numbers, ends)  # type: ignore[arg-type]
-    if len(ends) != 2 or found.is_empty:
+    # The probabilities differ if a value is between the ends.
+    if len(ends) != 2 or not np.diff(_frozen(kind, numbers).cdf(ends)) > 0.0:
         raise ParameterError(
             f'{name}: {_WITHIN} takes [low, high] with values of the {kind} distribution between '
             f'them, got {list(ends)}'
         )
-    return found
+    return Distribution(kind, numbers, ends)
 
 
 def _kinds() -> str:
@@ -136,7 +127,7 @@ def _kinds() -> str:
     return ', '.join([*kinds, f'{{{_CHOICE}: [values]}}'])
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return number and abs(value) <= _LARGEST
 
@@ -144,7 +135,7 @@ def _is_number(value: Any) -> bool:
 def _numbers(name: str, given: Any) -> tuple[float, ...]:
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{name} takes a list of numbers, got {given!r}')
-    if not all(map(_is_number, given)):
+    if not all(map(is_number, given)):
         raise ParameterError(
             f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
         )

@@ -32,13 +32,11 @@ from pyarrow import parquet
 #: Samples of the first chunk, and the target duration of the others [s].
 _FIRST, _WANTED = 16, 1.0
 _LARGEST: Final = 2**13
-
 _GROUP: Final = 2**13  #: rows per group of the table; the bytes of the table depend on it
+_BLOCK: Final = 2**20  #: bytes that are read at once
 
 # The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
-
-_BLOCK: Final = 2**20  #: bytes that are read at once
 
 #: Name of a part: first sample, end, and checksum.
 _PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
@@ -103,18 +101,15 @@ class _Part(NamedTuple):
     checksum: str
     path: Path
 
-    @property
-    def is_intact(self) -> bool:
-        return _checksum(self.first, self.end, self.path) == self.checksum
-
 
 class Results:
     """Folder of a study; ParameterError for other content, JobError for a damaged table."""
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
-        self._parts = folder / 'parts'
-        self._file = folder / STUDY
+        self.table = folder / TABLE  #: file of all samples
+        self._sum = self.table.with_suffix('.crc32')
+        self._parts, self._file = folder / 'parts', folder / STUDY
         if self._file.is_file():
             if self._begun()['study'] != json.loads(order(study))['study']:
                 raise ParameterError(f'{folder} belongs to another study; name another folder')
@@ -151,28 +146,23 @@ class Results:
                 raise JobError(f'another process computes {self.folder}') from error
             end = 0
             for part in [] if self.table.exists() else self._done():
-                if part.first < end or not part.is_intact:
+                intact = _checksum(part.first, part.end, part.path) == part.checksum
+                if part.first < end or not intact:
                     part.path.unlink()
                 else:
                     end = part.end
             yield
-
-    @property
-    def table(self) -> Path:
-        """File of all samples."""
-        return self.folder / TABLE
 
     def missing(self) -> list[tuple[int, int]]:
         """Return the samples to compute, as ranges of first and last + 1."""
         begin, gaps = 0, list[tuple[int, int]]()
         if self.table.exists():
             return gaps
-        for part in self._done():
-            if part.first > begin:
-                gaps.append((begin, part.first))
-            begin = max(begin, part.end)
-        if begin < self.study.samples:
-            gaps.append((begin, self.study.samples))
+        parts = [(part.first, part.end) for part in self._done()]
+        for first, end in [*parts, (self.study.samples, self.study.samples)]:
+            if first > begin:
+                gaps.append((begin, first))
+            begin = max(begin, end)
         return gaps
 
     def _done(self) -> list[_Part]:
@@ -196,10 +186,6 @@ class Results:
             write_whole(self._sum, _checksum(0, self.study.samples, draft).encode())
             draft.replace(self.table)
         self._clear()
-
-    @property
-    def _sum(self) -> Path:
-        return self.table.with_suffix('.crc32')
 
     def _is_intact(self) -> bool:
         """Return whether the table has its checksum."""
@@ -232,12 +218,11 @@ class Results:
             with ExitStack() as stack:
                 writer = None
                 for one in tables:
-                    if writer is None:
-                        writer = stack.enter_context(
-                            parquet.ParquetWriter(
-                                draft, one.schema, compression='zstd', use_dictionary=False
-                            )
+                    writer = writer or stack.enter_context(
+                        parquet.ParquetWriter(
+                            draft, one.schema, compression='zstd', use_dictionary=False
                         )
+                    )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
             if durable:
                 # The parts are removed afterwards. A lost part is computed again.

@@ -2,13 +2,14 @@
 """Insert sampled flexible needles to a depth, under a control law or in open loop."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
     Axis,
     check_stability,
+    ControllerSettings,
     DEFAULT_GAINS,
     LAWS,
     Measurement,
@@ -28,18 +29,23 @@ from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParamete
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant, from_values
+from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
+from needle_study.scenario import (
+    check_names,
+    mapping,
+    MeasuredRun,
+    Metric,
+    one_of,
+    Scenario,
+    Variable,
+)
 import numpy as np
 from scipy.optimize import brentq
 
 OPEN_LOOP: Final = 'open loop'
-
 CONTROLLERS: Final = (*LAWS, OPEN_LOOP)  #: control laws, and the open loop
 _REST: Final = 1e-5  #: largest speed of a needle at rest [m/s]
-_LIMITS: Final = SafetyLimits()  #: default limits of the guard
 _MOST: Final = 1_000_000  #: most samples of an insertion
 _AT_ONCE: Final = 16  #: open-loop insertions per batch, whose samples are all in memory
 
@@ -60,49 +66,38 @@ METRICS: Final[Mapping[str, Metric]] = {
 }
 
 
+def _same(settings: type, name: str) -> Any:
+    """Declare a field with the default and the range of a field of other settings."""
+    of_other = settings.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    return field(default=of_other.default, metadata=of_other.metadata)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InsertionStudy(CheckedSettings):
+class InsertionStudy(ReferenceLimits):
     """Settings of the scenario that are the same for all samples."""
 
-    rate: float = constant(1000.0, 'Hz', 'samples of the loop', low=1.0, high=10_000.0)
-    delay: float = constant(
-        1.0, 'periods', 'whole periods from a measurement to the effect of its command, in the '
-        'model of the law', high=20.0, whole=True,
-    )  # fmt: skip
-    force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
-    speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
-    acceleration: float = constant(
-        0.1, 'm/s^2', 'highest acceleration of the reference', open_low=True
-    )
+    rate: float = _same(ControllerSettings, 'rate')
+    delay: float = _same(ControllerSettings, 'delay')
+    force_limit: float = _same(ControllerSettings, 'force_limit')
+    speed_limit: float = _same(SafetyLimits, 'speed')
+    error_limit: float = _same(SafetyLimits, 'tracking_error')
+    deflection_limit: float = _same(SafetyLimits, 'tip_deflection')
     wait: float = constant(1.0, 's', 'time after the end of the reference', open_low=True)
     push: float = constant(3.0, 'N', 'force of the open loop', open_low=True)
     tolerance: float = constant(1e-4, 'm', 'largest error of a hit', open_low=True)
     step: float = constant(2e-4, 's', 'longest step of the simulated needle', low=1e-7)
-    speed_limit: float = constant(
-        _LIMITS.speed, 'm/s', 'speed at which the guard stops', open_low=True
-    )
-    error_limit: float = constant(
-        _LIMITS.tracking_error, 'm', 'distance from the reference at which the guard stops',
-        open_low=True,
-    )  # fmt: skip
-    deflection_limit: float = constant(
-        _LIMITS.tip_deflection, 'm', 'tip deflection at which the guard stops',
-        open_low=True,
-    )  # fmt: skip
 
 
-class _Course(NamedTuple):
+class _Insertion(NamedTuple):
     """Trajectory of one insertion up to its end or stop."""
 
     model: NeedleModel  #: the true needle
     states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
-    #: Command of each sample, and the force that acts from that sample on [N], shape (k,).
-    commands: FloatArray
-    forces: FloatArray
-    noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k + 1, 2)
+    commands: FloatArray  #: command of each sample [N], shape (k,)
+    forces: FloatArray  #: force that acts from each sample on [N], shape (k,)
+    noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k, 2)
     goal: FloatArray  #: reference [m], shape (k + 1,); NaN without a reference
-    #: As in `METRICS`.
-    stopped: float
+    stopped: float  #: as in `METRICS`
     left: float
 
     @property
@@ -120,6 +115,22 @@ class _Course(NamedTuple):
         """Tip deflection [m], shape (k + 1,)."""
         return self.model.tip_deflections(self.states)
 
+    @property
+    def measured(self) -> FloatArray:
+        """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
+        noise = np.concatenate([self.noise, np.zeros((1, 2))])[: len(self.states)]
+        return np.asarray(np.stack([self.depth, self.speed]) + noise.T)
+
+    def until(self, end: int) -> '_Insertion':
+        """Truncate it at a sample."""
+        return self._replace(
+            states=self.states[: end + 1],
+            commands=self.commands[:end],
+            forces=self.forces[:end],
+            noise=self.noise[: end + 1],
+            goal=self.goal[: end + 1],
+        )
+
 
 class InsertionScenario(Scenario):
     """
@@ -127,8 +138,7 @@ class InsertionScenario(Scenario):
 
     `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``controller`` of
     `CONTROLLERS` with ``gains`` that are stable for the ``uncertainty``; ``reference`` of
-    `REFERENCES`; and the fields of `InsertionStudy`. Raises `ParameterError` if a setting is
-    not valid.
+    `REFERENCES`; and the fields of `InsertionStudy`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -137,14 +147,10 @@ class InsertionScenario(Scenario):
         check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
         numbers = {name: value for name, value in settings.items() if name not in _PARTS}
         self._numbers = from_values(InsertionStudy, numbers, 'settings.')
-        words = {
-            'controller': (LAWS[0], CONTROLLERS),
-            'reference': (next(iter(REFERENCES)), tuple(REFERENCES)),
-        }
-        chosen = {
-            name: one_of(f'settings: {name}', settings.get(name, default), valid)
-            for name, (default, valid) in words.items()
-        }
+        controller, reference = (
+            one_of(f'settings: {name}', settings.get(name, next(iter(valid))), valid)
+            for name, valid in (('controller', CONTROLLERS), ('reference', REFERENCES))
+        )
         constants, gains, uncertainty = (
             mapping(f'settings: {name}', settings.get(name))
             for name in ('constants', 'gains', 'uncertainty')
@@ -154,18 +160,15 @@ class InsertionScenario(Scenario):
             {**asdict(find_needle(settings.get('needle', PAPER_NEEDLE)).needle), **constants},
             'settings.constants.',
         )
-        self._kind = REFERENCES[chosen['reference']]
+        self._kind = REFERENCES[reference]
         self._period = 1.0 / self._numbers.rate
         self._limits = SafetyLimits(
             speed=self._numbers.speed_limit,
             tracking_error=self._numbers.error_limit,
             tip_deflection=self._numbers.deflection_limit,
         )
-        self._law = self._made(
-            chosen['controller'],
-            gains,
-            from_values(Uncertainty, uncertainty, 'settings.uncertainty.'),
-        )
+        plants = from_values(Uncertainty, uncertainty, 'settings.uncertainty.')
+        self._law = self._made(controller, gains, plants)
         p, samples = self._needle, self._longest * self._numbers.rate
         if samples > _MOST:
             raise ParameterError(
@@ -205,8 +208,7 @@ class InsertionScenario(Scenario):
         if self._law is None:
             axis = Axis.insertion(p)
             return _time(axis, numbers.push, p.length - p.minimum_depth) + numbers.wait
-        limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
-        reference: Reference = self._kind(Setpoint(p.minimum_depth), p.length, limits)
+        reference: Reference = self._kind(Setpoint(p.minimum_depth), p.length, numbers)
         return reference.duration + numbers.wait
 
     def _made(
@@ -236,28 +238,27 @@ class InsertionScenario(Scenario):
     def insert(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[dict[str, float]]:
-        """Simulate insertions; return the metrics of each."""
-        return map(self._judged, rows, self._courses(rows, streams))
+        return map(self._metrics_of, rows, self._simulate(rows, streams))
 
     def replay(
         self, sample: Mapping[str, float], rng: np.random.Generator
     ) -> Iterator[MeasuredRun]:
         """Yield joints, tip and commands at each sample up to a stop, and the target."""
         row = self.row(sample)
-        (course,) = self._courses([row], [rng])
+        (run,) = self._simulate([row], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
-        m = course.model.coordinates
-        depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
+        m = run.model.coordinates
+        depths, speeds = run.measured
         # The effort acted up to the sample.
-        acted = np.concatenate([[0.0], course.forces])
-        for k, (state, tip) in enumerate(zip(course.states, course.tip, strict=True)):
+        acted = np.concatenate([[0.0], run.forces])
+        for k, (state, tip) in enumerate(zip(run.states, run.tip, strict=True)):
             stamp = round(k * self._period * NANOSECONDS)
             joints = (depths[k], state[1], speeds[k], state[m + 1], acted[k], 0.0)
             yield MeasuredRun(contract.JOINT_STATES, stamp, [float(value) for value in joints])
-            at = (0.0, float(course.depth[k]), float(tip))
+            at = (0.0, float(run.depth[k]), float(tip))
             yield MeasuredRun(contract.TIP_DEFLECTION, stamp, at)
-            if k < len(course.commands):
-                force = (0.0, float(course.commands[k]), 0.0)
+            if k < len(run.commands):
+                force = (0.0, float(run.commands[k]), 0.0)
                 yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
 
     def _truth(self, row: Mapping[str, float]) -> NeedleParameters:
@@ -270,10 +271,9 @@ class InsertionScenario(Scenario):
             carriage_mass=row['carriage_mass'],
         )
 
-    def _courses(
+    def _simulate(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[_Course]:
-        """Simulate the insertions."""
+    ) -> Iterator[_Insertion]:
         law = self._law
         if law is None:
             return self._open(rows, streams)
@@ -284,13 +284,12 @@ class InsertionScenario(Scenario):
         sizes = [row[name] for name in ('depth_noise', 'speed_noise', 'force_noise')]
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
-    def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Course:
+    def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Insertion:
         """Simulate an insertion under a control law."""
         numbers, model = self._numbers, NeedleModel(self._truth(row))
         # The reference starts at the measured depth.
         begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
-        limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
-        reference: Reference = self._kind(Setpoint(begin), row['target'], limits)
+        reference: Reference = self._kind(Setpoint(begin), row['target'], numbers)
         count = max(1, round((reference.duration + numbers.wait) * numbers.rate))
         noise, late = self._noise(row, rng, count), round(row['late'])
         batch = run_batch(
@@ -310,18 +309,17 @@ class InsertionScenario(Scenario):
         commands, delay = batch.commands[0], int(numbers.delay) + late
         acting = np.concatenate([np.zeros(delay), commands])[:count] + noise[:, 2]
         done = int(batch.completed[0])
-        course = _Course(
-            model, batch.trajectories[0], commands, acting, _padded(noise), batch.goal, 0.0,
+        run = _Insertion(
+            model, batch.trajectories[0], commands, acting, noise[:, :2], batch.goal, 0.0,
             float(done < count),
-        )  # fmt: skip
-        course = _cut(course, done)
-        end = self._stop(course)
-        return course if end is None else _cut(course._replace(stopped=1.0, left=0.0), end)
+        ).until(done)  # fmt: skip
+        end = self._stop(run)
+        return run if end is None else run._replace(stopped=1.0, left=0.0).until(end)
 
-    def _stop(self, course: _Course) -> int | None:
+    def _stop(self, run: _Insertion) -> int | None:
         """Return the sample of the stop by the guard, or None."""
-        depth, speed = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
-        samples = np.stack([depth, speed, course.goal - depth, course.tip], axis=1)
+        depth, speed = run.measured
+        samples = np.stack([depth, speed, run.goal - depth, run.tip], axis=1)
         low, high = samples.min(axis=0), samples.max(axis=0)
         # Limits are intervals: nearly always the extremes are within them, and so all samples.
         extremes = np.stack([low, low, high, high])
@@ -338,7 +336,7 @@ class InsertionScenario(Scenario):
 
     def _open(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[_Course]:
+    ) -> Iterator[_Insertion]:
         """Simulate insertions under a constant force, for the duration of the nominal needle."""
         numbers, nominal = self._numbers, Axis.insertion(self._needle)
         models = [NeedleModel(self._truth(row)) for row in rows]
@@ -368,50 +366,33 @@ class InsertionScenario(Scenario):
         for k, (model, pushes, blur) in enumerate(zip(models, commands, noise, strict=True)):
             count = len(pushes)
             done = min(round(batch.completed[k] * numbers.rate), count)
-            course = _Course(
-                model, batch.states[k], pushes, forces[k], _padded(blur),
+            yield _Insertion(
+                model, batch.states[k], pushes, forces[k], blur[:, :2],
                 np.full(count + 1, nan), nan, float(done < count),
-            )  # fmt: skip
-            yield _cut(course, done)
+            ).until(done)  # fmt: skip
 
-    def _judged(self, row: Mapping[str, float], course: _Course) -> dict[str, float]:
+    def _metrics_of(self, row: Mapping[str, float], run: _Insertion) -> dict[str, float]:
         """Return the metrics of an insertion."""
-        depth, speed, target = course.depth, course.speed, row['target']
+        depth, speed, target = run.depth, run.speed, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)
         moving = np.flatnonzero(np.abs(speed) > _REST)
         still = 0 if not len(moving) else int(moving[-1]) + 1
         after = speed[-(1 + round(self._numbers.wait * self._numbers.rate)) :]
         directions = np.sign(after[np.abs(after) > _REST])
-        whole = not (course.left or course.stopped == 1.0)
+        whole = not (run.left or run.stopped == 1.0)
         return {
             'error': error,
             'hit': float(whole and error <= self._numbers.tolerance),
             'overshoot': max(0.0, float(beyond.max())),
-            'following': float(np.sqrt(np.square(course.goal - depth).mean())),
-            'force': float(np.abs(course.forces).max(initial=0.0)),
-            'deflection': float(np.abs(course.tip).max()),
+            'following': float(np.sqrt(np.square(run.goal - depth).mean())),
+            'force': float(np.abs(run.forces).max(initial=0.0)),
+            'deflection': float(np.abs(run.tip).max()),
             'rest': still * self._period if whole and still < len(speed) else nan,
             'reversals': float(np.count_nonzero(np.diff(directions))) if whole else nan,
-            'stopped': course.stopped,
-            'left': course.left,
+            'stopped': run.stopped,
+            'left': run.left,
         }
-
-
-def _padded(noise: FloatArray) -> FloatArray:
-    """Append zeros for the last sample, which no command follows, to the encoder noise."""
-    return np.concatenate([noise[:, :2], np.zeros((1, 2))])
-
-
-def _cut(course: _Course, end: int) -> _Course:
-    """Truncate an insertion at a sample."""
-    return course._replace(
-        states=course.states[: end + 1],
-        commands=course.commands[:end],
-        forces=course.forces[:end],
-        noise=course.noise[: end + 1],
-        goal=course.goal[: end + 1],
-    )
 
 
 def _time(axis: Axis, force: float, distance: float) -> float:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interface of a scenario: variables, metrics, and the simulation of samples."""
+"""Interface of a scenario, and checks of the content of a study file."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, nan
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_ros.contract import Topic
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice, unknown_name
 import numpy as np
 
 
@@ -15,19 +17,16 @@ class Variable(NamedTuple):
     """A variable that may differ from sample to sample."""
 
     default: float  #: value if it is not in the population
-    #: SI unit.
-    unit: str
+    unit: str  #: SI unit
     meaning: str
-    #: Valid range.
-    low: float = -inf
+    low: float = -inf  #: valid range
     high: float = inf
 
 
 class Metric(NamedTuple):
     """A metric of a sample."""
 
-    #: SI unit; '' for yes or no.
-    unit: str
+    unit: str  #: SI unit; '' for yes or no
     meaning: str
 
 
@@ -85,3 +84,26 @@ SCENARIOS: Final[Mapping[str, str]] = {
     'steering': 'needle_study.steering:SteeringScenario',
     'insertion': 'needle_study.insertion:InsertionScenario',
 }
+
+
+def check_names(where: str, given: Iterable[Any], valid: Iterable[str]) -> None:
+    """Raise `ParameterError`, with the prefix `where`, if a name is not valid."""
+    known = list(valid)
+    for name in given:
+        if name not in known:
+            raise ParameterError(f'{where}{unknown_name(str(name), known)}')
+
+
+def mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """Return a mapping of the file, empty for None; raise `ParameterError` otherwise."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise ParameterError(f'{name} must be names with values, got {value!r}')
+    return value
+
+
+def one_of(name: str, value: Any, valid: Iterable[str]) -> str:
+    """Return a word of the file; raise `ParameterError` if it is not valid."""
+    check_choice(name, value, tuple(valid))
+    return str(value)

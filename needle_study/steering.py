@@ -7,15 +7,9 @@ from functools import cached_property
 from math import nan
 from typing import Any, Final
 
-from needle_controller import (
-    OutOfReachError,
-    SIMULATION_LIMITS,
-    SteeringLimits,
-    SteeringModel,
-    SteeringPrior,
-)
+from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
-from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits, STEP_LENGTH
 from needle_controller.steering.simulation import (
     GroundTruth,
     simulate_steering,
@@ -24,30 +18,21 @@ from needle_controller.steering.simulation import (
     SteppedTipErrors,
     SteppedTipSensor,
 )
-from needle_dynamics import (
-    DEFAULT_NEEDLE,
-    find_needle,
-    insert_batch,
-    NeedleParameters,
-    SteeringParameters,
-)
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
 from needle_dynamics.simulated.tip_errors import TipErrorParameters
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.reading import check_names, mapping
-from needle_study.scenario import MeasuredRun, Metric, Scenario, Variable
+from needle_study.scenario import check_names, mapping, MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 
 #: Law of a guide at rest, for which a batch is simulated without a law.
 _OPEN_LOOP: Final = 'open_loop'
 
 _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
-
 _JOINTS: Final = contract.steered_states(efforts=False)
-
 _EXACT: Final = SteppedTipErrors()  # of a sensor with white noise alone
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion
@@ -101,8 +86,7 @@ class SteeringScenario(Scenario):
     Steer needles that differ from the nominal model to a target.
 
     `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``prior``, their
-    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`, or raises
-    `ParameterError`.
+    uncertainty; ``law``, as for `build_law`; and the fields of `SteeringStudy`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -175,7 +159,6 @@ class SteeringScenario(Scenario):
     def insert(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[dict[str, float]]:
-        """Simulate insertions; yield the metrics of each."""
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
         steered = map(self._steered, truths, rows, streams)
         each = self._open(truths) if self._law == _OPEN_LOOP else steered
@@ -254,7 +237,6 @@ class SteeringScenario(Scenario):
         rng: np.random.Generator,
         watch: Callable[[SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
-        """Simulate one insertion under the law."""
         try:
             law = build_law(
                 self._law, self._model, (row['target_x'], row['target_z']), self._numbers

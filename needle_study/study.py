@@ -16,9 +16,8 @@ from needle_dynamics.display import Displayed, new_figure, shown
 from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
-from needle_study.distribution import Distribution, distribution
-from needle_study.reading import check_names, mapping, one_of
-from needle_study.scenario import Metric, Scenario, SCENARIOS, Variable
+from needle_study.distribution import Distribution, distribution, is_number
+from needle_study.scenario import check_names, mapping, one_of, Scenario, SCENARIOS
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
@@ -32,12 +31,9 @@ if TYPE_CHECKING:
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
-_PARTS: Final = 50  # largest number of parts of a study that shows its progress
+_PARTS: Final = 50  #: largest number of parts of a study that shows its progress
 DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
-
-#: Largest number of samples and of dimensions, as limited by the Sobol sequence.
-_MOST: Final = 2**30
-_DIMENSIONS: Final = 21201
+_MOST: Final = 2**30  #: largest number of samples, as limited by the Sobol sequence
 
 #: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
 _MOST_LATIN: Final = 2**24
@@ -55,8 +51,7 @@ class Study:
     samples: int
     seed: int
     design: str  #: one of `DESIGNS`
-    #: Distributions by variable; the other variables have their defaults.
-    population: Mapping[str, Distribution]
+    population: Mapping[str, Distribution]  #: by variable; the others have their defaults
     factor: FloatArray  #: Cholesky factor of the correlations of the normal scores, shape (d, d)
     document: Mapping[str, Any]  #: content of the study file
 
@@ -103,36 +98,17 @@ class Study:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
 
     def simulate(self, progress: Progress | None = None) -> StudyTable:
-        """
-        Simulate all samples in this process.
-
-        `needle study` computes large studies on all cores, and writes them to files.
-
-        Parameters
-        ----------
-        progress : bool or callable, optional
-            True shows a progress bar; a function is called after each part. The samples are then
-            simulated in up to 50 parts, with the same results.
-
-        Returns
-        -------
-        StudyTable
-            Variables and metrics of each sample.
-
-        """
-        if not progress:
-            return StudyTable(self, self.rows(0, self.samples))
-        parts = []
-        shares = np.array_split(np.arange(self.samples), min(self.samples, _PARTS))
-        with progress_of(progress, len(shares), 'parts') as advance:
-            for share in shares:
+        """Simulate all samples in this process; `needle study` uses all cores, and files."""
+        parts, count = [], min(self.samples, _PARTS) if progress else 1
+        with progress_of(progress, count, 'parts') as advance:
+            for share in np.array_split(np.arange(self.samples), count):
                 parts.append(self.rows(int(share[0]), len(share)))
                 advance()
         values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return StudyTable(self, values)
 
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
-        """Compute `count` samples from number `first` on: number, sampled values and metrics."""
+        """Compute samples from a number on: number, sampled values and metrics."""
         numbers = range(first, first + count)
         drawn = self.draw(numbers)
         streams = [self.rng(number, 1) for number in numbers]
@@ -152,25 +128,12 @@ class StudyTable(Displayed):
 
     def columns(self) -> dict[str, FloatArray]:
         scenario = self.study.scenario
-        known: dict[str, Metric | Variable] = {**scenario.variables, **scenario.metrics}
-        units = {name: one.unit for name, one in known.items()}
+        units = {name: one.unit for name, one in scenario.variables.items()}
+        units |= {name: one.unit for name, one in scenario.metrics.items()}
         return {f'{name} [{units.get(name) or 1}]': one for name, one in self.values.items()}
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
-        """
-        Draw the distribution of the primary metric, and the metric over each variable.
-
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure, optional
-            Figure to draw in; by default a new one of ``matplotlib.pyplot``.
-
-        Returns
-        -------
-        list of matplotlib.axes.Axes
-            The histogram, and a panel for each variable of the population.
-
-        """
+        """Draw the distribution of the primary metric, and the metric over each variable."""
         scenario, (name, *_) = self.study.scenario, self.study.scenario.metrics
         label, factor = shown(f'{name} [{scenario.metrics[name].unit}]')
         values = factor * self.values[name]
@@ -187,32 +150,14 @@ class StudyTable(Displayed):
 
 @lru_cache(maxsize=64)
 def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
-    """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
+    """Return the strata of a dimension by sample number."""
     # The generators of samples have two numbers in their key, this generator has three.
     key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
     return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))
 
 
 def read_study(path: Path | str) -> Study:
-    """
-    Read a study file.
-
-    Parameters
-    ----------
-    path : Path or str
-        File (.yaml).
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If the file is not a valid study; the message has its name.
-
-    """
+    """Read a study file (.yaml), or raise `ParameterError` with its name."""
     path = Path(path)
     try:
         return build_study(read_document(path.read_text(encoding='utf-8')))
@@ -224,25 +169,7 @@ def read_study(path: Path | str) -> Study:
 
 
 def build_study(document: Any) -> Study:
-    """
-    Build a study from the content of a study file.
-
-    Parameters
-    ----------
-    document : mapping
-        Keys and values as in a study file, in SI units.
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown or a value is not valid.
-
-    """
+    """Build a study from the content of a study file, in SI units, or raise `ParameterError`."""
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)
@@ -291,15 +218,13 @@ def _factor(given: Any, names: Sequence[str]) -> FloatArray:
         raise ParameterError(f'{form}, got {given!r}')
     for one in given:
         valid = isinstance(one, Sequence) and not isinstance(one, str) and len(one) == 3
-        if not valid or one[0] not in names or one[1] not in names or one[0] == one[1]:
-            raise ParameterError(f'{form}, got {one!r}')
-        value = one[2]
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1.0:
+        valid = valid and one[0] in names and one[1] in names and one[0] != one[1]
+        if not (valid and is_number(one[2]) and abs(one[2]) < 1.0):
             raise ParameterError(f'{form}, got {one!r}')
         i, k = names.index(one[0]), names.index(one[1])
         if matrix[i, k] != 0.0:
             raise ParameterError(f'correlations has {one[0]} with {one[1]} twice')
-        matrix[i, k] = matrix[k, i] = value
+        matrix[i, k] = matrix[k, i] = one[2]
     try:
         return np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError as error:

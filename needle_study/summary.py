@@ -58,20 +58,7 @@ def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
 
 
 def probability(parts: Iterable[FloatArray]) -> Estimate:
-    """
-    Estimate a probability, with the interval of Wilson.
-
-    Parameters
-    ----------
-    parts : iterable of ndarray
-        Values 1 and 0, in any number of arrays; NaN is ignored.
-
-    Returns
-    -------
-    Estimate
-        Fraction of ones, with its 95 % interval.
-
-    """
+    """Estimate the fraction of ones among 1 and 0, with the interval of Wilson; NaN is ignored."""
     n, yes = 0, 0.0
     for values in parts:
         finite = values[np.isfinite(values)]
@@ -85,22 +72,7 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
 
 
 def quantile(values: FloatArray, part: float) -> Estimate:
-    """
-    Estimate a quantile with its distribution-free interval.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Values; NaN is ignored.
-    part : float
-        Fraction of the values below the quantile.
-
-    Returns
-    -------
-    Estimate
-        The quantile, with its 95 % interval.
-
-    """
+    """Estimate the quantile below which a part of the values is; NaN is ignored."""
     finite = np.sort(values[np.isfinite(values)])
     n = len(finite)
     if n == 0:

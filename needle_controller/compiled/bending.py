@@ -26,8 +26,8 @@ class Frozen(NamedTuple):
     growth: float  #: stiffness factor of swelling
     layer: int  #: index of the layer that contains the tip
     stiffness: float  #: stiffness of the tissue at the tip [N/m^2]
-    at: ModeIntegrals  #: shape modes and their integrals
-    modes: NormalModes  #: normal modes
+    at: ModeIntegrals
+    modes: NormalModes
 
 
 @inlined
@@ -49,10 +49,9 @@ def freeze(needle: CompiledNeedle, depth: float, growth: float, modes: NormalMod
 @inlined
 def turn(rate: float, square: float, t: float) -> tuple[float, float, float, float]:
     """
-    Return the transition cc, cb, bc, bb of c and b of one mode over a time t [s].
+    Return cc, cb, bc, bb: after a time t [s] a mode has c of cc c + cb b and b of bc c + bb b.
 
-    ``rate`` is the damping [1/s] and ``square`` the squared natural frequency [1/s^2]; c after t
-    is cc c + cb b, and b is bc c + bb b.
+    ``rate`` is the damping [1/s] and ``square`` the squared natural frequency [1/s^2] of the mode.
     """
     omega = sqrt(square)
     pp, pv, _, vv = swing(rate, square, t)
@@ -61,7 +60,6 @@ def turn(rate: float, square: float, t: float) -> tuple[float, float, float, flo
 
 @inlined
 def _means(rate: float, since: float, until: float) -> tuple[float, float]:
-    """Return the means of cos(rate t) and sin(rate t) over a time interval."""
     middle, half = 0.5 * rate * (since + until), 0.5 * rate * (until - since)
     # The next term is below 1e-18.
     mean = sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
@@ -78,9 +76,8 @@ def change_basis(
     q and the momenta rho A G q_dot are continuous. The depth changes at a constant rate from
     ``since`` to ``until`` [s], relative to the time of the new modes: the coupling between modes
     is the mean over the rotation in between. Slow modes do not rotate in this time and take the
-    full change; fast modes keep only the part that conserves the action energy / omega.
-
-    The new modes take the signs of the old modes. ``change``, shape (2 n, 2 n), is overwritten.
+    full change; fast modes keep only the part that conserves the action energy / omega. The new
+    modes take the signs of the old modes. ``change``, shape (2 n, 2 n), is overwritten.
     """
     n = new.squares.shape[0]
     for i in range(n):
@@ -115,8 +112,8 @@ def base_impulse(needle: CompiledNeedle, f: Frozen, velocity: float, rows: Float
     """
     Compute the impulse of force and moment at the base per change of c and b, shape (2, 2 n).
 
-    It follows from the balance of momentum over the inserted part: the integral of the state over
-    a time follows from the change of the state. ``velocity`` is the insertion velocity [m/s].
+    The balance of momentum over the inserted part relates the integral of the state over a time to
+    the change of the state. ``velocity`` is the insertion velocity [m/s].
     """
     n = f.modes.squares.shape[0]
     rho, damping = needle.linear_density, needle.tissue_damping

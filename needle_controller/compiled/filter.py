@@ -75,11 +75,10 @@ class Noise(NamedTuple):
 class Filter(NamedTuple):
     """Filter and its history: arrays with one row per stored sample."""
 
-    needle: CompiledNeedle  #: nominal model of needle and tissue
-    noise: Noise  #: noise model
-    low_pass: LowPass  #: low-pass of the wrench
-    #: Scalars of each sample, see `SAMPLE`, shape (slots,).
-    samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]
+    needle: CompiledNeedle
+    noise: Noise
+    low_pass: LowPass
+    samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]  #: shape (slots,)
     states: Matrix  #: state after the sample, see `kalman`, shape (slots, N)
     #: Its covariance, and the transition over the sample, shape (slots, N, N).
     covariances: Array3
@@ -91,14 +90,11 @@ class Filter(NamedTuple):
     squares: Matrix
     tips: Matrix
     changes: Array3  #: change of basis from the previous sample, shape (slots, 2 n, 2 n)
-    #: Samples of the tip deflection in order: start and end of the exposure [s], mean [m],
-    #: shape (m, 3).
-    exposures: Matrix
+    exposures: Matrix  #: start and end [s] and mean [m] of the tip deflection, shape (m, 3)
 
 
 @inlined
 def _modes(f: Filter, slot: int) -> NormalModes:
-    """Return the normal modes of a sample."""
     return NormalModes(f.shapes[slot], f.inverses[slot], f.squares[slot])
 
 
@@ -238,7 +234,7 @@ def _expose(
     covariance: FloatArray,
     work: FloatArray,
 ) -> None:
-    """Add a part of the sample, in times from its start [s], to the running mean of the tip."""
+    """Add a part of a sample, with times from its start [s], to the running mean of the tip."""
     n = f.squares.shape[1]
     change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n + 1]
     by_force = 0.0
@@ -381,11 +377,9 @@ def estimate(  # noqa: C901
     Transform the newest slot to modal coordinates at the present depth, half a sample later.
 
     ``modal``, shape (2 n,), takes q [m^3/2] and q_dot [m^3/2 / s], ``jacobian``, shape (2 n, 2 n),
-    their derivatives by c and b of the slot.
-
-    Returns the tip deflection and its standard deviation [m], and the force of the bent needle
-    against insertion [N] by the modes below half the sample rate: the estimated rates of faster
-    modes are noise, which their square would add to the force.
+    their derivatives by c and b of the slot. Returns the tip deflection and its standard deviation
+    [m], and the force of the bent needle against insertion [N] by the modes below half the sample
+    rate: the estimated rates of faster modes are noise, which their square would add to the force.
     """
     f = boxed.value
     needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]

@@ -1,9 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-Reachable set of the tip, and the next position of the guide.
-
-`needle_controller.compiled.hypotheses` has the distributions of the tip by hypothesis.
-"""
+"""Reachable set of the tip, and the next position of the guide."""
 
 from __future__ import annotations
 
@@ -35,11 +31,8 @@ _FINE: Final = np.linspace(-1.0, 1.0, 121)
 _ROLLS: Final = 16
 _COARSE: Final = np.linspace(-1.0, 1.0, 13)
 
-#: Least decrease of the mean square distance from the reachable set by a turn [m^2].
-_TURN: Final = 1e-4**2
-
-#: Cost of a load on the guide above its limit [m^2/N^2]: dominates every distance.
-_OVERLOAD: Final = 1.0
+_TURN: Final = 1e-4**2  #: Least decrease of the mean square distance by a turn [m^2].
+_OVERLOAD: Final = 1.0  #: Cost of a load above its limit [m^2/N^2]: dominates every distance.
 
 #: Abscissas and weights of the quadrature over a normal distribution.
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
@@ -115,12 +108,7 @@ def _reachable(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
 
 @kernel
 def reachable_set(boxed: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """
-    Return the reachable set of the tip by hypothesis, shape (h,) each.
-
-    Its middle x + i z [m], its half widths along x + i along z [m], and the standard deviation of
-    the middle along each axis [m].
-    """
+    """Return middle, half widths, x + i z, and error of the reachable set [m], shape (h,)."""
     return _reachable(boxed.value)
 
 
@@ -146,11 +134,7 @@ def hit_probability(boxed: Boxed[Steering]) -> float:
 
 @kernel
 def choose_guide(boxed: Boxed[Steering]) -> complex:
-    """
-    Return the next position of the guide, x + i z [m], and turn the needle if worthwhile.
-
-    Updates the roll and the bevel directions of the state.
-    """
+    """Return the next position of the guide, x + i z [m], and turn the needle if worthwhile."""
     c = boxed.value
     k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
     turns, candidates = c.counts[TURNS], _candidates(c, _FINE)
@@ -196,7 +180,6 @@ def _tip_roll(c: Steering, g: int, base: float) -> float:
 
 @inlined
 def _direction(roll: float) -> complex:
-    """Return the direction of the bevel relative to zero roll."""
     return complex(cos(roll), -sin(roll))
 
 

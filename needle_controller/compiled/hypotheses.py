@@ -74,15 +74,9 @@ _FAULT, _FAULT_CHANGE = 0.03, 2e-4
 #: the needle: a single measurement never does.
 _MOST_EVIDENCE, _STOP_EVIDENCE = 8.0, 10.0
 
-#: Squared distance beyond which each measurement has a gross error [m^2].
-_FARTHEST: Final = 0.1**2
-
-#: Least logarithm of the weight of a hypothesis, relative to the largest; then it is discarded.
-_LEAST_LOG: Final = -30.0
-
-#: Number of equal successive tip measurements of a moving needle that is a frozen sensor.
-MOST_SAME: Final = 2
-
+_FARTHEST: Final = 0.1**2  #: Squared distance of a measurement with a gross error [m^2].
+_LEAST_LOG: Final = -30.0  #: Logarithm of the relative weight of a hypothesis to discard.
+MOST_SAME: Final = 2  #: Number of equal successive tip measurements that is a frozen sensor.
 MOST_MISSING: Final = 6  #: Largest number of successive missing tip measurements.
 
 #: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
@@ -97,30 +91,31 @@ VALID, LOST, FROZEN, OUTLIER = range(4)  #: Result of the check of a tip measure
 
 
 class HypothesisResponses(NamedTuple):
-    """Responses of the tip by point of the grid: arrays of `SteeringModel`, and sums."""
+    """Shifts of the tip at each depth, for g points of the grid, and their sums."""
 
-    #: As in `SteeringModel`.
-    guide: Array3
+    guide: Array3  #: per position of the guide in each step, shape (g, n + 1, n)
+    #: Per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without roll, and
+    #: curvature of the path at each depth [1/m], shape (g, n + 1, 5 + n).
     causes: Array3
-    bevel: Array3
-    elastic: Matrix
+    bevel: Array3  #: per load of the bevel [N] on the skin, and in each step, (g, n + 1, n + 1)
+    elastic: Matrix  #: of the resting tip per load of the bevel [m/N], shape (g, n + 1)
+    #: The same for the force on the guide at its position of each step [N], with n rows.
     guide_load: Array3
     causes_load: Array3
     bevel_load: Array3
+    #: Change of `guide` to the next bending length, and to the next skin, shape (2, g, n + 1, n).
     between: Array4
-    lags: Matrix
-    #: Sums of the absolute values of `guide` at the last depth, from each step on,
-    #: shape (g, n + 1).
+    lags: Matrix  #: largest lag of the roll of the tip behind the base [rad], shape (g, n + 1)
+    #: Sums of the absolute values at the last depth: of `guide` from each step on, shape
+    #: (g, n + 1), and of `bevel` from the skin and each step on, shape (g, n + 3).
     later_guide: Matrix
-    #: Sums of the absolute values of `bevel` at the last depth, from the skin and each step on,
-    #: shape (g, n + 3).
     later_bevel: Matrix
 
 
 class Steering(NamedTuple):
     """State and limits of a steering controller: h hypotheses, n steps and m constants."""
 
-    responses: HypothesisResponses  #: responses of the tip
+    responses: HypothesisResponses
     drifts: Vector  #: standard deviation of the slow error by hypothesis [m], shape (h,)
     decay: Vector  #: correlation of the slow error over a step, shape (n,)
     path: Vector  #: depths relative to the target depth, from 0 to 1, shape (n + 1,)
@@ -130,21 +125,15 @@ class Steering(NamedTuple):
     target: Vector  #: target of the tip, x and z [m], shape (2,)
     mean: ComplexMatrix  #: mean of the constants, shape (h, m)
     covariance: ComplexArray3  #: their covariance, shape (h, m, m)
-    #: Logarithm of the probability of each hypothesis, up to a constant; -inf if discarded,
-    #: shape (h,).
-    logs: Vector
+    logs: Vector  #: logarithm of the hypothesis weights; -inf if discarded, shape (h,)
     guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
     #: Direction of the bevel relative to zero roll, on the skin and in each step, by point of the
     #: grid, shape (g, n + 1).
     turned: ComplexMatrix
     roll: Vector  #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
     last: Vector  #: last tip measurement [m], shape (2,)
-    #: Tip measurements so far, remaining turns, successive equal, gross and missing measurements,
-    #: shape (5,).
-    counts: IntVector
-    #: Expected number of gross errors, number of measurements, evidence of a sensor fault, and the
-    #: last innovation along x and z [m], shape (5,).
-    gross: Vector
+    counts: IntVector  #: numbers with the index `STEP` and so on, shape (5,)
+    gross: Vector  #: numbers with the index `_ERRORS` and so on, shape (5,)
 
 
 class TipDistribution(NamedTuple):
@@ -156,12 +145,10 @@ class TipDistribution(NamedTuple):
 
 
 class TipMoments(NamedTuple):
-    """Mean and covariance of the tip over all hypotheses."""
+    """Mean [m] and covariance [m^2] of the tip over all hypotheses."""
 
-    #: Mean [m].
     x: float
     z: float
-    #: Covariance [m^2].
     xx: float
     xz: float
     zz: float
@@ -183,7 +170,6 @@ def weights(logs: Vector) -> FloatArray:
 
 @inlined
 def _guide_at_rest(c: Steering) -> ComplexArray:
-    """Return the positions of the guide, shape (n,), with the guide at rest from now on."""
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
     if done > 0:
         for j in range(done, len(guide)):
@@ -241,7 +227,6 @@ def tip_distribution(
 
 @compiled
 def _moments(w: FloatArray, tip: TipDistribution) -> TipMoments:
-    """Return mean and covariance of the tip over all hypotheses."""
     x = z = xx = xz = zz = 0.0
     for i in range(len(w)):
         x += w[i] * tip.means[i].real
@@ -311,12 +296,7 @@ def _log_density(off: complex, variance: float) -> float:
 def _update_hypotheses(
     c: Steering, w: FloatArray, tip: TipDistribution, measured: complex
 ) -> tuple[float, float]:
-    """
-    Update all hypotheses and their weights with a tip measurement [m].
-
-    ``tip`` is the distribution of the measured tip with the noise of the measurement. Returns the
-    probability that the measurement has no gross error, and the logarithm of its likelihood.
-    """
+    """Update all hypotheses; return the probability of no gross error, and the log-likelihood."""
     share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.gross[_MEASURED])
     likely, sounds, largest = np.full(len(w), -inf), np.zeros(len(w)), -inf
     for i in range(len(w)):

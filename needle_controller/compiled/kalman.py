@@ -50,11 +50,7 @@ def measure(
 def add_to_mean(
     x: FloatArray, covariance: FloatArray, row: FloatArray, shared: FloatArray
 ) -> None:
-    """
-    Add a linear form of the first m entries of the state (N,) to its last entry.
-
-    ``row``, shape (m,), is the linear form, ``shared``, shape (N,), scratch memory.
-    """
+    """Add the linear form ``row`` of the first entries of the state to its last entry."""
     last = x.shape[0] - 1
     for j in range(last + 1):
         shared[j] = 0.0
@@ -119,11 +115,9 @@ def propagate(
     Propagate state (N,) and covariance (N, N) through a transition (N, N), in place.
 
     Only nonzero blocks are multiplied: modes and loads drive all entries, each low-pass drives
-    itself, and its reading has no memory. The last entry of the state stays.
-
-    ``modal`` and ``filters`` are the numbers of entries of modes and loads, and of each low-pass
-    with its reading; ``size`` is N, or N - 1 while the last entry is zero without variance;
-    ``work``, shape (N + 2, N), is scratch memory.
+    itself, and its reading has no memory. ``modal`` and ``filters`` are the numbers of entries of
+    modes and loads, and of each low-pass with its reading; ``size`` is N, or N - 1 while the last
+    entry, which stays, is zero without variance; ``work``, shape (N + 2, N), is scratch memory.
     """
     end = modal + 2 * filters
     fresh, row, turned = work[0], work[1, :size], work[2:]

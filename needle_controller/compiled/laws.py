@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Sampled control laws on one axis.
+Sampled control laws on one axis, for the node and for the compiled loop over thousands of runs.
 
-The same functions serve the node, call by call, and the compiled loop over thousands of runs.
-They take `LawConstants` and `Instant` as plain tuples and name their fields inside: Numba
+The functions take `LawConstants` and `Instant` as plain tuples and name their fields inside: Numba
 recognizes a plain tuple several times faster than a named tuple.
 """
 
@@ -44,13 +43,11 @@ class LawConstants(NamedTuple):
 
     kind: float  #: `INVERSE_DYNAMICS` or `PID`
     period: float  #: sample period h [s]
-    #: Response of the axis over one period of insertion to its velocity and to a constant force;
-    #: see `Response`.
+    #: Response of the axis over one period of insertion, and of withdrawal; see `Response`.
     pv: float
     vv: float
     pf: float
     vf: float
-    #: Response on withdrawal.
     back_pv: float
     back_vv: float
     back_pf: float
@@ -75,8 +72,7 @@ class LawConstants(NamedTuple):
     model_kv: float
     filter_time: float  #: time constant of the filter of the error rate [s]
     tolerance: float  #: error at rest below which the integral is frozen [m]
-    #: Fraction of an excess force that back-calculation removes in one period; 0 for conditional
-    #: integration.
+    #: Fraction of an excess force that back-calculation removes in one period; 0: conditional.
     tracking: float
     feed_forward: float  #: 1 with feed-forward, 0 without
     fade: float  #: factor by which the offset after a switch decreases in one period
@@ -107,7 +103,7 @@ class _Implicit(NamedTuple):
     Feedback as an equation for its own force: force = forward + push / divisor.
 
     The filtered rate of the error at the end of the period is rate - slope times the feedback.
-    `end` and `reached` are the goal position and velocity at the end of the period.
+    `end` and `reached` are the goal position and velocity then.
     """
 
     forward: float
@@ -148,11 +144,7 @@ def _dry(c: LawConstants, velocity: float, acceleration: float) -> float:
 
 @compiled
 def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
-    """
-    Return the motion to follow: the reference, or the modeled motion of inverse dynamics.
-
-    The modeled motion starts at the measurement and converges to the reference with k_p and k_v.
-    """
+    """Return the motion to follow: the reference, or the modeled motion, which converges to it."""
     if c.kind == PID:
         return at
     position, velocity = at.position, at.velocity
@@ -185,8 +177,8 @@ def law_learn(
     """
     Update the learned friction with the last period, if the law learns and the axis was sliding.
 
-    ``constants`` and ``memory`` as in `law_force`; ``position`` and ``velocity`` are measured now,
-    ``force`` is the force of the period less known loads [N].
+    ``position`` and ``velocity`` are measured now, ``force`` is the force of the period less known
+    loads [N]; else as in `law_force`.
     """
     c = LawConstants(*constants)
     if c.bound == 0.0:
@@ -283,9 +275,7 @@ def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: 
     """
     Return the force for the next period before any limit [N]; see the classes of the laws.
 
-    ``constants`` are the fields of `LawConstants`, ``memory`` the memory of the law, shape
-    (MEMORY,), ``instant`` the fields of `Instant`, and ``load`` a known force against the motion
-    [N].
+    ``memory`` has shape (MEMORY,), and ``load`` is a known force against the motion [N].
     """
     return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 

@@ -22,9 +22,7 @@ BLOCK: Final = TERMS + TERMS * TERMS
 
 LENGTH: Final = 0.05  #: Insertion depth over which dry friction may change by its bound [m].
 _CORRELATED: Final = 0.01  #: Correlation time of the measurement noise [s].
-
-#: Time in which the covariance of a correction grows to its prior, without measurements [s].
-_MEMORY: Final = 60.0
+_MEMORY: Final = 60.0  #: Time in which a covariance grows to its prior, without measurements [s].
 
 
 @compiled
@@ -37,12 +35,7 @@ def bounds(share: float, coulomb: float, viscous: float) -> tuple[float, float, 
 def correction(
     block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
-    """
-    Return the learned additional friction [N] in the direction of a block, within bounds.
-
-    ``block`` has shape (BLOCK,), ``limits`` are from `bounds`, ``depth`` is the position of the
-    axis [m] and ``speed`` the modulus of its velocity [m/s].
-    """
+    """Return the learned friction [N] of a block (BLOCK,) at a depth [m] and a speed [m/s]."""
     dry, viscous, slope = limits
     dry_part = min(max(block[2], -slope), slope) * (depth - LENGTH) + block[0]
     return float(min(max(dry_part, -dry), dry) + min(max(block[1], -viscous), viscous) * speed)
@@ -61,8 +54,7 @@ def learn(
     """
     Update the estimate of one direction, shape (BLOCK,), with one period of sliding.
 
-    ``missing`` is the friction of the period beyond the model [N] and ``noise`` its standard
-    deviation. A block of zeros starts at the prior.
+    ``missing`` is the friction beyond the model [N], and ``noise`` its standard deviation.
     """
     covariance = block[TERMS:].reshape((TERMS, TERMS))
     prior = (0.5 * limits[0], 0.5 * limits[1], 0.5 * limits[2])

@@ -50,17 +50,16 @@ def run_loop(  # noqa: C901
     """
     Run a sampled law of insertion with the simulated needle; return the completed periods.
 
-    Fewer than k periods are completed if the needle leaves its range. Positions are in m,
-    velocities in m/s, forces in N.
+    They are fewer than k if the needle leaves its range. Positions are in m, velocities in m/s,
+    forces in N.
 
-    ``state``, shape (2 (2 + n),), takes the final state; ``law`` has the fields of `LawConstants`,
-    ``limit`` is the largest force. For each of k commands ``setpoints``, shape (k, 3), has
-    position, velocity and acceleration; ``goal``, shape (k + 1,), the reference at the times of
-    the measurements. While the force is at its limit towards the last setpoint the reference
-    waits, as in `ReferenceHold`. ``pending``, shape (delay,), are commands without effect so far,
-    updated, of which the law compensates the newest ``known``. ``noise``, shape (k, 3) or (0, 3),
-    has errors of the measured position and velocity, and additional force. ``added``, shape
-    (m, 3), has insertion depths above which Coulomb friction [N] and viscous friction [N s/m] are
+    ``state``, shape (2 (2 + n),), takes the final state; ``limit`` is the largest force. For each
+    of k commands ``setpoints``, shape (k, 3), has position, velocity and acceleration; ``goal``,
+    shape (k + 1,), the reference at the measurements. While the force is at its limit towards the
+    last setpoint the reference waits, as in `ReferenceHold`. ``pending``, shape (delay,), are
+    commands without effect so far, updated, of which the law compensates the newest ``known``.
+    ``noise``, shape (k, 3) or (0, 3), has errors of measured position and velocity, and additional
+    force. ``added``, shape (m, 3), has depths above which Coulomb and viscous friction [N s/m] are
     added, until the next row. ``longest`` is the longest step [s].
 
     Outputs, the first three unused if empty: at the measurements ``depths``, shape (k + 1,), and

@@ -8,7 +8,6 @@ import numpy as np
 
 @compiled
 def _value(c: FloatArray, x: float) -> float:
-    """Evaluate a polynomial at x; constant coefficient first."""
     value = 0.0
     for j in range(len(c) - 1, -1, -1):
         value = value * x + c[j]
@@ -17,11 +16,7 @@ def _value(c: FloatArray, x: float) -> float:
 
 @kernel
 def quintic_extremes(c: Vector) -> FloatArray:  # noqa: C901
-    """
-    Return least and largest value of a quintic and of its first two derivatives on [0, 1].
-
-    ``c``, shape (6,), has the constant coefficient first; the result has shape (3, 2).
-    """
+    """Return the range of c[0] + c[1] x + ... and two derivatives on [0, 1], shape (3, 2)."""
     derivatives, extremes = np.zeros((6, 6)), np.empty((3, 2))
     for j in range(6):
         derivatives[0, j] = c[j]

@@ -2,7 +2,7 @@
 """Continuous insertion: the needle moves without rest, and the guide follows its depth."""
 
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl, STILL
@@ -13,13 +13,8 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 
-class ContinuousInsertion(InsertionStrategy):
-    """
-    Insert a needle without rests; the guide follows the measured insertion depth.
-
-    The tip is measured during the motion through each depth, and at rest at the first and last
-    one.
-    """
+class ContinuousInsertion(SteppedInsertion):
+    """Insert a needle without rests, with measurements in motion; the guide follows its depth."""
 
     def __init__(
         self, law: GuardedLaw, motions: MotionControl, settings: ExecutiveSettings
@@ -28,37 +23,29 @@ class ContinuousInsertion(InsertionStrategy):
         #: Measurements at the depths, and the last depth that was passed.
         self._passing: dict[int, TipMeasurements] = {}
         self._passed = 0
-        #: Positions of the guide before and after the next depth [m].
-        self._between = np.zeros((2, 2))
-        #: Time of the last guide motion [ns].
-        self._sent = 0
-        #: Whether the needle has begun to move.
-        self._moved = False
+        self._between = np.zeros((2, 2))  #: positions of the guide around the next depth [m]
+        self._sent = 0  #: time of the last guide motion [ns]
+        self._moved = False  #: whether the needle has begun to move
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
-        """Begin the insertion to the last depth."""
         self._between = np.array([[0.0, 0.0], [to.x, to.z]])
         self.phase, self._rest = Phase.INSERTING, None
         return self._insert(now, float(self.law.depths[0]))
 
     def _insert(self, now: int, begin: float, *, again: bool = False) -> JointMotion:
-        """Send the needle to the target depth."""
         motions, depths = self._motions, self.law.depths
         motions.origin = np.array([depths[0], *self._between[0]])
         motions.goal = np.array([depths[-1], *self._between[1]])
-        motions.again = lambda later: self._insert(later, self._depth_now, again=True)
+        # From the present depth, within the motion.
+        motions.again = lambda later: self._insert(
+            later, float(np.clip(motions.at[0], motions.origin[0], motions.goal[0])), again=True
+        )
         return motions.insert(begin, now, again=again)
-
-    @property
-    def _depth_now(self) -> float:
-        """Insertion depth now, within the motion [m]."""
-        motions = self._motions
-        return min(max(float(motions.at[0]), float(motions.origin[0])), float(motions.goal[0]))
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Send the guide with the needle, and plan at each passed depth."""
         if self.phase is not Phase.INSERTING:
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         motions, depths, settings = self._motions, self.law.depths, self._settings
         depth, last = float(motions.at[0]), self.law.steps
         self._moved |= depth >= depths[0] + STILL
@@ -68,14 +55,14 @@ class ContinuousInsertion(InsertionStrategy):
             self._passed += 1
             self._pass()
         if self._passed == last:
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         if depth >= depths[last] - settings.depth_tolerance:
             self._passed, motions.due = last, stamp
             return self._end_guide(now)
         if stamp > motions.due + settings.patience * NANOSECONDS:
             # The guide is at its setpoint of this depth.
             motions.goal[1:] = motions.at[1:]
-            return self._wait(stamp, now)
+            return super().follow(stamp, now)
         interval = 1.0 / settings.rate
         if stamp - self._sent < interval * NANOSECONDS:
             return None
@@ -83,9 +70,8 @@ class ContinuousInsertion(InsertionStrategy):
         low, high = depths[self._passed : self._passed + 2].tolist()
         begin, end = self._between
         part = min(max((depth + motions.velocity * interval - low) / (high - low), 0.0), 1.0)
-        way = end - begin
-        rate = way * motions.velocity / (high - low)
-        move = motions.guide_to(begin + part * way, rate, interval, now)
+        rate = (end - begin) * motions.velocity / (high - low)
+        move = motions.guide_to(begin + part * (end - begin), rate, interval, now)
         motions.monitor.stream(move)
         return move
 
@@ -112,13 +98,13 @@ class ContinuousInsertion(InsertionStrategy):
         self._between = np.array([there, [to.x, to.z]])
         self._motions.origin[1:], self._motions.goal[1:] = there, self._between[1]
 
-    def _end_measurement(self, now: int) -> JointMotion | None:
+    def _end_measurement(self, measured: TipMeasurements, now: int) -> JointMotion | None:
         """Pass the measurement in motion before it to the law as well."""
         k = self.law.step - 1
-        look = self._passing.pop(k, None)
-        if look is not None:
-            self.law.update(look, k)
-        return super()._end_measurement(now)
+        readings = self._passing.pop(k, None)
+        if readings is not None:
+            self.law.update(readings, k)
+        return super()._end_measurement(measured, now)
 
     def tip(self, stamp: int, tip: tuple[float, ...], now: int) -> JointMotion | None:
         """Process a reading of the tip, x, y, z [m], at rest or in motion."""
@@ -129,6 +115,6 @@ class ContinuousInsertion(InsertionStrategy):
         depth = float(motions.at[0]) - motions.velocity * (now - stamp) / NANOSECONDS
         at = int(np.searchsorted(depths, depth))
         if 0 < at < len(depths):
-            look = self._passing.setdefault(at, TipMeasurements())
-            look.take(tip, float(depths[at]) - depth)
+            readings = self._passing.setdefault(at, TipMeasurements())
+            readings.take(tip, float(depths[at]) - depth)
         return None

@@ -16,18 +16,17 @@ from needle_controller.safety.input_monitor import InputMonitor, Refusal
 from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl
 from needle_controller.steering.planner import describe_target, InsertionPlanner
-from needle_controller.steering.planning import ComputedJob, StartJob
+from needle_controller.steering.planning import Job, StartJob
 from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.retraction import Retraction
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.steering.stepped import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -44,7 +43,6 @@ import numpy as np
 #: Changes from one message to the next that are implausible [m, rad].
 _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
-#: Phases with motions of this executive.
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
 
 
@@ -52,16 +50,15 @@ class SteeringExecutive(StateMachine[JointMotion]):
     """
     Execute a steered insertion, and stop it on any fault.
 
-    Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns a `JointMotion` of needle and guide to send; None leaves the last motion in effect.
-    A motion is sent again until the joints follow it, see `MotionMonitor`.
+    Every event is a method: it takes the time ``now`` [ns] of the clock that stamps the messages,
+    and returns a `JointMotion` of needle and guide to send; None leaves the last motion in effect.
+    A motion is sent again until the joints follow it, see `MotionMonitor`. `fault` is the reason
+    of the stop, '' without a stop.
 
     Parameters
     ----------
-    needle : NeedleParameters
-        Nominal needle and tissue.
-    steering : SteeringParameters
-        Their constants for steering.
+    needle, steering : NeedleParameters, SteeringParameters
+        Nominal needle and tissue, and their constants for steering.
     prior : SteeringPrior
         Prior uncertainty of all constants.
     settings : ExecutiveSettings
@@ -72,12 +69,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         Starts the computation of a plan, see `StartJob`.
     law : str
         Steering law, see `build_law`.
-
-    Attributes
-    ----------
-    fault : str
-        Reason of the stop, '' without a stop.
-
     """
 
     def __init__(
@@ -87,7 +78,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         prior: SteeringPrior,
         settings: ExecutiveSettings,
         steady: Callable[[], float] = monotonic,
-        start: StartJob = ComputedJob,
+        start: StartJob = Job,
         law: str = DEFAULT_LAW,
     ) -> None:
         super().__init__(steady, {TARGET: (INSERTION,)})
@@ -99,13 +90,10 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.fault, self._noise = '', prior.noise
         self.planner = InsertionPlanner(needle, steering, prior, settings, start, law)
         self._motions = MotionControl(settings, self.events)
-        #: The latest insertion.
-        self._insertion: InsertionStrategy | None = None
-        #: Record of it, for an executive after a restart.
-        self.keeper = RecordKeeper()
-        #: The newest reading of the tip [m].
-        self._tip: tuple[float, ...] | None = None
-        #: The retraction after it.
+        self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
+        self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]
+        #: The latest insertion, and the retraction after it.
+        self._insertion: SteppedInsertion | None = None
         self._retraction: Retraction | None = None
 
     @property
@@ -151,26 +139,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def target(
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> JointMotion | None:
-        """
-        Plan an insertion to a target and begin it; during an insertion, change its target.
-
-        Parameters
-        ----------
-        stamp : int
-            Stamp of the message [ns]; 0 if it has none.
-        frame : str
-            Frame of the message.
-        point : tuple of float
-            Target of the tip, x, y, z [m].
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        JointMotion or None
-            Motion to send.
-
-        """
+        """Plan an insertion to a target x, y, z [m], or change its target; a stamp may be 0."""
         if not self._is_new(TARGET, stamp, frame, now):
             return None
         try:
@@ -298,17 +267,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self.obey(now)
 
     def halt(self, why: str, now: int) -> JointMotion | None:
-        """
-        End the insertion or retraction: needle and guide brake to rest; cancel a plan.
-
-        Parameters
-        ----------
-        why : str
-            Reason for the user.
-        now : int
-            Time [ns].
-
-        """
+        """End the insertion or retraction for a reason: brake to rest, and cancel a plan."""
         self.requests.supersede(now)
         self._cancel(Verdict.REJECTED, f'stopped: {why}')
         moves = self._moves
@@ -322,42 +281,20 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._motions.stop(now) if moves else None
 
     def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
-        """
-        Process the status of another node: its answers to the motions.
-
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-        status : RequestStatus
-            Status of the node.
-        now : int
-            Time [ns].
-
-        """
-        refusal = self._motions.monitor.hear(node, status)
+        """Process the status of another node by name: its answers to the motions."""
+        refusal = self._motions.monitor.process(node, status)
         if refusal is None:
             return None
         if self.steers:
             return self._stop(str(refusal), now)
         if self._retraction is not None:
-            self._retraction.hear(refusal)
+            self._retraction.refuse(refusal)
         elif self.phase is Phase.STOPPED:
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
-        """
-        Process `joint_states`.
-
-        Parameters
-        ----------
-        reading : Reading
-            The message.
-        now : int
-            Time [ns].
-
-        """
+        """Process `joint_states`."""
         found = dict(zip(reading.names, reading.values[0], strict=False))
         if missing := [name for name in self.settings.joints if name not in found]:
             got = f'got names {list(reading.names)}'
@@ -374,21 +311,20 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return None
         if not self.steers:
             if self.phase is Phase.DONE and motions.beyond:
-                self.fault = f'after the insertion {motions.astray()}'
+                self.fault = f'after the insertion {motions.departure()}'
                 return self._stop(self.fault, now)
             return None if self._retraction is None else self._retraction.follow(stamp, now)
-        if motions.astray():
-            return self._stop(motions.astray(), now)
+        if departure := motions.departure():
+            return self._stop(departure, now)
         if self.phase is Phase.MEASURING:
-            missed = motions.missed()
-            line = f'during the measurement of the tip {missed}'
-            return self._stop(line, now) if missed else None
+            line = f'during the measurement of the tip {motions.missed()}'
+            return self._stop(line, now) if motions.missed() else None
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)
 
     def _run(
-        self, process: Callable[[InsertionStrategy], JointMotion | None], now: int
+        self, process: Callable[[SteppedInsertion], JointMotion | None], now: int
     ) -> JointMotion | None:
         """Pass an event to the insertion under way, and stop it on a fault."""
         insertion = self._insertion
@@ -404,15 +340,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
-        """
-        Process `tip_deflection`.
-
-        Parameters
-        ----------
-        reading, now
-            As for `joints`.
-
-        """
+        """Process `tip_deflection`."""
         tip = reading.values[0]
         if not self._is_valid(self._tip_stream, reading, tip, now):
             return None
@@ -423,15 +351,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.events.reject(f'{stream.name} refused: {refusal.line}')
 
     def watch(self, now: int) -> JointMotion | None:
-        """
-        Check for missing inputs, and whether a plan is computed; call it ten times a second.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Check for missing inputs, and whether a plan is computed; call it ten times a second."""
         timeout = self.settings.measurement_timeout
         back = self.clock_went_back(now, self._joint_stream.timeout)
         if back:
@@ -457,37 +377,19 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
-        """
-        Set the numbers of publishers of the measurements: each must have one source only.
-
-        Parameters
-        ----------
-        joint_states, tip_deflection : int
-            Number of publishers.
-
-        """
+        """Set the numbers of publishers of the measurements: each must have one source only."""
         self._joint_stream.publishers = joint_states
         self._tip_stream.publishers = tip_deflection
 
     def diagnose(self, now: int) -> tuple[Severity, str, SteeringStatus]:
-        """
-        Return severity, the state in one line, and status.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Return severity, the state in one line, and status."""
         insertion, job = self._insertion, self.planner.job
-        status, warning = describe(insertion, self._motions.goal, self._noise, active=self.steers)
         status = replace(
-            status,
+            describe(insertion, self._motions.goal, self._noise, active=self.steers),
             phase=self.phase,
             system=self.authority.mode,
             fault=self.fault,
             planned_fraction=None if job is None else job.fraction,
-            warning=warning,
             input={stream.name: stream.status(now) for stream in self._streams},
             rejected=self.events.rejected,
             last_rejection=self.events.last_rejection,

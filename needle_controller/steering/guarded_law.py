@@ -3,7 +3,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from math import isfinite, sqrt
+from math import isfinite, nan, sqrt
 from typing import Any, Final
 
 from needle_controller.compiled.guide_plan import HIT
@@ -31,8 +31,8 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`, for every law. ``depths`` are the depths of the tip measurements
-    [m], shape (n + 1,), and ``noise`` is the configured standard deviation of a measurement [m].
+    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,), and
+    ``noise`` is the configured standard deviation of a measurement [m].
     """
 
     def __init__(
@@ -43,37 +43,22 @@ class GuardedLaw:
         settings: ExecutiveSettings,
         events: EventLog,
     ) -> None:
-        self.law, self.depths = law, depths
+        self.law, self.depths, self.steps = law, depths, len(depths) - 1
         self._noise, self._settings, self._events = noise, settings, events
-        #: Number of plans so far: the number of the present depth.
-        self.step = 0
-        #: Expected position of the tip at the target depth, new after each plan.
-        self.expected: TipEstimate | None = None
-        #: Last measurement.
-        self.measured: AveragedTipMeasurement | None = None
-        #: Largest deviation of a reading of the tip so far [m].
-        self._scatter = 0.0
-        #: Depth of the tip less the insertion depth, at the first measurement [m].
-        self._ahead: float | None = None
+        self.step = 0  #: number of plans so far: the number of the present depth
+        self.expected: TipEstimate | None = None  #: tip at the target depth, new after each plan
+        self.measured: AveragedTipMeasurement | None = None  #: last measurement
+        self._scatter = 0.0  #: largest deviation of a reading of the tip so far [m]
+        self._ahead: float | None = None  #: first depth of the tip less the insertion depth [m]
         #: Successive missing and identical measurements, and the last measurement [m].
         self._missing = self._same = 0
-        self._last: tuple[float, float] | None = None
-        self._setpoint = GuideSetpoint(0.0, 0.0)
+        self._last = np.full(2, nan)
+        self.setpoint = GuideSetpoint(0.0, 0.0)  #: last setpoint of guide and roll
         self._warned = False
         #: Inputs of the law in their order, and its setpoints: ``aim`` x, z [m]; ``tip``, x, y, z
         #: [m], or None, with the fields of `AveragedTipMeasurement`, ``at`` and ``depth`` as in
         #: `update`; ``plan`` x, z [m], roll [rad].
         self.history: list[dict[str, Any]] = []
-
-    @property
-    def steps(self) -> int:
-        """Number of steps n."""
-        return len(self.depths) - 1
-
-    @property
-    def setpoint(self) -> GuideSetpoint:
-        """Last setpoint of guide and roll."""
-        return self._setpoint
 
     def aim(self, target: FloatArray) -> None:
         """Change the target, x and z [m]."""
@@ -108,23 +93,20 @@ class GuardedLaw:
 
     def _take(self, measured: AveragedTipMeasurement | None, at: int, depth: float) -> None:
         self.measured = measured
-        fields = (
-            (None, 0.0, 0, False) if measured is None else (measured.tip.tolist(), *measured[1:])
-        )
-        named = zip(AveragedTipMeasurement._fields, fields, strict=True)
-        self.history.append({**dict(named), 'at': at, 'depth': depth})
-        if measured is None:
-            self._check_sensor(None)
-            with _guarded():
-                self.law.update(None, at)
-            return
-        self._check_slip(measured, depth)
-        x, _, z = measured.tip.tolist()
-        self._check_sensor((x, z))
-        self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
-        noise = max(measured.error, self._scatter / sqrt(measured.readings))
+        entry: dict[str, Any] = {'tip': None, 'error': 0.0, 'readings': 0, 'frozen': False}
+        if measured is not None:
+            entry = {**measured._asdict(), 'tip': measured.tip.tolist()}
+        self.history.append({**entry, 'at': at, 'depth': depth})
+        tip: FloatArray | None = None
+        noise = 0.0
+        if measured is not None:
+            self._check_slip(measured, depth)
+            tip = measured.tip[[0, 2]]
+            self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
+            noise = max(measured.error, self._scatter / sqrt(measured.readings))
+        self._check_sensor(tip)
         with _guarded():
-            self.law.update(measured.tip[[0, 2]], at, noise)
+            self.law.update(tip, at, noise)
 
     def _check_slip(self, measured: AveragedTipMeasurement, depth: float) -> None:
         """Compare the depth of the tip with the insertion depth [m]."""
@@ -143,7 +125,7 @@ class GuardedLaw:
             'than the needle was inserted: it slips, or the sensor measures another needle'
         )
 
-    def _check_sensor(self, tip: tuple[float, float] | None) -> None:
+    def _check_sensor(self, tip: FloatArray | None) -> None:
         """Count missing and identical measurements."""
         if tip is None:
             self._missing += 1
@@ -151,8 +133,8 @@ class GuardedLaw:
                 raise SteeringFaultError(f'{self._missing} tip measurements are missing')
             return
         self._missing = 0
-        self._same = self._same + 1 if tip == self._last else 0
-        self._last = tip
+        self._same = self._same + 1 if np.array_equal(tip, self._last) else 0
+        self._last = tip.copy()
         if self._same >= MOST_SAME:
             raise SteeringFaultError(
                 f'the tip sensor is frozen: {self._same + 1} identical measurements'
@@ -173,13 +155,13 @@ class GuardedLaw:
                 f'{1e3 * settings.guide_limit:g} mm'
             )
         widest = settings.limits(float(np.diff(self.depths).max())).guide_step + _ROUNDING
-        change = max(abs(to.x - self._setpoint.x), abs(to.z - self._setpoint.z))
+        change = max(abs(to.x - self.setpoint.x), abs(to.z - self.setpoint.z))
         if change > widest:
             raise SteeringFaultError(
                 f'the steering law requests a guide motion of {1e3 * change:.3f} mm in a step, at '
                 f'most {1e3 * widest:.3f} mm are possible'
             )
-        self._setpoint, self.step = to, k + 1
+        self.setpoint, self.step = to, k + 1
         self.history.append({'plan': [*to]})
         if k < self.steps and warning and not self._warned:
             self._warned = True

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Common part of stepped and continuous insertions: motions, rest, and measurement of the tip."""
-
-from abc import ABC, abstractmethod
+"""Stepped insertion: guide and needle move in turn, with a measurement at rest after each step."""
 
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
@@ -15,13 +13,13 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 
-class InsertionStrategy(ABC):
+class SteppedInsertion:
     """
     Insert a needle under a steering law: straighten the guide, measure, plan, move.
 
-    Every event is a method that returns a motion to send, as in `SteeringExecutive`. A fault is
-    raised as a `NeedleError`, after which the executive stops the insertion. `phase` is GUIDING,
-    INSERTING, MEASURING or DONE.
+    The needle moves when the guide has arrived: the path is independent of their speeds.
+    Every event is a method that returns a motion to send, or raises a `NeedleError`, which ends
+    the insertion. `phase` is GUIDING, INSERTING, MEASURING or DONE.
     """
 
     def __init__(
@@ -29,18 +27,12 @@ class InsertionStrategy(ABC):
     ) -> None:
         self.law, self._motions, self._settings = law, motions, settings
         self.phase = Phase.GUIDING
-        #: Stamp [ns] and insertion depth [m] at the start of rest.
-        self._rest: tuple[int, float] | None = None
+        self._rest: tuple[int, float] | None = None  #: stamp [ns] and depth [m] at its start
         self._measured: TipMeasurements | None = None
-        #: Stamps between which readings belong to a measurement at rest [ns].
-        self._span = 0, 0
+        self._span = 0, 0  #: stamps between which readings belong to a measurement at rest [ns]
 
     def begin(self, at: FloatArray, now: int) -> JointMotion | None:
-        """
-        Send the guide to its zero, from positions of the joints [m, rad].
-
-        A law with plans continues: the guide is sent to its last setpoint.
-        """
+        """Send the guide from joint positions [m, rad] to its zero, or to its last setpoint."""
         if self.law.step:
             self._motions.goal = at.copy()
             return self._begin_step(self.law.setpoint, now)
@@ -50,7 +42,6 @@ class InsertionStrategy(ABC):
         return self._send(Phase.GUIDING, straight, now)
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> JointMotion | None:
-        """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         return self._motions.send(goal, now)
 
@@ -64,11 +55,7 @@ class InsertionStrategy(ABC):
         return None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
-        """Process new positions of the joints during a motion."""
-        return self._wait(stamp, now)
-
-    def _wait(self, stamp: int, now: int) -> JointMotion | None:
-        """Wait until needle and guide rest at their goal."""
+        """Process new positions of the joints: wait until needle and guide rest at their goal."""
         motions = self._motions
         if stamp < motions.due:
             return None
@@ -81,8 +68,11 @@ class InsertionStrategy(ABC):
             raise SteeringFaultError(f'{missed}, {late:.1f} s late')
         return None
 
-    def _arrive(self, stamp: int, _now: int) -> JointMotion | None:
-        """Wait for rest at the goal, then begin a measurement."""
+    def _arrive(self, stamp: int, now: int) -> JointMotion | None:
+        """Insert the needle after the guide, or wait for rest, then begin a measurement."""
+        if self.phase is Phase.GUIDING and self.law.step:
+            goal = np.array([self.law.depths[self.law.step], *self._motions.goal[1:]])
+            return self._send(Phase.INSERTING, goal, now)
         depth = float(self._motions.at[0])
         if self._rest is None or abs(depth - self._rest[1]) > STILL:
             self._rest = stamp, depth
@@ -99,21 +89,18 @@ class InsertionStrategy(ABC):
         since, until = self._span
         if since < stamp <= until:
             self._measured.take(tip)
-        return self._end_measurement(now) if stamp >= until else None
+        return self._end_measurement(self._measured, now) if stamp >= until else None
 
     def watch(self, now: int) -> JointMotion | None:
         """End a measurement whose last readings do not arrive."""
         timeout = self._settings.measurement_timeout
         if self._measured is not None and now > self._span[1] + timeout * NANOSECONDS:
-            return self._end_measurement(now)
+            return self._end_measurement(self._measured, now)
         return None
 
-    def _end_measurement(self, now: int) -> JointMotion | None:
+    def _end_measurement(self, measured: TipMeasurements, now: int) -> JointMotion | None:
         """End a measurement of the tip, and begin the next step."""
-        measured, self._measured = self._measured, None
-        if measured is None:
-            return None
-        k = self.law.step
+        k, self._measured = self.law.step, None
         self.law.update(measured, k, float(self._motions.at[0]))
         to = self.law.plan()
         if k == self.law.steps:
@@ -121,6 +108,8 @@ class InsertionStrategy(ABC):
             return None
         return self._begin_step(to, now)
 
-    @abstractmethod
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
         """Begin the step after a measurement at rest."""
+        goal = self._motions.goal
+        goal = np.array([goal[0], to.x, to.z, to.roll])[: len(goal)]
+        return self._send(Phase.GUIDING, goal, now)

@@ -5,15 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+import json
+import os
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.motion_control import LAGGING
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
-from needle_ros.errors import JobError, MessageError
+from needle_ros.errors import JobError, MessageError, ParameterError
+from needle_ros.files import write_whole
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import Authority
 import numpy as np
@@ -34,18 +38,13 @@ class PlannedInsertion(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringRecord:
-    """
-    Plan and estimate of an insertion; its fields are values of JSON.
-
-    `history` has the inputs of the steering law in their order and its setpoints, see
-    `GuardedLaw.history`: a law with the same inputs has the same estimate.
-    """
+    """Plan and estimate of an insertion; its fields are values of JSON."""
 
     point: Sequence[float]  #: target of the tip at the start, x, y, z [m]
     depths: Sequence[float]  #: depths of the tip measurements [m]
     start: Sequence[float]  #: positions of the joints at the start [m, rad]
     continuous: bool  #: whether the needle is inserted without rests
-    history: Sequence[Mapping[str, Any]]
+    history: Sequence[Mapping[str, Any]]  #: `GuardedLaw.history`, which determines the estimate
     #: Expected position of the tip at the target depth, x, z [m], and its covariance [m^2].
     expected: Sequence[float]
     covariance: Sequence[Sequence[float]]
@@ -72,12 +71,7 @@ class SteeringRecord:
     def check(
         self, at: FloatArray, tip: Sequence[float] | None, state: int, own: ExecutiveSettings
     ) -> None:
-        """
-        Check that needle, guide and tip are where the record leaves them, or raise `JobError`.
-
-        ``at`` are the positions of the joints [m, rad], ``tip`` is a reading of the tip, x, y, z
-        [m], and ``state`` the time of the newest change of the system state [ns].
-        """
+        """Raise `JobError` if joints [m, rad], tip x, y, z [m] or state [ns] have changed."""
         if self.ended:
             raise JobError(self.ended)
         if self.continuous or own.continuous:
@@ -103,11 +97,10 @@ class SteeringRecord:
         return before, np.array([self.depths[min(step, len(self.depths) - 1)], *plans[step]])
 
     def _check_tip(self, depth: float, tip: Sequence[float] | None, slip: float) -> None:
-        """Compare a reading of the tip [m] with the last measurement."""
-        looks = [entry for entry in self.history if entry.get('tip') is not None]
-        if tip is None or not looks:
+        measured = [entry for entry in self.history if entry.get('tip') is not None]
+        if tip is None or not measured:
             raise JobError('the tip is not measured')
-        last = looks[-1]
+        last = measured[-1]
         off, moved = np.subtract(tip, last['tip']), depth - last['depth']
         across = slip + _STEEPEST * abs(moved)
         if abs(off[1] - moved) > slip or np.hypot(off[0], off[2]) > across:
@@ -130,11 +123,11 @@ class RecordKeeper:
     """The record of the latest insertion, created when it has changed."""
 
     def __init__(self) -> None:
-        self._insertion: InsertionStrategy | None = None
+        self._insertion: SteppedInsertion | None = None
         self._key: tuple[Any, ...] = ()
 
     def begin(
-        self, request: PlannedInsertion, insertion: InsertionStrategy, authority: Authority
+        self, request: PlannedInsertion, insertion: SteppedInsertion, authority: Authority
     ) -> None:
         """Keep the record of an insertion from now on."""
         self._insertion, self._request, self._authority = insertion, request, authority
@@ -160,3 +153,35 @@ class RecordKeeper:
             ended=ended,
             state=state,
         )
+
+
+class RecordFile:
+    """
+    File with the record of a node on a domain, and with the source of its measurements.
+
+    The source identifies the process of the robot: with another one, the needle may be another.
+    """
+
+    def __init__(self, node: str, domain: int) -> None:
+        home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+        name = node.strip('/').replace('/', '.')
+        self._path = home / 'needle_insertion' / f'{name}.{domain}.json'
+
+    def write(self, record: str, source: str) -> None:
+        """Replace the file, or raise `ParameterError`."""
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ParameterError(f'{self._path} cannot be written: {error.strerror}') from error
+        write_whole(self._path, json.dumps({'source': source, 'record': record}).encode())
+
+    def read(self) -> tuple[SteeringRecord, str] | None:
+        """Return the record and its source; None without a file, `MessageError` if invalid."""
+        try:
+            content = json.loads(self._path.read_bytes())
+            record = SteeringRecord.from_values(json.loads(content['record']))
+            return record, str(content['source'])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise MessageError(f'{self._path} cannot be read: {error}') from error

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Status of a steered insertion: phase, law, expected tip and last measurement."""
 
-from dataclasses import replace
 from typing import Final
 
-from needle_controller.steering.insertion import InsertionStrategy
+from needle_controller.steering.insertion import SteppedInsertion
 from needle_dynamics.arrays import FloatArray
 from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase
@@ -21,28 +20,33 @@ _DESCRIPTIONS: Final = {
     Phase.MEASURING: 'measures the tip',
     Phase.RETRACTING: 'the needle is withdrawn',
 }
-
-#: Noise of the readings of the tip, as a multiple of the configured noise, that is reported.
-_SCATTERED: Final = 3.0
+_SCATTERED: Final = 3.0  #: Multiple of the configured noise of a measurement that is reported.
 
 
 def describe(
-    insertion: InsertionStrategy | None, goal: FloatArray, noise: float, *, active: bool
-) -> tuple[SteeringStatus, str]:
+    insertion: SteppedInsertion | None, goal: FloatArray, noise: float, *, active: bool
+) -> SteeringStatus:
     """
-    Return the status of an insertion, and its warning or ''.
+    Return the status of an insertion, with its warning.
 
     ``goal`` are the goals of the joints [m, rad], ``noise`` is the configured noise of a tip
-    measurement [m], and ``active`` whether the insertion is under way.
+    measurement [m], and a law has no warning unless ``active``.
     """
     if insertion is None:
-        return SteeringStatus(), ''
+        return SteeringStatus()
     guarded, law = insertion.law, insertion.law.law
+    expected, measured = guarded.expected, guarded.measured
     x, z = np.asarray(law.target).tolist()
     _, guide_x, guide_z = goal[:3].tolist()
+    warning = law.warning if active else ''
+    if not warning and measured is not None and measured.error > _SCATTERED * noise:
+        warning = (
+            f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
+            f'configured {1e3 * noise:.2f} mm (prior.noise)'
+        )
     values = dict(law.status())
     turns = values.pop('turns_left', None)
-    status = SteeringStatus(
+    return SteeringStatus(
         target=(x, float(guarded.depths[-1]), z),
         step=min(guarded.step, guarded.steps),
         steps=guarded.steps,
@@ -51,38 +55,18 @@ def describe(
         hit_probability=values.pop('hit_probability', None),
         bending_length_ratio=values.pop('bending_length_ratio', None),
         law=values,
+        expected_tip=tuple(expected.mean.tolist()) if expected else None,
+        expected_tip_half_width=tuple(expected.half_width.tolist()) if expected else None,
+        last_measurement_readings=measured and measured.readings,
+        last_measurement_error=measured and measured.error,
+        warning=warning,
     )
-    if guarded.expected is not None:
-        half = guarded.expected.half_width
-        status = replace(
-            status,
-            expected_tip=tuple(guarded.expected.mean.tolist()),
-            expected_tip_half_width=tuple(half.tolist()),
-        )
-    warning, measured = law.warning if active else '', guarded.measured
-    if measured is not None:
-        status = replace(
-            status,
-            last_measurement_readings=measured.readings,
-            last_measurement_error=measured.error,
-        )
-        if not warning and measured.error > _SCATTERED * noise:
-            warning = (
-                f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
-                f'configured {1e3 * noise:.2f} mm (prior.noise)'
-            )
-    return status, warning
 
 
 def summarize(
-    status: SteeringStatus, insertion: InsertionStrategy | None, failure: str, advice: str
+    status: SteeringStatus, insertion: SteppedInsertion | None, failure: str, advice: str
 ) -> tuple[Severity, str]:
-    """
-    Return severity and state in one line, for users.
-
-    ``failure`` is the reason why a retraction has failed, and ``advice`` follows the line of an
-    idle node; both may be ''.
-    """
+    """Return severity and state in one line, with the failure or the advice, if not empty."""
     if status.phase is Phase.STOPPED:
         return Severity.ERROR, f'stopped: {status.fault}'
     if failure and status.phase is Phase.IDLE:

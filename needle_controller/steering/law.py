@@ -24,10 +24,7 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
     'roll_to_target': f'{_LAWS}.roll_to_target:RollToTargetLaw',
     'open_loop': f'{_LAWS}.open_loop:OpenLoopLaw',
 }
-
-#: Default law of the node, of `needle steer` and of studies.
-DEFAULT_LAW: Final = 'multi_hypothesis'
-
+DEFAULT_LAW: Final = 'multi_hypothesis'  #: Default law of node, `needle steer` and studies.
 
 #: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
 NORMAL, _CHI_SQUARED = 1.96, 5.991
@@ -50,15 +47,7 @@ class TipEstimate:
         return np.asarray(NORMAL * np.sqrt(np.diag(self.covariance)))
 
     def contains(self, tip: FloatArray) -> bool:
-        """
-        Return whether the 95 % ellipse contains a position.
-
-        Parameters
-        ----------
-        tip : ndarray, shape (2,)
-            Position in x and z [m].
-
-        """
+        """Return whether the 95 % ellipse contains a position x, z [m], shape (2,)."""
         off = tip - self.mean
         return bool(off @ np.linalg.solve(self.covariance, off) <= _CHI_SQUARED)
 
@@ -94,43 +83,18 @@ class SteeringLaw(Protocol):
         """Warning for the user, '' without a warning."""
 
     def aim(self, target: ArrayLike) -> None:
-        """
-        Continue to another target at the same depth.
-
-        Parameters
-        ----------
-        target : array_like, shape (2,)
-            Target position of the tip at the last depth, x and z [m].
-
-        Raises
-        ------
-        NeedleError
-            If the target is not possible. The target is then unchanged.
-
-        """
+        """Change the target x, z [m], or raise `NeedleError` and keep the old one."""
 
     def update(
         self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0
     ) -> None:
         """
-        Process an averaged tip measurement.
+        Process an averaged tip measurement x, z [m] in the frame of the sensor; None if missing.
 
-        Parameters
-        ----------
-        tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
-        at : int
-            Number of its depth, not greater than `step`: the present or, if the needle does not
-            rest, the depth before.
-        noise : float
-            Standard deviation of the measurement along each axis, if above the configured one [m].
-
-        Raises
-        ------
-        SteeringFaultError
-            If the needle must stop, because the measurements are missing for too long, have
-            frozen, or are implausible.
-
+        ``at`` is the number of its depth, not greater than `step`: the present or, if the needle
+        does not rest, the depth before. ``noise`` is its standard deviation along each axis, if
+        above the configured one [m]. Raises `SteeringFaultError` if the needle must stop, because
+        the measurements are missing for too long, frozen or implausible.
         """
 
     def plan(self) -> GuideSetpoint:
@@ -149,19 +113,15 @@ LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float]
 
 def find_law(name: str) -> LawClass:
     """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
+    valid = f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class'
     module, _, of_class = STEERING_LAWS.get(name, name).partition(':')
     if not module or not of_class:
-        raise ParameterError(
-            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class, got {name!r}'
-        )
+        raise ParameterError(f'{valid}, got {name!r}')
     try:
         found: LawClass = getattr(import_module(module), of_class)
     # The module is any code of the user.
     except Exception as error:
-        raise ParameterError(
-            f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class; {name!r} cannot be '
-            f'imported: {error}'
-        ) from error
+        raise ParameterError(f'{valid}; {name!r} cannot be imported: {error}') from error
     return found
 
 
@@ -184,18 +144,10 @@ def build_law(
     roll : float
         Roll of the needle at the start [rad].
 
-    Returns
-    -------
-    SteeringLaw
-        The law.
-
     Raises
     ------
-    ParameterError
-        If there is no such law, or its class cannot be constructed.
     OutOfReachError
         If the law detects that the target is out of reach.
-
     """
     of_class = find_law(name)
     try:
@@ -213,25 +165,22 @@ def build_law(
 
 
 def checked_roll(roll: float) -> float:
-    """Return the roll at the start [rad], if it is finite."""
     if not isfinite(roll):
         raise ParameterError(f'roll must be finite, got {roll!r} rad')
     return roll
 
 
-def checked_tip(tip: Sequence[float] | FloatArray | None) -> FloatArray:
-    """Return a tip measurement x, z [m] as an array, nan if it is missing."""
+def checked_tip(tip: ArrayLike | None, name: str = 'a tip measurement') -> FloatArray:
+    """Return a tip measurement x, z [m], nan if it is missing."""
     found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
     if found.shape != (2,):
-        raise ShapeError(f'a tip measurement must be x and z, got shape {found.shape}')
+        raise ShapeError(f'{name} must be x and z, got shape {found.shape}')
     return found
 
 
 def checked_target(target: ArrayLike) -> FloatArray:
-    """Return a target x, z [m] as an array, if it is two finite numbers."""
-    found = np.array(target, dtype=np.float64)
-    if found.shape != (2,):
-        raise ShapeError(f'target must be x and z, got shape {found.shape}')
+    """Return a target x, z [m], if it is two finite numbers."""
+    found = checked_tip(target, 'target')
     if not np.isfinite(found).all():
         raise ParameterError(f'target must be finite, got {found.tolist()} m')
     return found

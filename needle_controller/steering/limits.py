@@ -36,6 +36,5 @@ class SteeringLimits:
 
 
 STEP_LENGTH: Final = 5e-3  #: Default insertion from one tip measurement to the next [m].
-
 #: Default limits of simulations: only the position of the guide is limited.
 SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)

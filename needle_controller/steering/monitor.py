@@ -12,9 +12,9 @@ from needle_ros.requests import Acknowledgement, REPEAT_AFTER, REPEATS, RequestS
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-#: Least displacement of a joint that follows, if less than its tolerance [m, rad].
-_MOVED: Final = 1e-4
-
+_MOVED: Final = (
+    1e-4  #: Displacement of a joint that follows, unless its tolerance is less [m, rad].
+)
 _REACTION: Final = 0.3  #: Time for a robot to react to a motion [s].
 _STREAMED: Final = 64  #: Number of kept stamps of a stream of motions: more than in a second.
 
@@ -33,15 +33,15 @@ class MotionRefusal(NamedTuple):
 
 class MotionMonitor:
     """
-    Compare the last motion with the joint positions, and with the answers to it.
+    Compare the last motion with the positions of the ``joints`` [m, rad], and with its answers.
 
-    ``tolerances``, shape (joints,), are of the positions of the ``joints`` [m, rad].
+    ``tolerances`` of the positions, and all positions, have shape (joints,).
     """
 
     def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:
         self._joints, self._tolerances = list(joints), tolerances
-        #: Status of the nodes that take trajectories, by name.
-        self._receivers: dict[str, RequestStatus] = {}
+        self._moved = np.minimum(tolerances, _MOVED)
+        self._receivers: dict[str, RequestStatus] = {}  #: nodes that take trajectories, by name
         #: Stamps of the motion with its repetitions, and of the motions of a stream [ns].
         self._stamps: list[int] = []
         self._streamed: deque[int] = deque(maxlen=_STREAMED)
@@ -55,16 +55,16 @@ class MotionMonitor:
         self._streamed.clear()
         self._refused.clear()
         self._begin = self._goal = np.zeros(len(self._joints))
-        self._pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
+        #: Whether each joint still has to follow the motion, shape (joints,).
+        self.pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
         self._arrives = False
-        #: Time from which each joint is late [ns].
-        self._overdue = np.zeros(len(self._joints), dtype=np.int64)
+        self._overdue = np.zeros(len(self._joints), dtype=np.int64)  #: times of late joints [ns]
 
     def begin(
         self, move: JointMotion, at: FloatArray, *, again: bool = False, arrives: bool = False
     ) -> None:
         """
-        Start to monitor a motion from measured positions ``at`` [m, rad], shape (joints,).
+        Start to monitor a motion from measured positions [m, rad].
 
         ``again`` marks a repetition of the motion. With ``arrives`` the joints must arrive in
         time, where a part of the motion may have been followed already; otherwise they must begin
@@ -76,51 +76,38 @@ class MotionMonitor:
         columns = [self._joints.index(name) for name in move.joints]
         self._begin, self._goal = at.copy(), at.copy()
         self._goal[columns] = move.positions[-1]
-        way, room = np.abs(self._goal - self._begin), self._room
-        self._pending = way > (self._tolerances if arrives else room)
+        distance, moved = np.abs(self._goal - self._begin), self._moved
+        self.pending = distance > (self._tolerances if arrives else moved)
         self._arrives = arrives
-        for k in np.flatnonzero(self._pending):
-            gone = move.positions[:, columns.index(int(k))] - at[k]
-            gone = gone * np.sign(self._goal[k] - at[k])
-            seen = len(gone) - 1 if arrives else int(np.argmax(gone >= min(room[k], way[k])))
-            wait = max(REPEAT_AFTER, float(move.times[seen]) + _REACTION)
+        for k in np.flatnonzero(self.pending):
+            shift = move.positions[:, columns.index(int(k))] - at[k]
+            shift = shift * np.sign(self._goal[k] - at[k])
+            point = -1 if arrives else int(np.argmax(shift >= min(moved[k], distance[k])))
+            wait = max(REPEAT_AFTER, float(move.times[point]) + _REACTION)
             self._overdue[k] = move.stamp + round(wait * NANOSECONDS)
-
-    @property
-    def _room(self) -> FloatArray:
-        return np.minimum(self._tolerances, _MOVED)
 
     def stream(self, move: JointMotion) -> None:
         """Add a motion that is soon replaced by the next: only its answers are monitored."""
         self._streamed.append(move.stamp)
 
     def is_late(self, at: FloatArray, stamp: int) -> bool:
-        """
-        Return whether the motion is overdue and must be repeated.
-
-        ``at`` are the positions of the joints [m, rad], shape (joints,), and ``stamp`` is their
-        time [ns].
-        """
-        if not self._pending.any():
+        """Return whether the motion is overdue at positions [m, rad] with their stamp [ns]."""
+        if not self.pending.any():
             return False
         if self._arrives:
-            self._pending &= np.abs(at - self._goal) > self._tolerances
+            self.pending &= np.abs(at - self._goal) > self._tolerances
         else:
             gone = (at - self._begin) * np.sign(self._goal - self._begin)
-            self._pending &= gone < self._room
-        return bool((self._pending & (stamp >= self._overdue)).any())
+            self.pending &= gone < self._moved
+        return bool((self.pending & (stamp >= self._overdue)).any())
 
     @property
     def exhausted(self) -> bool:
         """Whether the largest number of repetitions is reached."""
         return len(self._stamps) > REPEATS
 
-    def hear(self, node: str, status: RequestStatus) -> MotionRefusal | None:
-        """
-        Process the status of a node that takes trajectories.
-
-        Returns once that the node does not execute the motion, None if it does.
-        """
+    def process(self, node: str, status: RequestStatus) -> MotionRefusal | None:
+        """Process the status of a node; return once that it does not execute the motion."""
         joints = status.takes.get(JOINT_TRAJECTORY.name)
         if joints is None:
             return None
@@ -134,44 +121,29 @@ class MotionMonitor:
         return None
 
     def _refuses(self, answer: Acknowledgement) -> bool:
-        """Return whether an answer rejects the last motion."""
         if answer.verdict is Verdict.REJECTED:
             return answer.stamp in self._stamps or answer.stamp in self._streamed
         # The motions before the newest are superseded by it.
         return answer.verdict is Verdict.SUPERSEDED and answer.stamp in self._stamps[-1:]
 
-    @property
-    def pending(self) -> BoolArray:
-        """Whether each joint still has to follow the motion, shape (joints,)."""
-        return self._pending
-
     def failure(self) -> str:
         """Describe how often the motion was sent, and which nodes answered."""
-        late = np.flatnonzero(self._pending) if self._pending.any() else range(len(self._joints))
+        topic, count = JOINT_TRAJECTORY.name, len(self._stamps)
+        late = np.flatnonzero(self.pending) if self.pending.any() else range(len(self._joints))
         names = {self._joints[k] for k in late}
-        takers = {
-            node: status
+        answers = {
+            node: [status.answer_to(topic, stamp) for stamp in self._stamps]
             for node, status in self._receivers.items()
-            if names & {*status.takes[JOINT_TRAJECTORY.name]}
+            if names & {*status.takes[topic]}
         }
-        silent = [
-            node
-            for node, status in takers.items()
-            if not any(status.answer_to(JOINT_TRAJECTORY.name, one) for one in self._stamps)
-        ]
-        if not takers:
-            why = f'no node reports that it takes {JOINT_TRAJECTORY.name}'
+        silent = [node for node, found in answers.items() if not any(found)]
+        last = [found[-1] for found in answers.values()]
+        if not answers:
+            why = f'no node reports that it takes {topic}'
         elif silent:
             why = f'no answer of {" and ".join(silent)}'
-        elif any(_is_late(status, self._stamps[-1]) for status in takers.values()):
+        elif any(answer and answer.verdict is Verdict.LATE for answer in last):
             why = 'it arrived too late'
         else:
-            why = f'{" and ".join(takers)} accepted it'
-        count = len(self._stamps)
-        return f'{JOINT_TRAJECTORY.name} sent {count} time{"s" * (count > 1)}, {why}'
-
-
-def _is_late(status: RequestStatus, stamp: int) -> bool:
-    """Return whether a node has received a motion after its end."""
-    answer = status.answer_to(JOINT_TRAJECTORY.name, stamp)
-    return answer is not None and answer.verdict is Verdict.LATE
+            why = f'{" and ".join(answers)} accepted it'
+        return f'{topic} sent {count} time{"s" * (count > 1)}, {why}'

@@ -4,6 +4,8 @@
 from math import ceil, sqrt
 from typing import Final, NamedTuple
 
+from needle_controller.reference.quintic import Quintic
+from needle_controller.reference.setpoint import Setpoint
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
 import numpy as np
@@ -31,31 +33,22 @@ class JointMotion(NamedTuple):
 def smooth(
     joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float
 ) -> JointMotion:
-    """
-    Return a minimum-jerk motion (fifth-order polynomial) from rest to rest of proportional joints.
-
-    ``begin`` and ``end`` are positions [m, rad], shape (joints,); ``duration`` is in s.
-    """
+    """Return a minimum-jerk motion from rest to rest [m, rad] in a duration [s]."""
     count = max(_POINTS, ceil(duration / _INTERVAL))
-    part = np.arange(1, count + 1) / count
-    gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
-    rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
-    way = end - begin
+    times = duration * (np.arange(1, count + 1) / count)
+    unit, shift = Quintic(Setpoint(0.0), Setpoint(1.0), duration), end - begin
+    parts, rates, _ = np.array([unit.at(time) for time in times.tolist()]).T
     # The last point is exact.
-    positions = np.vstack([begin + np.outer(gone[:-1], way), end])
-    return JointMotion(joints, duration * part, positions, np.outer(rate, way))
+    positions = np.vstack([begin + np.outer(parts[:-1], shift), end])
+    return JointMotion(joints, times, positions, np.outer(rates, shift))
 
 
-def duration_of(way: FloatArray, settings: ExecutiveSettings) -> float:
-    """
-    Return the shortest duration [s] of a smooth motion within speed and acceleration limits.
-
-    ``way`` is the displacement of the joints [m, rad], shape (joints,).
-    """
-    along, across = float(abs(way[0])), float(np.hypot(way[1], way[2]))
+def duration_of(shift: FloatArray, settings: ExecutiveSettings) -> float:
+    """Return the shortest duration [s] of a smooth motion of the joints by a shift [m, rad]."""
+    along, across = float(abs(shift[0])), float(np.hypot(shift[1], shift[2]))
     return max(
         _PEAK * along / settings.speed,
         _PEAK * across / settings.guide_speed,
-        _PEAK * float(np.abs(way[3:]).sum()) / settings.roll_speed,
+        _PEAK * float(np.abs(shift[3:]).sum()) / settings.roll_speed,
         sqrt(_STEEPEST * max(along, across) / settings.acceleration),
     )

@@ -16,16 +16,11 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 BRAKING: Final = 0.2  #: Time in which needle and guide brake to rest after a stop [s].
-
-#: Number of points of a stop: one that arrives within a second is not in the past yet.
-_HELD: Final = 6
-
+_HELD: Final = 6  #: Number of points of a stop: if it arrives within a second, one is not past.
 LAGGING: Final = 5.0  #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 
-#: Time after which a stop is sent again to a needle that still moves [s], and number of times that
-#: it is sent.
+#: Time after which a stop is sent again to a needle that still moves [s], and number of stops.
 _STOP_AGAIN, _STOPS = 0.5, 4
-
 _SPAN: Final = 0.05  #: Time over which the velocity of the needle is measured [s].
 STILL: Final = 1e-4  #: Largest displacement of a needle at rest [m].
 
@@ -36,8 +31,7 @@ class MotionControl:
     def __init__(self, settings: ExecutiveSettings, events: EventLog) -> None:
         self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
-        #: Measured positions [m, rad], shape (joints,); nan before the first measurement.
-        self.at = np.full(len(settings.joints), np.nan)
+        self.at = np.full(len(settings.joints), np.nan)  #: measured positions [m, rad]
         #: Velocity of the needle [m/s]; stamp [ns] and depth [m] from which it is measured.
         self.velocity = 0.0
         self._before: tuple[int, float] | None = None
@@ -46,8 +40,7 @@ class MotionControl:
         self.origin = self.goal = np.zeros(len(settings.joints))
         self.due = 0
         self.again: Callable[[int], JointMotion | None] = lambda _now: None
-        #: Stamp of the newest motion [ns], unique for each motion.
-        self._stamp = 0
+        self._stamp = 0  #: stamp of the newest motion [ns], unique for each motion
         #: Positions of the stop, stamp [ns] and insertion depth [m] of the last check for rest,
         #: and number of stops left to send.
         self._halt: FloatArray | None = None
@@ -112,19 +105,8 @@ class MotionControl:
         self, position: FloatArray, velocity: FloatArray, duration: float, now: int
     ) -> JointMotion:
         """Send the guide to a position [m] with a velocity [m/s] in a duration [s]."""
-        move = JointMotion(
-            self._settings.joints[1:3],
-            np.array([duration]),
-            position[np.newaxis],
-            velocity[np.newaxis],
-        )
-        return self._stamped(move, now)
-
-    def guide_toward(self, position: FloatArray, duration: float, now: int) -> JointMotion:
-        """Send the guide to rest at a position [m], in a duration [s] or at `guide_speed`."""
-        way = position - self.at[1:3]
-        duration = max(duration, float(np.hypot(*way)) / self._settings.guide_speed)
-        return self.guide_to(position, np.zeros(2), duration, now)
+        guide, times = self._settings.joints[1:3], np.array([duration])
+        return self._stamped(JointMotion(guide, times, position[None], velocity[None]), now)
 
     def _stamped(self, move: JointMotion, now: int) -> JointMotion:
         """Return a motion with a unique stamp: simulated time may stand still."""
@@ -142,7 +124,7 @@ class MotionControl:
         self._events.add(Severity.WARNING, f'{failure}; sent again')
         return self.again(now)
 
-    def astray(self) -> str:
+    def departure(self) -> str:
         """Describe the first joint outside its motion, '' if none is."""
         low, high = np.minimum(self.origin, self.goal), np.maximum(self.origin, self.goal)
         room = LAGGING * self._settings.tolerances
@@ -163,15 +145,13 @@ class MotionControl:
         """Describe the joints (or given joints) that are not at their goal, '' if all are."""
         far = np.abs(self.at - self.goal) > self._settings.tolerances
         far = far if which is None else which
-        missed = []
-        for k, name in enumerate(self._settings.joints):
-            scale, unit = (1.0, 'rad') if name == ROLL else (1e3, 'mm')
-            if far[k]:
-                missed.append(
-                    f'{name} is at {scale * self.at[k]:.3f} {unit}, not at '
-                    f'{scale * self.goal[k]:.3f} {unit}'
-                )
-        return ' and '.join(missed)
+        scaled = [(1.0, 'rad') if name == ROLL else (1e3, 'mm') for name in self._settings.joints]
+        rows = zip(self._settings.joints, scaled, self.at, self.goal, far, strict=True)
+        return ' and '.join(
+            f'{name} is at {scale * at:.3f} {unit}, not at {scale * goal:.3f} {unit}'
+            for name, (scale, unit), at, goal, missed in rows
+            if missed
+        )
 
     # Stops.
 
@@ -213,10 +193,10 @@ class MotionControl:
         held = np.tile(end, (_HELD, 1))
         times = BRAKING * np.arange(1.0, _HELD + 1.0)
         move = JointMotion(self._settings.joints, times, held, np.zeros_like(held))
-        halt = self._stamped(move, now)
+        move = self._stamped(move, now)
         self.monitor.forget()
-        self.monitor.stream(halt)
-        return halt
+        self.monitor.stream(move)
+        return move
 
     def stop_again(self, stamp: int, now: int) -> JointMotion | None:
         """Send the stop again to a needle that still advances; never beyond its present depth."""

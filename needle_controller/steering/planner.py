@@ -2,6 +2,7 @@
 """Planner of an insertion: check its start, and compute the steering law in a job."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import ceil
 from typing import Final
 
@@ -18,32 +19,24 @@ from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import JobError, NeedleError, ParameterError
 import numpy as np
 
-#: Largest depth of a needle outside tissue, where the guide may move freely [m].
-_OUTSIDE: Final = 1e-3
-
+_OUTSIDE: Final = 1e-3  #: Depth of a needle outside tissue, where the guide may move freely [m].
 _SAME: Final = 1e-6  #: Tolerance of equal numbers of steps.
 _MOST_STEPS: Final = 200  #: Most steps of a plan.
 
 
+@dataclass(slots=True, eq=False)
 class InsertionPlanner:
     """Compute the law of an insertion, one at a time; arguments as for `SteeringExecutive`."""
 
-    def __init__(
-        self,
-        needle: NeedleParameters,
-        steering: SteeringParameters,
-        prior: SteeringPrior,
-        settings: ExecutiveSettings,
-        start: StartJob,
-        law: str,
-    ) -> None:
-        self._needle, self._steering, self.prior = needle, steering, prior
-        self._settings, self._start, self._law = settings, start, law
-        #: Computation under way, and its request.
-        self.job: Job[SteeringLaw] | None = None
-        self.request: PlannedInsertion | None = None
-        #: Record of the insertion before a restart.
-        self.recalled: SteeringRecord | None = None
+    needle: NeedleParameters
+    steering: SteeringParameters
+    prior: SteeringPrior
+    settings: ExecutiveSettings
+    start_job: StartJob
+    law: str
+    job: Job[SteeringLaw] | None = None  #: computation under way
+    request: PlannedInsertion | None = None  #: its request
+    recalled: SteeringRecord | None = None  #: record of the insertion before a restart
 
     def advice(self, depth: float) -> str:
         """Return advice to the user after a restart with a needle at a depth [m], or ''."""
@@ -66,22 +59,18 @@ class InsertionPlanner:
         tip: Sequence[float] | None,
         state: int,
     ) -> PlannedInsertion:
-        """
-        Return a request with the depths of its steps, if an insertion can begin or resume.
-
-        ``begun`` is as for `depths`, ``tip`` and ``state`` are as for `SteeringRecord.check`.
-        """
+        """Return a request with its depths, if an insertion can begin or resume."""
         record, depth = self.recalled, float(request.at[0])
         if begun is None and record is not None:
             begun = float(record.depths[0])
             same = abs(request.point[1] - record.depths[-1]) <= _SAME
             if same and depth > begun + _OUTSIDE:
                 try:
-                    record.check(request.at, tip, state, self._settings)
+                    record.check(request.at, tip, state, self.settings)
                 except JobError as error:
                     raise _cannot_resume(error, begun) from error
                 return request._replace(depths=np.array(record.depths), record=record)
-        return request._replace(depths=self.depths(request.point, request.at, begun))
+        return request._replace(depths=self._depths(request, begun))
 
     def resume(self, request: PlannedInsertion, law: GuardedLaw) -> None:
         """Restore a law to the record of its request, if it has one."""
@@ -95,16 +84,9 @@ class InsertionPlanner:
         if np.abs(np.subtract(law.law.target, (x, z))).max() > _SAME:
             law.aim(np.array([x, z]))
 
-    def depths(
-        self, point: tuple[float, float, float], at: FloatArray, begun: float | None
-    ) -> FloatArray:
-        """
-        Return the depths of the steps to a target, if an insertion can begin.
-
-        ``at`` are the positions of the joints [m, rad], and ``begun`` is the depth at which the
-        last insertion began, if there was one [m].
-        """
-        settings = self._settings
+    def _depths(self, request: PlannedInsertion, begun: float | None) -> FloatArray:
+        """Return the depths of the steps, if an insertion can begin; the last began at a depth."""
+        point, at, settings = request.point, request.at, self.settings
         if at[0] < -_OUTSIDE:
             raise JobError(f'the needle is {-1e3 * at[0]:.2f} mm before the skin')
         depth, straight = max(0.0, float(at[0])), begun or 0.0
@@ -134,33 +116,25 @@ class InsertionPlanner:
 
     def start(self, request: PlannedInsertion) -> None:
         """Start to compute the law of a request."""
-        point, depths = request.point, request.depths
-        if request.record is not None:
-            # The law was constructed for the target at the start.
-            x, _, z = request.record.point
-            point, at = (x, point[1], z), np.array(request.record.start)
-        else:
-            at = request.at
-        settings, steps = self._settings, len(depths) - 1
+        settings, depths, record = self.settings, request.depths, request.record
+        # The law of a record was constructed for the target at the start.
+        x, _, z = request.point if record is None else record.point
+        at = request.at if record is None else record.start
+        limits = settings.limits(float(request.point[1] - depths[0]) / (len(depths) - 1))
+        roll = float(at[3]) if settings.turns else 0.0
 
         def work(progress: Progress) -> SteeringLaw:
             model = SteeringModel(
-                self._needle,
-                self._steering,
+                self.needle,
+                self.steering,
                 depths,
                 self.prior,
                 together=settings.continuous,
                 progress=progress,
             )
-            return build_law(
-                self._law,
-                model,
-                (point[0], point[2]),
-                settings.limits(float(point[1] - depths[0]) / steps),
-                roll=float(at[3]) if settings.turns else 0.0,
-            )
+            return build_law(self.law, model, (x, z), limits, roll)
 
-        self.request, self.job = request, self._start(work)
+        self.request, self.job = request, self.start_job(work)
 
     def take(self) -> tuple[PlannedInsertion, Job[SteeringLaw]] | None:
         """Return the request and its job once it is computed, and discard both."""
@@ -172,10 +146,10 @@ class InsertionPlanner:
 
     def cancel(self) -> PlannedInsertion | None:
         """Cancel the computation and return its request, None without one."""
-        if self.job is not None:
-            self.job.cancel()
-        request = self.request
+        request, job = self.request, self.job
         self.request = self.job = None
+        if job is not None:
+            job.cancel()
         return request
 
 

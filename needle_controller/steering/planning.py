@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs that compute a plan: synchronously, or in a thread that can be cancelled."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from threading import Thread
 from typing import Any, Generic, TypeAlias, TypeVar
@@ -20,22 +19,18 @@ class CancelledError(JobError):
     """A job was cancelled."""
 
 
-class Job(ABC, Generic[_Result]):
-    """A computation with a result; ``work`` calls its argument between its parts."""
+class Job(Generic[_Result]):
+    """A synchronous computation with a result; ``work`` calls its argument between its parts."""
 
     def __init__(self, work: Callable[[Progress], _Result]) -> None:
         self._work = work
-        #: Fraction that is done, 0 to 1, and whether it has ended, with a result or an error.
-        self.fraction, self.done = 0.0, False
+        self.fraction = 0.0  #: fraction that is done, 0 to 1
+        self.done = False  #: whether it has ended, with a result or an error
         self.cancelled = False
         self._error: Exception | None = JobError('the job is not done')
         self._start()
 
-    @abstractmethod
     def _start(self) -> None:
-        """Call `_run`."""
-
-    def _run(self) -> None:
         try:
             self._result = self._work(self._progress)
             self._error = None
@@ -60,15 +55,8 @@ class Job(ABC, Generic[_Result]):
         self.cancelled = True
 
 
-#: Starts a job: `ComputedJob`, `ThreadJob`, or another class with the same constructor.
+#: Starts a job: `Job`, `ThreadJob`, or another class with the same constructor.
 StartJob: TypeAlias = Callable[[Callable[[Progress], Any]], Job[Any]]
-
-
-class ComputedJob(Job[_Result]):
-    """A job that is computed synchronously, for simulations."""
-
-    def _start(self) -> None:
-        self._run()
 
 
 class ThreadJob(Job[_Result]):
@@ -77,7 +65,7 @@ class ThreadJob(Job[_Result]):
     def _start(self) -> None:
         def run() -> None:
             leave_realtime()
-            self._run()
+            Job._start(self)
 
         # A daemon: the end of the process does not wait for it.
         Thread(target=run, name='plan', daemon=True).start()

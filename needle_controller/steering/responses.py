@@ -94,20 +94,16 @@ class SteeringModel:
         Whether the guide moves in proportion to the depth and reaches the position of a step at
         its end; otherwise it moves while the needle rests, and rests during the insertion.
     progress : callable, optional
-        Called before each hypothesis, with the number of those done and of all. An exception that
-        it raises cancels the construction and reaches the caller. A hypothesis of 200 steps takes
-        some 10 ms, in compiled code that releases the GIL.
+        Called before each hypothesis, with the number of those done and of all. Its exception
+        cancels the construction. A hypothesis of 200 steps takes 10 ms, without the GIL.
 
     Attributes
     ----------
     needle, steering, depths, prior
         As given.
-    lengths : ndarray, shape (h,)
-        Bending length of each hypothesis, relative to the nominal one.
-    skins : ndarray, shape (h,)
-        Skin stiffness of each hypothesis, relative to the stiffness of the tissue [m].
-    drifts : ndarray, shape (h,)
-        Standard deviation of the slow error of the sensor of each hypothesis [m].
+    lengths, skins, drifts : ndarray, shape (h,)
+        By hypothesis: bending length relative to the nominal one, skin stiffness relative to the
+        stiffness of the tissue [m], standard deviation of the slow error of the sensor [m].
     rolled : ndarray of bool, shape (h,)
         Whether a hypothesis is kinematic: of a needle that is turned.
     decay : ndarray, shape (n,)
@@ -118,21 +114,7 @@ class SteeringModel:
         Prior covariance of the causes, of the position between two points of the grid, and of
         the slow error, by path noise and slow error; hypothesis i has that of number i // g.
     responses : HypothesisResponses
-        Responses at the g points of the grid; hypothesis i has those of point i modulo g. Shifts
-        of the tip at each depth: ``guide``, shape (g, n + 1, n), per position of the guide
-        in each step; ``causes``, shape (g, n + 1, 5 + n), per origin [m], turn of the frame [rad],
-        tilt, load of the bevel [N] without roll, and curvature of the path at each depth [1/m];
-        ``bevel``, shape (g, n + 1, n + 1), per load of the bevel [N] on the skin, and in each
-        step; ``elastic``, shape (g, n + 1), of the resting tip per load of the bevel [m/N];
-        ``between``, shape (2, g, n + 1, n), change of ``guide`` from one point to the next in
-        bending length, and in skin; ``lags``, shape (g, n + 1), largest lag of the roll of the tip
-        behind the base at each depth [rad]. ``guide_load``, ``causes_load`` and ``bevel_load``,
-        with n rows, are the same for the force on the guide at its position of each step [N].
-
-    Raises
-    ------
-    ParameterError
-        If the depths do not increase, or the needle does not reach so deep.
+        Responses at the g points of the grid; hypothesis i has those of point i modulo g.
 
     """
 
@@ -247,7 +229,7 @@ def _respond(
 def _kinematic(
     base: Steered, steering: SteeringParameters, depths: FloatArray, lead: float
 ) -> tuple[FloatArray, ...]:
-    """Return the responses, as `_respond`, of a tip ahead of the arcs that it cuts [m]."""
+    """Return the responses, as `_respond`, of a tip that is a distance ahead of its arcs [m]."""
     n, edges = len(depths) - 1, np.append(0.0, depths)
     middles = 0.5 * (edges[1:] + edges[:-1])
     layers = _layers(base.starts, middles)

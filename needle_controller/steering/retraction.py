@@ -19,10 +19,10 @@ class Retraction:
     Withdraw a needle to `retract_depth`, and reduce the guide offset with the insertion depth.
 
     It begins with the first positions, and is one motion of needle and guide in proportion, so
-    that the needle leaves along its path. A needle that is not deeper rests. A controller that
-    withdraws the needle by itself supersedes the motion: then the guide follows the depth, and
-    the retraction ends where the needle rests. `ended` is whether it is over: needle and guide
-    rest at the end, or it has failed, with the reason `failure`.
+    that the needle leaves along its path. If a controller withdraws the needle by itself, which
+    supersedes the motion, the guide follows the depth, and the retraction ends where the needle
+    rests. `ended` is whether needle and guide rest at the end, or it has failed, with the reason
+    `failure`.
     """
 
     def __init__(
@@ -31,23 +31,20 @@ class Retraction:
         self._motions, self._settings, self._events = motions, settings, events
         self.ended, self.failure = False, ''
         events.add(Severity.INFO, 'the needle is withdrawn')
-        #: Positions at the begin [m, rad], shape (joints,), None before; depth at the end [m].
-        self._begin: FloatArray | None = None
-        self._end = settings.retract_depth
+        self._begin: FloatArray | None = None  #: positions at the begin [m, rad], shape (joints,)
+        self._end = settings.retract_depth  #: depth at the end [m]
         #: Whether another node withdraws the needle; time of the last guide motion then [ns].
         self._follows, self._guided = False, 0
-        #: Stamp [ns] and insertion depth [m] since which the needle rests.
-        self._rest = 0, np.inf
+        self._rest = 0, np.inf  #: stamp [ns] and insertion depth [m] since which the needle rests
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
-        """Return the next motion at the present positions."""
         try:
             return None if self.ended else self._follow(stamp, now)
         except SteeringFaultError as error:
             self._fail(str(error))
             return None
 
-    def hear(self, refusal: MotionRefusal) -> None:
+    def refuse(self, refusal: MotionRefusal) -> None:
         """Process that a node does not execute the motion."""
         if self.ended:
             return
@@ -75,8 +72,12 @@ class Retraction:
         if abs(depth - self._rest[1]) > STILL:
             self._rest = stamp, depth
         rest = (stamp - self._rest[0]) / NANOSECONDS
+        if self._follows and rest < REPEAT_AFTER:
+            return self._follow_depth(now)
         if self._follows:
-            return self._end_follow(now) if rest >= REPEAT_AFTER else self._follow_depth(now)
+            # The needle rests at the depth of the other node: the guide returns to its zero.
+            self._follows, self._end = False, depth
+            return self._withdraw(now)
         if self._is_deep or np.abs(motions.at[1:3]).max() > settings.guide_tolerance:
             late = stamp > motions.due + settings.patience * NANOSECONDS
             overdue = late or motions.monitor.is_late(motions.at, stamp)
@@ -101,7 +102,6 @@ class Retraction:
     # Another node withdraws the needle.
 
     def _follow_depth(self, now: int) -> JointMotion | None:
-        """Move the guide with the measured depth."""
         motions, interval = self._motions, 1.0 / self._settings.rate
         if self._begin is None or now - self._guided < interval * NANOSECONDS:
             return None
@@ -110,11 +110,9 @@ class Retraction:
         # At the end of the guide motion.
         depth = motions.at[0] + motions.velocity * interval
         part = (depth - self._end) / max(begin - self._end, self._settings.depth_tolerance)
-        move = motions.guide_toward(min(max(part, 0.0), 1.0) * np.array(guide), interval, now)
+        to = min(max(part, 0.0), 1.0) * np.array(guide)
+        distance = float(np.hypot(*(to - motions.at[1:3])))
+        duration = max(interval, distance / self._settings.guide_speed)
+        move = motions.guide_to(to, np.zeros(2), duration, now)
         motions.monitor.stream(move)
         return move
-
-    def _end_follow(self, now: int) -> JointMotion | None:
-        """Return the guide to its zero: the needle rests at the depth of the other node."""
-        self._follows, self._end = False, float(self._motions.at[0])
-        return self._withdraw(now)

@@ -102,15 +102,7 @@ class ExecutiveSettings(SteeringLimits):
         return JOINTS if self.turns else JOINTS[:-1]
 
     def limits(self, step: float) -> SteeringLimits:
-        """
-        Return the limits of the steering law.
-
-        Parameters
-        ----------
-        step : float
-            Insertion distance of a step [m].
-
-        """
+        """Return the limits of the steering law for steps of a length [m]."""
         change = self.guide_step
         if self.continuous:
             # Both axes at once, at the peak of the insertion speed.

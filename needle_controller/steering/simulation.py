@@ -29,8 +29,7 @@ class GroundTruth:
     steering: SteeringParameters
     tilt: tuple[float, float]  #: Tilt of the guide in x and z [rad].
     bevel: FloatArray  #: Load of the bevel in x and z [N], shape (2,).
-    #: Rotation of the sensor's frame: shift of the tip in x and z per depth [rad], shape (2,).
-    frame: FloatArray
+    frame: FloatArray  #: Shift of the tip in x and z per depth by the sensor [rad], shape (2,).
     seed: int  #: Seed of the noise of the path.
 
     def plant(self, depths: FloatArray) -> SteeringPlant:
@@ -54,12 +53,7 @@ def sample_truth(
     rng: np.random.Generator,
     seed: int,
 ) -> GroundTruth:
-    """
-    Sample a true needle from the prior uncertainty of a nominal needle.
-
-    The spread of ``prior`` is uniform, its standard deviations are normal; it also gives bevel
-    and path noise. ``seed`` is the seed of the path noise.
-    """
+    """Sample a true needle: uniform in the spread of the prior, normal in its deviations."""
     length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
     tilt, frame, bevel = (size * rng.standard_normal(2) for size in sizes)
@@ -80,8 +74,8 @@ class SteeringPlant:
     """
     Simulated needle that is inserted in steps, and its tip in the frame of the sensor.
 
-    The needle is at the first of the ``depths`` of the tip measurements [m], shape (n + 1,), and
-    ``step`` is the number of its present depth; ``frame`` as in `GroundTruth`.
+    `step` is the number of its present depth among ``depths`` of the tip measurements [m], shape
+    (n + 1,); ``frame`` as in `GroundTruth`.
     """
 
     def __init__(
@@ -123,8 +117,8 @@ class SteppedTipSensor:
     """
     Averaged tip measurement of a plant at rest, in the frame of its sensor; None if it is lost.
 
-    ``noise`` is the standard deviation of the white noise [m], with random numbers ``random``;
-    ``losses`` are the random numbers of losses. ``seed`` determines all other ``errors``.
+    ``random`` generates white noise with the standard deviation ``noise`` [m], ``losses`` the
+    losses, and ``seed`` all other ``errors``.
     """
 
     def __init__(
@@ -151,12 +145,10 @@ class SteppedTipSensor:
 class SteeringRun(NamedTuple):
     """Simulated insertion under a steering law."""
 
-    #: Distance traveled by the guide [m], and number of turns of the needle.
-    travel: float
-    turns: int
+    travel: float  #: Distance traveled by the guide [m].
+    turns: int  #: Number of turns of the needle.
     load: float  #: Largest force on the guide after a motion of the guide [N].
-    #: First warning of the law before the last depth, with its depth; '' without one.
-    warning: str
+    warning: str  #: First warning of the law before the last depth, with its depth, or ''.
     times: list[float]  #: Computation time of the law at each depth [s].
 
 

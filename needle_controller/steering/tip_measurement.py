@@ -8,10 +8,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 import numpy as np
 
 _OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.
-
-#: Standard deviation of a normal distribution over the median of its absolute deviations.
-_NORMAL: Final = 1.4826
-
+_NORMAL: Final = 1.4826  #: Standard deviation over the median of absolute deviations.
 _FEW: Final = 3  #: Least number of readings for outlier rejection.
 
 
@@ -38,8 +35,7 @@ class TipMeasurements:
         """
         Return the mean without outliers, or during motion a fitted line at the depth; or None.
 
-        ``noise`` is the configured standard deviation of a measurement [m], a lower bound in the
-        outlier test.
+        ``noise`` is the least standard deviation of a measurement in the outlier test [m].
         """
         if not self._readings:
             return None

@@ -13,8 +13,7 @@ from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.boxed import Boxed
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
-from needle_study.gym.actions import checked_actions
-from needle_study.gym.picture import picture
+from needle_study.gym.environment import checked_actions, picture
 from needle_study.gym.pushed import BOUND, FORCE, observe, push, Pushed, START, Tissues, UNITS
 import numpy as np
 
@@ -72,13 +71,11 @@ class _Needles:
         return {'error': errors, 'force': self.forces.copy(), 'success': ends > 0}
 
     def picture(self, k: int) -> Any:
-        """Return an image of needle k."""
         n = self._needles
         depth, tip = n.common.length - n.states[k, 0], 1e-3 * float(self.observe()[k, 3])
         return picture(n.common.length, _EDGE, (depth, tip), (n.targets[k], 0.0))
 
     def observe(self) -> FloatArray:
-        """Return the observations, shape (n, 4)."""
         return np.asarray(observe(self._boxed))
 
 
@@ -109,7 +106,6 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode with a new needle; return the observation and the info."""
         super().reset(seed=seed, options=options)
         self._needles.begin(0, self.np_random)
         self._begun = True
@@ -127,7 +123,6 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
         return {name: values[0].item() for name, values in self._needles.info(ends).items()}
 
     def render(self) -> Any:
-        """Return an image of the needle and its target depth, or None without a render mode."""
         return None if self.render_mode is None else self._needles.picture(0)
 
 
@@ -174,8 +169,8 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         """
         Start an episode in each environment, or in those of the option ``reset_mask``.
 
-        An integer seed is the seed of the first environment, the next integer of the second, and
-        so on. In a sequence, None continues the random numbers of its environment.
+        An integer seed counts up from the first environment. In a sequence, None continues the
+        random numbers of its environment.
         """
         super().reset(options=options)
         seeds: list[int | None] = [None] * self.num_envs
@@ -210,7 +205,6 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         return self._needles.observe(), rewards, ended, broken, self._info(ends)
 
     def render(self) -> Any:
-        """Return an image of each needle and its target depth, or None without a render mode."""
         if self.render_mode is None:
             return None
         return tuple(map(self._needles.picture, range(self.num_envs)))

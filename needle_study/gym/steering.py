@@ -12,8 +12,7 @@ from needle_controller.steering.simulation import sample_truth, SteeringPlant, s
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
-from needle_study.gym.actions import checked_actions
-from needle_study.gym.picture import picture
+from needle_study.gym.environment import checked_actions, picture
 from needle_study.gym.pushed import BOUND
 import numpy as np
 
@@ -96,7 +95,6 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         return observation, -1e3 * miss, True, False, {'tip': tip, 'miss': miss}
 
     def render(self) -> Any:
-        """Return an image of needle and target, or None without a render mode or an episode."""
         plant = self._plant
         if self.render_mode is None or plant is None:
             return None

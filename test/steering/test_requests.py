@@ -12,13 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import SteeringPrior
 from needle_controller.steering.executive import SteeringExecutive
-from needle_controller.steering.planning import (
-    CancelledError,
-    ComputedJob,
-    Job,
-    Progress,
-    ThreadJob,
-)
+from needle_controller.steering.planning import CancelledError, Job, Progress, ThreadJob
 from needle_ros.contract import INSERTION, JOINT_TRAJECTORY, Stamp, TARGET, TOPICS
 from needle_ros.errors import JobError
 from needle_ros.requests import Acknowledgement, PendingRequest, RequestLog, RequestStatus, Verdict
@@ -336,7 +330,7 @@ def test_needle_moved_during_planning_is_not_inserted() -> None:
     assert robot.verdict(stamp) == ('rejected', reason)
 
 
-@pytest.mark.parametrize('kind', [ComputedJob, ThreadJob])
+@pytest.mark.parametrize('kind', [Job, ThreadJob])
 def test_a_job_returns_its_result_or_raises_its_error(kind: Any) -> None:
     def wait(job: Job[Any]) -> Job[Any]:
         while not job.done:

@@ -24,9 +24,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 _ALPHA: Final = 0.65  #: Fraction of a prediction error that corrects the matrix.
-
-#: Depth from which tissue holds the needle [m]; the guide is fixed before.
-_FIXED_BELOW: Final = 0.02
+_FIXED_BELOW: Final = 0.02  #: Depth [m] from which tissue holds the needle, and the guide moves.
 
 
 class BroydenLaw(GuideLaw):
@@ -48,8 +46,7 @@ class BroydenLaw(GuideLaw):
         limit = self.limits.guide_limit
         if limit == 0.0:
             raise ParameterError('guide_limit cannot be 0: nothing would move')
-        #: Derivatives of x and z of the tip by x and z of the guide and the depth.
-        self._matrix = np.zeros((2, 3))
+        self._matrix = np.zeros((2, 3))  #: derivatives of x, z of the tip by guide x, z and depth
         self._before: tuple[FloatArray, FloatArray] | None = None
         earlier = SteeredNeedle(model.needle, model.steering)
         for k, depth in enumerate(self.depths.tolist()):
@@ -68,7 +65,6 @@ class BroydenLaw(GuideLaw):
         self._before = tip.copy(), at
 
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
-        """Return the position of the guide with the least predicted distance."""
         guide, depth = self.guides[at], self.depths[at]
         self._learn(tip, np.array([*guide, depth]))
         if depth < _FIXED_BELOW:

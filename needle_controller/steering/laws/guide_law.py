@@ -34,8 +34,7 @@ class GuideLaw(ABC):
         self.depths, self.limits = model.depths, limits
         self.turns, self.roll = limits.turns, checked_roll(roll)
         self.step = 0
-        #: Position of the guide at each depth so far [m]; the last one is the present setpoint.
-        self.guides = [np.zeros(2)]
+        self.guides = [np.zeros(2)]  #: guide at each depth so far [m], at last its setpoint
         self._newest: tuple[FloatArray, int] | None = None
         self.aim(target)
         self.prepare(model)
@@ -44,7 +43,6 @@ class GuideLaw(ABC):
         """Compute constants before the first step; the default computes nothing."""
 
     def aim(self, target: ArrayLike) -> None:
-        """Continue to another target at the same depth, x and z [m]."""
         self.target = checked_target(target)
 
     def update(
@@ -59,7 +57,6 @@ class GuideLaw(ABC):
             self._newest = measured, at
 
     def plan(self) -> GuideSetpoint:
-        """Return guide and roll for the next step, and advance to it; unchanged at the end."""
         guide, most, change = self.guides[-1], self.limits.guide_limit, self.limits.guide_step
         if self._newest is not None and self.step < len(self.depths) - 1:
             wanted = np.clip(self.choose(*self._newest), guide - change, guide + change)
@@ -79,5 +76,4 @@ class GuideLaw(ABC):
         return None
 
     def status(self) -> Mapping[str, float]:
-        """Return values for the status, by name."""
         return {'turns_left': self.turns}

@@ -33,22 +33,7 @@ from collections.abc import Mapping, Sequence
 from math import cos, nan, sin
 from typing import NamedTuple
 
-from needle_controller.compiled.guide_plan import choose_guide, hit_probability, reachable_set
-from needle_controller.compiled.hypotheses import (
-    advance,
-    BEVEL,
-    FROZEN,
-    LOST,
-    MISSING,
-    predict,
-    SAME,
-    Steering,
-    STEP,
-    TURNS,
-    update,
-    VALID,
-    weights,
-)
+from needle_controller.compiled import guide_plan, hypotheses
 from needle_controller.steering.law import (
     checked_roll,
     checked_target,
@@ -65,8 +50,7 @@ from needle_ros.errors import JobError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Probability of a hit below which a target is rejected at the start, or warned of during the
-#: insertion.
+#: Probability of a hit below which a target is rejected at the start, or is warned of later.
 _REFUSED, _WARNED = 0.05, 0.5
 
 #: Logarithm of the weight of a kinematic hypothesis at the start, over the others, with turns.
@@ -95,19 +79,11 @@ class MultiHypothesisLaw(SteeringLaw):
 
     Parameters
     ----------
-    model : SteeringModel
-        Hypotheses, with the depths of the tip measurements.
-    target : array_like, shape (2,)
-        Target position of the tip at the last depth, x and z in the frame of the sensor [m].
-    limits : SteeringLimits
-        Limits of the guide setpoints.
-    roll : float
-        Roll of the needle at the start [rad].
+    model, target, limits, roll
+        As for `build_law`.
 
     Raises
     ------
-    ShapeError, ParameterError
-        If the target is not two finite numbers, the roll is not finite, or nothing can move.
     OutOfReachError
         If the target is out of reach; the message contains the reachable set.
 
@@ -147,9 +123,9 @@ class MultiHypothesisLaw(SteeringLaw):
         prior, count = model.prior_covariance, len(model.lengths)
         points = len(model.responses.guide)
         mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
-        mean[:, BEVEL] = 1j * model.push
+        mean[:, hypotheses.BEVEL] = 1j * model.push
         self._model = model
-        self._now = Steering(
+        self._now = hypotheses.Steering(
             responses=model.responses,
             drifts=model.drifts,
             decay=model.decay,
@@ -169,43 +145,35 @@ class MultiHypothesisLaw(SteeringLaw):
             gross=np.zeros(5),
         )
         self._boxed = Boxed(self._now)
-        #: Probability of a hit after the last change of the state; None if not computed yet.
-        self._hit_probability: float | None = None
+        self._hit_probability: float | None = None  #: None until it is computed for this state
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
-        new = checked_target(target)
-        before = self.target
-        self._set_target(new)
+        before, self._now.target[:] = self.target, checked_target(target)
+        self._hit_probability = None
         if self.hit_probability < _REFUSED:
             error = OutOfReachError(self._unreachable(), self.reach)
-            self._set_target(before)
+            self._now.target[:], self._hit_probability = before, None
             raise error
-
-    def _set_target(self, target: FloatArray) -> None:
-        self._now.target[:], self._hit_probability = target, None
 
     # Estimates.
 
     @property
     def target(self) -> FloatArray:
-        """The target [m], shape (2,)."""
         return self._now.target.copy()
 
     @property
     def step(self) -> int:
-        """Number of tip measurements so far."""
-        return int(self._now.counts[STEP])
+        return int(self._now.counts[hypotheses.STEP])
 
     @property
     def turns(self) -> int:
-        """Number of turns left."""
-        return int(self._now.counts[TURNS])
+        return int(self._now.counts[hypotheses.TURNS])
 
     @property
     def weights(self) -> FloatArray:
         """Probability of each hypothesis, shape (h,)."""
-        return weights(self._now.logs)
+        return hypotheses.weights(self._now.logs)
 
     @property
     def bending(self) -> float:
@@ -213,39 +181,23 @@ class MultiHypothesisLaw(SteeringLaw):
         return float(self.weights @ self._model.lengths)
 
     def expected(self, at: int = -1) -> TipEstimate:
-        """
-        Return the predicted position of the tip.
-
-        Parameters
-        ----------
-        at : int
-            Number of the depth; by default the last one. Guide and roll are assumed to stay at
-            their last setpoint.
-
-        Returns
-        -------
-        TipEstimate
-            Mean and covariance over all hypotheses.
-
-        """
-        x, z, xx, xz, zz = predict(self._boxed, range(self._model.steps + 1)[at])
+        """Predict the tip at a depth number, with guide and roll at their last setpoint."""
+        x, z, xx, xz, zz = hypotheses.predict(self._boxed, range(self._model.steps + 1)[at])
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
     def hit_probability(self) -> float:
         """Probability that a hit within 1 mm of the target is still possible."""
         if self._hit_probability is None:
-            self._hit_probability = hit_probability(self._boxed)
+            self._hit_probability = guide_plan.hit_probability(self._boxed)
         return self._hit_probability
 
     @property
     def reach(self) -> Reach:
-        """Reachable set of the tip."""
-        middles, sizes, _ = reachable_set(self._boxed)
+        middles, sizes, _ = guide_plan.reachable_set(self._boxed)
         return Reach(middles, sizes, self.weights)
 
     def status(self) -> Mapping[str, float]:
-        """Return values for the status, by name."""
         return {
             'turns_left': self.turns,
             'hit_probability': self.hit_probability,
@@ -279,14 +231,14 @@ class MultiHypothesisLaw(SteeringLaw):
         x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
         self._hit_probability = None
-        kind, off_x, off_z = update(self._boxed, at, x, z, variance)
-        if kind == VALID:
+        kind, off_x, off_z = hypotheses.update(self._boxed, at, x, z, variance)
+        if kind == hypotheses.VALID:
             return
-        if kind == LOST:
-            missing = self._now.counts[MISSING]
+        if kind == hypotheses.LOST:
+            missing = self._now.counts[hypotheses.MISSING]
             raise SteeringFaultError(f'{missing} tip measurements are missing')
-        if kind == FROZEN:
-            same = self._now.counts[SAME] + 1
+        if kind == hypotheses.FROZEN:
+            same = self._now.counts[hypotheses.SAME] + 1
             raise SteeringFaultError(f'the tip sensor is frozen: {same} identical measurements')
         raise SteeringFaultError(
             f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from its '
@@ -298,10 +250,9 @@ class MultiHypothesisLaw(SteeringLaw):
         self._hit_probability = None
         if k <= last:
             now.guide[k] = self._choose()
-        advance(self._boxed)
+        hypotheses.advance(self._boxed)
         there = complex(now.guide[min(k, last)])
         return GuideSetpoint(there.real, there.imag, float(now.roll[-1]))
 
     def _choose(self) -> complex:
-        """Return the next position of the guide, x + i z [m]."""
-        return choose_guide(self._boxed)
+        return guide_plan.choose_guide(self._boxed)

@@ -9,5 +9,4 @@ class OpenLoopLaw(GuideLaw):
     """A fixed guide."""
 
     def choose(self, _tip: FloatArray, _at: int) -> FloatArray:
-        """Return the present position of the guide."""
         return self.guides[-1]

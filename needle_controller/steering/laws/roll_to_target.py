@@ -31,13 +31,11 @@ class RollToTargetLaw(GuideLaw):
     """
 
     def prepare(self, _model: SteeringModel) -> None:
-        """Check that turns are allowed."""
         if self.turns == 0:
             raise ParameterError('turns cannot be 0: nothing would move')
         self._before: tuple[float, FloatArray] | None = None
 
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
-        """Turn the bevel towards the target, and return the fixed guide."""
         depth = float(self.depths[at])
         before, self._before = self._before, (depth, tip)
         if before is not None and self.turns:

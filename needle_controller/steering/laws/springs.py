@@ -11,33 +11,31 @@ References
 
 """
 
+from dataclasses import replace
 from typing import Final
 
 from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.steering.reference_models import springs
+from needle_dynamics.steering.needle import SteeredNeedle
 import numpy as np
 
 _LEAST: Final = 1e-3  #: Least response of the springs that is inverted.
 
 
 class SpringsLaw(GuideLaw):
-    """
-    The inverse of a beam on springs, along a straight line to the target.
-
-    Parameters as for `GuideLaw`.
-    """
+    """Follow a straight line to the target by the inverse of a beam on springs; see `GuideLaw`."""
 
     def prepare(self, model: SteeringModel) -> None:
-        """Compute the response of the springs at each depth."""
-        self._responses = [
-            float(springs(model.needle, model.steering, float(depth))[0][0, 0])
-            for depth in self.depths
-        ]
+        # A path without bevel and noise is straight: it coincides with the axis.
+        straight = replace(model.steering, bevel_load=(0.0,), path_noise=0.0)
+        self._responses = []
+        for depth in self.depths.tolist():
+            needle = SteeredNeedle(model.needle, straight)
+            needle.move(depth=depth)
+            self._responses.append(float(needle.authority[0, 0]))
 
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
-        """Return the position of the guide for the next point of the line."""
         now, then = self._responses[at], self._responses[self.step + 1]
         if abs(then) < _LEAST:
             return self.guides[-1]

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Side view of a needle in tissue as an image, without a graphics library."""
+"""Check the actions of an environment, and draw a needle without a graphics library."""
 
 from typing import Any, Final
 
+from needle_dynamics import FloatArray
+from needle_dynamics.simulated.trajectory import floats
+from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 
 _WIDTH, _HEIGHT, _MARGIN = 320, 120, 20  #: size of an image and depth 0 [pixels]
@@ -12,6 +15,17 @@ _TISSUE, _AIR, _NEEDLE, _TARGET = (
 )  # fmt: skip
 
 _SPOT: Final = 3  #: half of the size of the target [pixels]
+
+
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
+    """Return actions as floats clipped to [-1, 1]; they must be finite and have the shape."""
+    found = floats('actions', actions)
+    if found.shape != shape:
+        raise ShapeError(f'actions must have shape {shape}, got {found.shape}')
+    wrong = found[~np.isfinite(found)]
+    if len(wrong):
+        raise ParameterError(f'actions must be finite, got {wrong[0]}')
+    return np.clip(found, -1.0, 1.0)
 
 
 def picture(length: float, deflection: float, tip: Any, target: Any) -> Any:
