@@ -76,9 +76,7 @@ def write_result(
     path: Path | str, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> None:
     """
-    Write the parameters to a ROS parameter file, with errors and recordings in comments.
-
-    The parameters apply to nodes named plant and controller in any namespace.
+    Write a ROS parameter file for plant and controller, with errors and recordings in comments.
 
     Parameters
     ----------
@@ -93,8 +91,6 @@ def write_result(
     ------
     IdentificationError
         If the data determine no parameter.
-    ParameterError
-        If the file cannot be written.
 
     """
     write_whole(path, result_yaml(friction, stiffness).encode())

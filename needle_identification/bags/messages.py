@@ -28,25 +28,7 @@ def _jazzy() -> Typestore:
 
 
 def message_type(type_name: str) -> Any:
-    """
-    Return the class of a standard message, for `encode`.
-
-    Parameters
-    ----------
-    type_name : str
-        Type, such as ``sensor_msgs/msg/JointState``.
-
-    Returns
-    -------
-    type
-        Message class.
-
-    Raises
-    ------
-    RecordingError
-        If the type is not in ROS 2 Jazzy.
-
-    """
+    """Return the class of a message type of ROS 2 Jazzy, for `encode`."""
     try:
         return _jazzy().types[type_name]
     except KeyError:
@@ -104,45 +86,12 @@ def definition_of(type_name: str) -> tuple[str, str]:
 
 
 def encode(message: Any) -> bytes:
-    """
-    Serialize a message.
-
-    Parameters
-    ----------
-    message : object
-        Message of a class of `message_type`.
-
-    Returns
-    -------
-    bytes
-        Serialized message (CDR).
-
-    """
+    """Serialize a message of a class of `message_type` (CDR)."""
     return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
 
 
 def deserialize(topic: BagTopic, data: bytes) -> Any:
-    """
-    Deserialize a message of a topic.
-
-    Parameters
-    ----------
-    topic : BagTopic
-        Topic of a bag; a type outside ROS 2 Jazzy is defined in the bag.
-    data : bytes
-        Serialized message (CDR).
-
-    Returns
-    -------
-    object
-        The message.
-
-    Raises
-    ------
-    RecordingError
-        If the type is unknown, or the bytes are not a message of this type.
-
-    """
+    """Deserialize a message (CDR) of a topic; the bag defines types outside ROS 2 Jazzy."""
     store = _store(topic.type_name, topic.encoding, topic.definition)
     try:
         if data[:2] not in (b'\0\0', b'\0\1'):

@@ -61,11 +61,6 @@ def read_bag(path: Path | str, topic: str) -> TopicTable:
     TopicTable
         Columns, with `to_dataframe` and `plot`.
 
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable, has no such topic, or a message is invalid.
-
     Examples
     --------
     >>> table = read_bag('bags/friction_01', '/joint_states')

@@ -66,16 +66,10 @@ def named(items: Sequence[_Named], name: str) -> _Named:
 
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
-    """
-    Compute the mean of one parameter over several recordings, as in Tables 1 and 2.
-
-    The standard error of the mean is the standard deviation over the recordings divided by the
-    square root of their number. Its lower limit results from the errors within the recordings,
-    because a few recordings may agree by chance. If the recordings differ by more than their own
-    errors, the interval is from Student's t, since a standard deviation from few recordings is
-    uncertain. Otherwise it is the mean plus and minus two standard errors. Undetermined estimates
-    are ignored.
-    """
+    """Return the mean of one parameter over the recordings that determine it."""
+    # As in Tables 1 and 2, the error is the standard deviation over the root of the number; at
+    # least that of the errors within the recordings, because a few may agree by chance. If the
+    # recordings differ by more than their errors, the interval is from Student's t.
     if not parameters:
         raise IdentificationError('no recordings to identify from')
     first = parameters[0]

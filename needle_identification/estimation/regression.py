@@ -174,10 +174,6 @@ def regress(
     ------
     IdentificationError
         If there are too few samples, or the noise of the regressors exceeds their variation.
-    ParameterError
-        If the estimator is unknown or lacks an argument.
-    ShapeError
-        If the shapes do not match, or a used value is not finite.
 
     Examples
     --------

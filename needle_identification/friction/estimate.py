@@ -111,11 +111,6 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
     FrictionSummary
         One `statistic` per parameter, then breakaway force and lag if any recording has them.
 
-    Raises
-    ------
-    IdentificationError
-        If there are no estimates.
-
     """
     if not estimates:
         raise IdentificationError('no recordings to identify from')

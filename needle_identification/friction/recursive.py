@@ -70,11 +70,6 @@ class RecursiveFriction:
         Time of steady motion after which the weight of a sample is 1 / e [s]. Samples at rest
         change neither the estimate nor the weights.
 
-    Raises
-    ------
-    ParameterError
-        If rate or forgetting time is not positive, or the estimator is not ordinary.
-
     Examples
     --------
     >>> import numpy as np
@@ -122,16 +117,9 @@ class RecursiveFriction:
 
     def update(self, time: float, velocity: float, force: float) -> None:
         """
-        Add one sample.
+        Add a sample: time [s], insertion velocity [m/s] and force on the needle [N].
 
-        Parameters
-        ----------
-        time : float
-            Time [s]. After a gap or a backward step, the filter restarts.
-        velocity, force : float
-            Insertion velocity [m/s] and force of the base on the needle [N], positive into the
-            tissue. A sample that is not finite counts as a gap.
-
+        After a gap, a backward step or a sample that is not finite, the filter restarts.
         """
         if not abs(velocity) + abs(force) < inf:
             self._time = -inf

@@ -27,12 +27,6 @@ class FrictionSettings:
     The default terms are equation (15). The estimator ``weighted`` estimates the noise in each
     stroke, ``total`` accounts for velocity noise; ``auto`` is ``total`` if velocity noise is
     relevant, otherwise ``ordinary``.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is out of range, or a term is unknown or lacks another term.
-
     """
 
     cutoff: float = constant(

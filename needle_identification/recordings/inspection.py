@@ -93,11 +93,6 @@ def inspect_recording(path: Path | str) -> Inspection:
     Inspection
         Content and suggested command.
 
-    Raises
-    ------
-    RecordingError
-        If the recording is not readable.
-
     Examples
     --------
     >>> from needle_identification import inspect_recording

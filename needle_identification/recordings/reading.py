@@ -100,8 +100,6 @@ def read_friction_recording(
     ------
     RecordingError
         If the bag is not readable or lacks a topic.
-    ParameterError
-        If an axis is not valid.
 
     Examples
     --------
@@ -181,13 +179,6 @@ def read_indentation_recording(
     -------
     IndentationRecording
         Force and position; ``losses`` lists discarded and repaired data.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or lacks a topic.
-    ParameterError
-        If an axis is not valid.
 
     """
     signs, plane = zip(*(signed_axis(axis, 'axis of the plane') for axis in axes), strict=True)

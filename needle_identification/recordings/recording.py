@@ -80,12 +80,6 @@ class Recording(BaseRecording):
     """
     Force and motion of the needle base during one experiment.
 
-    Raises
-    ------
-    ShapeError
-        If the arrays differ in length or are not finite, time does not increase, or both
-        velocity and depth are missing.
-
     Examples
     --------
     >>> velocity = [0.0, 0.01, 0.01]
@@ -119,15 +113,7 @@ class Recording(BaseRecording):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class IndentationRecording(BaseRecording):
-    """
-    Force and motion of an end-effector that presses a tissue in the plane.
-
-    Raises
-    ------
-    ShapeError
-        If the arrays differ in length or are not finite, or time does not increase.
-
-    """
+    """Force and motion of an end-effector that presses a tissue in the plane."""
 
     force: FloatArray  #: (n, 2) force of the end-effector on the tissue, x and z [N]
     position: FloatArray  #: (n, 2) position of the end-effector in the plane, x and z [m]

@@ -143,12 +143,7 @@ def _covered(one: SensorRecording) -> BoolArray:
 
 
 def _aligned(one: SensorRecording, usable: BoolArray) -> float:
-    """
-    Return the delay with the smallest errors [s]; 0 for a constant position.
-
-    Reject positions in another unit, and exchanged or reversed axes: with these, other errors are
-    much smaller.
-    """
+    """Return the delay of least errors [s]; reject other units, exchanged or reversed axes."""
     every = -(-int(np.count_nonzero(usable)) // _ALIGNED)
     time, tip, k = one.time[usable][::every], one.tip[usable][::every], len(one.axes)
     delays = np.arange(*_DELAYS, _GRID) if one.moves else np.zeros(1)

@@ -58,14 +58,10 @@ class NoiseFit(NamedTuple):
 
 
 class NoiseLikelihood:
-    """
-    Likelihood of the errors of a sensor.
-
-    ``errors`` (n, k) [m] are at ``time`` (n,) [s]; ``slopes`` (n, k) are the change of the errors
-    per change of the delay [m/s], or None without a delay.
-    """
+    """Likelihood of errors (n, k) [m] of a sensor at times (n,) [s]."""
 
     def __init__(self, time: FloatArray, errors: FloatArray, slopes: FloatArray | None) -> None:
+        """Slopes (n, k) are the change of the errors by the delay [m/s]; None without a delay."""
         self._steps, self._axes = np.diff(time), errors.shape[1]
         ones = np.ones((len(time), 1))
         parts = [ones, errors] if slopes is None else [ones, errors, slopes]

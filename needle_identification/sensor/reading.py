@@ -87,8 +87,6 @@ def read_sensor_recording(
     ------
     RecordingError
         If a file is not readable, lacks a topic or a column, or the times do not overlap.
-    ParameterError
-        If an axis or the constant position is not valid.
 
     """
     axes = tuple(axes)

@@ -53,15 +53,7 @@ _LARGEST: Final = 0.5  # largest error of a drift constant that is determined [r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringSettings:
-    """
-    Settings of the steering identification.
-
-    Raises
-    ------
-    ParameterError
-        If a value is not valid.
-
-    """
+    """Settings of the steering identification."""
 
     #: Drift terms, of `TERMS`; None selects the term with the smallest residual.
     terms: tuple[str, ...] | None = None

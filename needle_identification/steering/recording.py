@@ -35,15 +35,7 @@ _ASIDE: Final = 0.03
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class SteeringRecording(Displayed):
-    """
-    Recorded insertion: depth, guide, roll and tip position.
-
-    Raises
-    ------
-    ShapeError
-        If the shapes do not match, or a value is not finite.
-
-    """
+    """Recorded insertion: depth, guide, roll and tip position."""
 
     name: str = 'recording'  #: for messages
     medium: str = ''  #: name of the tissue; recordings in one tissue share its constants

@@ -240,11 +240,8 @@ def shown(name: str, variable: float) -> float:
 def interval(
     search: Search, optima: Sequence[Optimum], k: int, rise: float
 ) -> tuple[float, float]:
-    """
-    Return the profile likelihood interval of variable k; infinite at a bound of the search.
-
-    It contains all optima whose deviance is within `rise` of the first, which is the best.
-    """
+    """Return the profile likelihood interval of variable k; infinite at a bound of the search."""
+    # It contains all optima whose deviance is within `rise` of the first, which is the best.
     alike = [one for one in optima if one.deviance - optima[0].deviance <= rise]
     level = optima[0].deviance + rise
     alike.sort(key=lambda one: float(one.x[k]))

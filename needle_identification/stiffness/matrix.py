@@ -214,20 +214,7 @@ def _differ(fit: MatrixFit, found: FloatArray, stretch: FloatArray, slide: Float
 
 
 def asymmetry(matrix: ArrayLike) -> float:
-    """
-    Return the ratio of the antisymmetric to the symmetric part of a stiffness matrix.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (2, 2)
-        Stiffness matrix [N/m].
-
-    Returns
-    -------
-    float
-        Ratio of the Frobenius norms [1]; nan if the symmetric part is zero.
-
-    """
+    """Return the norm of the antisymmetric part of a matrix over that of the symmetric part."""
     k = np.asarray(matrix, dtype=np.float64)
     symmetric = float(norm(k + k.T))
     return float(norm(k - k.T)) / symmetric if symmetric else nan

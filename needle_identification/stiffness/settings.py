@@ -14,12 +14,6 @@ class StiffnessSettings:
 
     The mean matrices of Table 2 have an asymmetry of up to 0.086, and the paper calls their
     tissue a spring; ``largest_asymmetry`` is the next round number.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is out of range, or the estimator is unknown.
-
     """
 
     contact_length: float = constant(
