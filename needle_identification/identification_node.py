@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import sys
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.friction.estimate import summarize
+from needle_identification.friction.estimate import FrictionSummary, summarize
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
@@ -20,7 +20,7 @@ from needle_identification.recordings.reading import (
 )
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status_node import live_statuses, sentence, summary_statuses
-from needle_identification.stiffness.estimate import summarize_stiffness
+from needle_identification.stiffness.estimate import StiffnessSummary, summarize_stiffness
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_ros import contract
@@ -61,41 +61,22 @@ class IdentificationSettings(CheckedSettings):
     )
 
 
-class _Application(NamedTuple):
-    """Parameters sent to other nodes, and futures of the responses (None: no such node)."""
-
-    values: Mapping[str, float | str]
-    answers: Mapping[str, Future | None]
-    response: Trigger.Response
-    later: Future  # of the response
-
-    def is_over(self) -> bool:
-        """Whether all calls are answered or have failed."""
-        return all(answer is None or answer.done() for answer in self.answers.values())
-
-    def outcome(self) -> Trigger.Response:
-        """Return whether each existing node set all that it can, and a message by node."""
-        outcomes = [self._of_node(name, answer) for name, answer in self.answers.items()]
-        verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
-        self.response.success = bool(verdicts) and all(verdicts)
-        self.response.message = '; '.join(words for _, words in outcomes)
-        return self.response
-
-    def _of_node(self, node: str, answer: Future | None) -> tuple[bool | None, str]:
-        if answer is None:
-            return None, f'{node}: no such node'
-        response = answer.result()
-        if response is None:
-            return False, no_answer(f'{node}/set_parameters')
-        results = dict(zip(self.values, response.results, strict=True))
-        taken = [name for name, result in results.items() if result.successful]
-        values = {k: v if isinstance(v, str) else f'{v:.6g}' for k, v in self.values.items()}
-        words = [f'{name} = {values[name]}' for name in taken]
-        words += [
-            f'not {name}: {one.reason}' for name, one in results.items() if name not in taken
-        ]
-        needed = [name for name in _COEFFICIENTS if name in self.values] or list(self.values)
-        return all(name in taken for name in needed), f'{node}: {", ".join(words)}'
+def _outcome(
+    node: str, values: Mapping[str, float | str], answer: Future | None
+) -> tuple[bool | None, str]:
+    """Return whether a node set all that it can (None: there is no such node), and a message."""
+    if answer is None:
+        return None, f'{node}: no such node'
+    response = answer.result()
+    if response is None:
+        return False, no_answer(f'{node}/set_parameters')
+    results = dict(zip(values, response.results, strict=True))
+    taken = [name for name, result in results.items() if result.successful]
+    shown = {k: v if isinstance(v, str) else f'{v:.6g}' for k, v in values.items()}
+    words = [f'{name} = {shown[name]}' for name in taken]
+    words += [f'not {name}: {one.reason}' for name, one in results.items() if name not in taken]
+    needed = [name for name in _COEFFICIENTS if name in values] or list(values)
+    return all(name in taken for name in needed), f'{node}: {", ".join(words)}'
 
 
 class IdentificationNode(BaseNode):
@@ -139,7 +120,6 @@ class IdentificationNode(BaseNode):
         self._found: Sequence[Statistic] = ()
         self._words = ''
         self._live: LiveFriction | None = None
-        self._applications: list[_Application] = []
         self._setters: dict[str, Client] = {}
         self._calls = Calls(self)
 
@@ -231,40 +211,33 @@ class IdentificationNode(BaseNode):
             'motion_topic': self.text('motion_topic') or None,
             'time': self.text('time'),
         }
-        output = self.text('output')
+        summary: FrictionSummary | StiffnessSummary
+        found: Sequence[Statistic]
         if self.text('what') == 'friction':
             reading['force_axis'] = self.text('force_axis')
             reading['motion_axis'] = self.text('motion_axis') or None
-            friction = summarize(
-                self._estimates(
-                    partial(read_friction_recording, **reading),
-                    partial(
-                        identify_friction,
-                        settings=self.settings('friction.', FrictionSettings),
-                        among=len(self._bags),
-                    ),
-                )
-            )
-            if output:
-                write_result(output, friction)
-            self._found, count = friction.statistics, len(friction.estimates)
-            self._publish(self._friction, summary_statuses(friction))
+            read: Callable[[str], Any] = partial(read_friction_recording, **reading)
+            terms = self.settings('friction.', FrictionSettings)
+            identify = partial(identify_friction, settings=terms, among=len(self._bags))
+            summary = friction = summarize(self._estimates(read, identify))
+            found, publisher = friction.statistics, self._friction
+            write = partial(write_result, friction=friction)
         else:
             reading['axes'] = tuple(self.get_parameter('axes').value)
+            read = partial(read_indentation_recording, **reading)
             settings = self.settings('stiffness.', StiffnessSettings)
-            stiffness = summarize_stiffness(
-                self._estimates(
-                    partial(read_indentation_recording, **reading),
-                    partial(identify_stiffness, settings=settings),
-                ),
+            summary = stiffness = summarize_stiffness(
+                self._estimates(read, partial(identify_stiffness, settings=settings)),
                 force=self.settings('', IdentificationSettings).level or None,
                 level_tolerance=settings.level_tolerance,
             )
-            if output:
-                write_result(output, None, stiffness)
-            self._found, count = (stiffness.tissue_stiffness,), len(stiffness.estimates)
-            self._publish(self._stiffness, summary_statuses(stiffness))
-        self._words = f'{sentence(self._found)} from {count} recordings'
+            found, publisher = (stiffness.tissue_stiffness,), self._stiffness
+            write = partial(write_result, friction=None, stiffness=stiffness)
+        if output := self.text('output'):
+            write(output)
+        self._found = found
+        self._publish(publisher, summary_statuses(summary))
+        self._words = f'{sentence(found)} from {len(summary.estimates)} recordings'
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
@@ -336,25 +309,27 @@ class IdentificationNode(BaseNode):
             name: self._calls.call(client, request) if client.service_is_ready() else None
             for name, client in self._setters.items()
         }
-        application = _Application(values, answers, response, Future())
-        self._applications.append(application)
-        for answer in answers.values():
-            if answer is not None:
-                answer.add_done_callback(lambda _answer: self._answer_applications())
-        self._answer_applications()
-        return application.later
+        later = Future()
 
-    def _answer_applications(self) -> None:
-        """Send the responses of those calls of ``~/apply`` that are complete."""
-        for application in [one for one in self._applications if one.is_over()]:
-            self._applications.remove(application)
-            response = application.outcome()
-            application.later.set_result(response)
+        def answer_all(_answer: Future | None = None) -> None:
+            """Respond when all calls are answered or have failed."""
+            if later.done() or not all(one is None or one.done() for one in answers.values()):
+                return
+            outcomes = [_outcome(name, values, answer) for name, answer in answers.items()]
+            verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
+            response.success = bool(verdicts) and all(verdicts)
+            response.message = '; '.join(words for _, words in outcomes)
+            later.set_result(response)
             # Two statements: rclpy rejects a second severity from the same source line.
             if response.success:
                 self.get_logger().info(response.message)
             else:
                 self.get_logger().error(response.message)
+
+        for answer in filter(None, answers.values()):
+            answer.add_done_callback(answer_all)
+        answer_all()
+        return later
 
 
 def _answer_later(service: Service) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Final
 from builtin_interfaces.msg import Time
 from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.playback import BagPlayback, PlaybackSettings
-from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
+from needle_identification.bags.topics import BagTopic, DURATIONS, OfferedQos, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class, steady_timer
@@ -314,13 +314,13 @@ class PlayerNode(BaseNode):
             left_out=', '.join(sorted(self._left_out)),
             duplicate_publishers=', '.join(sorted(self._contested)),
         )
-        complaints = [*playback.bag.losses] if playback.is_ended else []
+        warnings = [*playback.bag.losses] if playback.is_ended else []
         if self._contested:
-            complaints.append(f'other publishers of {status.duplicate_publishers}')
+            warnings.append(f'other publishers of {status.duplicate_publishers}')
         if playback.late > _LATE and playback.is_running:
-            complaints.append(f'{playback.late:.2f} s late: the machine is too slow for this rate')
-        if complaints:
-            return Diagnosis(Severity.WARNING, '; '.join(complaints), status)
+            warnings.append(f'{playback.late:.2f} s late: the machine is too slow for this rate')
+        if warnings:
+            return Diagnosis(Severity.WARNING, '; '.join(warnings), status)
         return Diagnosis(Severity.INFO, f'{_STATES[status.phase]} {playback.bag.path}', status)
 
 
@@ -329,17 +329,12 @@ def _profile(topics: list[BagTopic]) -> QoSProfile:
     offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)
     reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-    times = {
-        name: Duration(nanoseconds=at)
-        for name, found in (
-            ('deadline', {qos.deadline for qos in offered}),
-            ('lifespan', {qos.lifespan for qos in offered}),
-            ('liveliness_lease_duration', {qos.lease for qos in offered}),
-        )
+    times = {}
+    for name in DURATIONS:
         # Durations that differ between publishers are left unlimited.
-        for at in found
-        if len(found) == 1 and at != UNLIMITED
-    }
+        found = {getattr(qos, name) for qos in offered}
+        if len(found) == 1 and UNLIMITED not in found:
+            times[name] = Duration(nanoseconds=found.pop())
     if not any(qos.durability == 'transient_local' for qos in offered):
         return QoSProfile(depth=_DEPTH, reliability=reliability, **times)
     # The middleware may not report the depth to a recorder: then one message per publisher.

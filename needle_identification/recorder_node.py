@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node that records topics to an MCAP bag with the QoS that their publishers offer."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 import sys
 import time
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.topics import OfferedQos
+from needle_identification.bags.topics import DURATIONS, OfferedQos, WORDS
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class, steady_timer
@@ -170,10 +171,10 @@ class RecorderNode(BaseNode):
         if self._bag is None:
             return self.failure or 'not recording'
         self._release()
-        try:
+        with self._writing(bag):
             bag.close()
-        except OSError as error:
-            return self._give_up(bag, error)
+        if self.failure:
+            return self.failure
         counts = bag.counts
         result = f'recorded {sum(counts.values())} messages to {bag.path}'
         lines = [f'{count:8d} {topic}' for topic, count in sorted(counts.items())]
@@ -192,33 +193,30 @@ class RecorderNode(BaseNode):
         self._report_recorded(0)
         self._bag = None
 
-    def _give_up(self, bag: BagWriter, error: OSError) -> str:
+    @contextmanager
+    def _writing(self, bag: BagWriter) -> Iterator[None]:
         """Stop the recording after a disk error; the bag remains readable up to this point."""
-        self._release()
-        bag.abort()
-        self.failed = True
-        self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
-        self.get_logger().error(self.failure)
-        self.publish_diagnostics()
-        return self.failure
+        try:
+            yield
+        except OSError as error:
+            self._release()
+            bag.abort()
+            self.failed = True
+            self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
+            self.get_logger().error(self.failure)
+            self.publish_diagnostics()
 
     def _flush(self) -> None:
         if self._bag is not None:
-            try:
+            with self._writing(self._bag):
                 self._bag.flush()
-            except OSError as error:
-                self._give_up(self._bag, error)
 
     def _take(self, most: int) -> None:
         """Write the received messages with their time of reception by the middleware."""
-        for topic, recorded in self._recorded.items():
-            if self._bag is None:
-                return
-            try:
-                self._take_from(self._bag, topic, recorded, most)
-            except OSError as error:
-                self._give_up(self._bag, error)
-                return
+        for topic, recorded in list(self._recorded.items()):
+            if self._bag is not None:
+                with self._writing(self._bag):
+                    self._take_from(self._bag, topic, recorded, most)
         if self._bag is not None and self._bag.lost:
             self.report_change()
         if self._sampled.keys() & self._recorded.keys():
@@ -259,7 +257,8 @@ class RecorderNode(BaseNode):
             if self._bag is not None and self._is_wanted(topic):
                 publishers = self.get_publishers_info_by_topic(topic)
                 if publishers:
-                    self._subscribe(self._bag, topic, types, publishers)
+                    with self._writing(self._bag):
+                        self._subscribe(self._bag, topic, types, publishers)
 
     def _is_wanted(self, topic: str) -> bool:
         wanted = topic in self._names or (self._all and not is_hidden(topic))
@@ -285,9 +284,6 @@ class RecorderNode(BaseNode):
         except (MessageError, RecordingError) as error:
             self._left_out.add(topic)
             self.get_logger().warning(f'{topic} left out: {error}')
-            return
-        except OSError as error:
-            self._give_up(bag, error)
             return
         if before and before.best_effort >= best_effort and before.latched <= latched:
             self._recorded[topic] = before._replace(offered=offered)
@@ -317,16 +313,9 @@ def is_hidden(topic: str) -> bool:
 
 
 def _offer(qos: QoSProfile) -> OfferedQos:
-    return OfferedQos(
-        reliability=qos.reliability.name.lower(),
-        durability=qos.durability.name.lower(),
-        history=qos.history.name.lower(),
-        depth=qos.depth,
-        deadline=qos.deadline.nanoseconds,
-        lifespan=qos.lifespan.nanoseconds,
-        liveliness=qos.liveliness.name.lower(),
-        lease=qos.liveliness_lease_duration.nanoseconds,
-    )
+    words = {name: getattr(qos, name).name.lower() for name in WORDS}
+    times = {name: getattr(qos, name).nanoseconds for name in DURATIONS}
+    return OfferedQos(depth=qos.depth, **words, **times)
 
 
 if __name__ == '__main__':

@@ -163,7 +163,7 @@ def memory_of(
         products.append(both.T @ dpttrs(d, e, both)[0])
     longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
     for length in np.geomspace(0.5 * parts.length, longest, _TIMES):
-        diagonal, beside, log_chain = _precision(time[some], length)
+        diagonal, beside, log_chain = precision(np.diff(time[some]), length)
         for ratio in _RATIOS.tolist():
             d, e, _ = dpttrf(diagonal / ratio + 1.0 / own, beside / ratio)
             models.append((float(length), ratio))
@@ -187,7 +187,7 @@ def memory_of(
     for k in counts:
         length, ratio = models[k]
         if length not in spreads:
-            d, e, _ = dpttrf(*_precision(time, length)[:2])
+            d, e, _ = dpttrf(*precision(np.diff(time), length)[:2])
             spreads[length] = (a * dpttrs(d, e, a)[0]).sum(axis=0)
         deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
@@ -213,11 +213,10 @@ def _shared(time: FloatArray, length: float) -> FloatArray:
     return np.where(np.diff(time) < 1.5 * length, -0.5, 0.0)
 
 
-def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
+def precision(gaps: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
     """Return diagonal, off-diagonal and log determinant of the inverse covariance of a chain."""
-    gaps = np.diff(time)
     kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
-    diagonal = np.ones(len(time))
+    diagonal = np.ones(len(gaps) + 1)
     diagonal[:-1] += kept**2 / new
     diagonal[1:] += kept**2 / new
     return diagonal, np.asarray(-kept / new), float(np.log(new).sum())

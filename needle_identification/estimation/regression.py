@@ -348,12 +348,8 @@ def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArr
 
 def _window(length: int) -> FloatArray:
     """Return a triangular window that rises to at most one in the middle, shape (length,)."""
-    rising = np.arange(1, (length + 1) // 2 + 1)
-    if length % 2:
-        half = 2.0 * rising / (length + 1.0)
-        return np.concatenate([half, half[-2::-1]])
-    half = (2.0 * rising - 1.0) / length
-    return np.concatenate([half, half[::-1]])
+    whole = length + length % 2
+    return (whole - np.abs(2.0 * np.arange(length) - (length - 1.0))) / whole
 
 
 def independent_span(correlation: int) -> float:

@@ -26,6 +26,7 @@ from math import exp, inf, log, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.estimation.memory import precision
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.optimize import minimize
@@ -144,14 +145,10 @@ class NoiseLikelihood:
         columns = self._columns
         if not ratio:
             return columns.T @ columns, 0.0
-        kept = np.exp(-self._steps / time)
-        lost = -np.expm1(-2.0 * self._steps / time)
-        diagonal = np.ones(len(columns))
-        diagonal[:-1] += kept**2 / lost
-        diagonal[1:] += kept**2 / lost
-        d, e, _ = dpttrf(diagonal + ratio, -kept / lost)
+        diagonal, beside, log_chain = precision(self._steps, time)
+        d, e, _ = dpttrf(diagonal + ratio, beside)
         solved, _ = dpttrs(d, e, columns)
-        logarithm = float(np.log(d).sum() + np.log(lost).sum())
+        logarithm = float(np.log(d).sum()) + log_chain
         return columns.T @ (columns - ratio * solved), logarithm
 
 

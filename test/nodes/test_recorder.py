@@ -332,7 +332,7 @@ def test_qos_of_later_publishers_is_recorded(
     node.stop()
     (topic,) = Bag(tmp_path / 'bag').topics()
     one, two = topic.offered_qos()
-    assert (one.deadline, one.lifespan, one.lease) == (
+    assert (one.deadline, one.lifespan, one.liveliness_lease_duration) == (
         2_500_000_000, 30_000_000_000, 1_500_000_000
     )  # fmt: skip
     assert (two.deadline, two.lifespan) == (UNLIMITED, UNLIMITED)
