@@ -24,12 +24,12 @@ def measured(value: float, error: float, unit: str = '') -> str:
         return UNKNOWN
     form = _format(error)
     text = f' ± {error:{form if form.endswith("f") else ".2g"}}' if isfinite(error) else ''
-    return f'{value:{form}}{text}{_suffix(unit)}'
+    return f'{value:{form}}{text}{suffix(unit)}'
 
 
 def rounded(value: float, error: float, unit: str = '') -> str:
     """Format a value without its error, rounded to significant digits; or `UNKNOWN`."""
-    return f'{value:{_format(error)}}{_suffix(unit)}' if isfinite(value) else UNKNOWN
+    return f'{value:{_format(error)}}{suffix(unit)}' if isfinite(value) else UNKNOWN
 
 
 def spread(deviation: float) -> str:
@@ -53,5 +53,6 @@ def _format(error: float) -> str:
     return f'.{max(1 - floor(log10(error)), 0)}f'
 
 
-def _suffix(unit: str) -> str:
+def suffix(unit: str) -> str:
+    """Return a unit for the end of a number; none of a pure number."""
     return '' if unit in ('', '1') else f' {unit}'
