@@ -43,10 +43,7 @@ _STATES: Final = {
 
 _DEPTH: Final = 1000  # queue length of a topic that is not latched
 _CLOCK_PERIOD: Final = 1_000_000  # shortest time between two messages on /clock [ns]
-
-#: Delay that is reported on /diagnostics [s]; smaller delays are normal on a busy machine.
-_LATE: Final = 0.1
-
+_LATE: Final = 0.1  # delay that is reported [s]; less is normal on a busy machine
 _FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
 
 #: QoS of the subscription of rclpy to /clock.

@@ -27,21 +27,17 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-#: Periods of topic discovery, of flushes to the disk, and of taking received messages [s].
-_DISCOVERY_PERIOD: Final = 0.1
-_FLUSH_PERIOD: Final = 0.5
-_TAKE_PERIOD: Final = 0.005
-
-#: Queue length of a topic, and largest number of its messages that are taken at once.
-_DEPTH: Final = 5000
-_AT_ONCE: Final = 1000
+_DISCOVERY_PERIOD: Final = 0.1  # period of topic discovery [s]
+_FLUSH_PERIOD: Final = 0.5  # period of flushes to the disk [s]
+_TAKE_PERIOD: Final = 0.005  # period of taking received messages [s]
+_DEPTH: Final = 5000  # queue length of a topic
+_AT_ONCE: Final = 1000  # largest number of its messages that are taken at once
 
 #: Last parts of the names of topics that are recorded best effort: retransmission would increase
 #: the CPU load of the plant by a third.
 _LOSSY: Final = {topic.name.rpartition('/')[2] for topic in TOPICS if topic.qos.lossy}
 
-#: Topics of the middleware that * does not include.
-_NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
+_NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')  # not included in *
 
 
 class _Recorded(NamedTuple):

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_BATCH: Final = 2**14  #: largest number of messages in a batch
-
-#: Upper limit of receive times, so that their differences fit in 64 bits [ns].
-LATEST: Final = 2**62
+LATEST: Final = 2**62  #: upper limit of receive times: differences fit in 64 bits [ns]
 
 #: Magic bytes of compressed messages; others begin with 0.
 _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}

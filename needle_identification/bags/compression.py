@@ -31,17 +31,11 @@ DAMAGED: Final = (
 )
 
 FACTOR: Final = 'NEEDLE_BAG_FACTOR'  #: environment variable: factor of all limits of this module
-
-#: Largest record or chunk, and largest message that was compressed individually [bytes].
-LARGEST_RECORD: Final = 2**27
-LARGEST_MESSAGE: Final = 2**26
-
-#: Decompressed size allowed for any file [bytes], and per byte of the file.
-_AT_LEAST: Final = 2**28
-_RATIO: Final = 50
-
-#: Records allowed for any file, else one per byte: a message at rest takes 2 or 3 bytes.
-_RECORDS: Final = 2**20
+LARGEST_RECORD: Final = 2**27  #: largest record or chunk [bytes]
+LARGEST_MESSAGE: Final = 2**26  #: largest message that was compressed individually [bytes]
+_AT_LEAST: Final = 2**28  # decompressed size allowed for any file [bytes]
+_RATIO: Final = 50  # decompressed size allowed per byte of a file
+_RECORDS: Final = 2**20  # records allowed for any file, else one per byte
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
 

@@ -10,9 +10,7 @@ from needle_identification.errors import RecordingError
 from needle_ros.documents import DocumentError, LARGEST, read_document
 from needle_ros.errors import printable
 
-#: File of a rosbag2 folder that lists its other files; written when the bag is closed.
-METADATA: Final = 'metadata.yaml'
-
+METADATA: Final = 'metadata.yaml'  #: lists the other files, written at the end
 LOST: Final = 'messages lost'  #: key of the metadata for the messages that the recorder lost
 
 _FORMS: Final = ('.mcap', '.db3', '.bag')

@@ -32,10 +32,7 @@ from numpy.typing import NDArray
 _MAGIC: Final = b'\x89MCAP0\r\n'
 
 _HEAD: Final = struct.Struct('<BQ')  # opcode and length of a record
-
-#: Start, end, size, checksum and length of the name of the compression of a chunk.
-_CHUNK: Final = struct.Struct('<QQQII')
-
+_CHUNK: Final = struct.Struct('<QQQII')  # start, end, size, checksum, length of compression
 _TAIL: Final = struct.Struct('<BQQQI8s')  # the end of a file: a footer record and the magic bytes
 
 #: Header of a message record.

@@ -14,8 +14,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 
-#: Longest plausible pause between two messages: a day [ns].
-_LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS
+_LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS  # longest plausible pause: a day [ns]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,12 +19,9 @@ from needle_identification.errors import RecordingError
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
 _ROW: Final = 16  # size of a row in addition to its data [bytes]
-
-#: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
-#: A message takes 20 to 40 steps and 40 bytes.
-_STEPS: Final = 10**8
-_STEPS_PER_BYTE: Final = 20
-_STEPS_PER_CALL: Final = 10**5
+_STEPS: Final = 10**8  # limit of SQLite steps; a message of 40 bytes takes 20 to 40
+_STEPS_PER_BYTE: Final = 20  # additional steps per byte of the file
+_STEPS_PER_CALL: Final = 10**5  # steps between two checks
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:

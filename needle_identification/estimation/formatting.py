@@ -4,9 +4,7 @@
 from math import floor, inf, isfinite, log10
 from typing import Final
 
-#: Text for a parameter that the data do not determine.
-UNKNOWN: Final = 'not determined by the data'
-
+UNKNOWN: Final = 'not determined by the data'  #: text for a parameter
 _SMALLEST_ERROR: Final = 1e-9  # smallest error that limits the digits
 
 

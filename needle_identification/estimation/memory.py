@@ -34,17 +34,10 @@ import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import ndtr, ndtri
 
-#: Variances of correlated noise relative to white noise in a part.
-_RATIOS: Final = np.geomspace(0.02, 2e6, 10)
-
-#: Number of correlation times, and the longest relative to the recording; the shortest is half a
-#: part.
-_TIMES: Final = 24
-_LONGEST: Final = 10.0
-
-#: Variances of differences relative to white noise in a part.
-_DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)
-
+_RATIOS: Final = np.geomspace(0.02, 2e6, 10)  # correlated over white variance
+_TIMES: Final = 24  # number of correlation times, from half a part
+_LONGEST: Final = 10.0  # longest correlation time, relative to the recording
+_DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)  # variances over white noise
 _DIFFERENCED: Final = 0.1  # prior probability of differences
 
 #: Prior probability of white noise. 0.5 is too large: a correlation time of a fifth of a part was
@@ -54,10 +47,8 @@ _WHITE: Final = 0.2
 _NEGLIGIBLE: Final = 1e-6  # smallest probability of a model that is included
 _BISECTIONS: Final = 30  # bisection steps, for an accuracy of an interval of 1/1000 of the widest
 _ROUNDING: Final = 1e-9  # relative size of rounding errors
-
-#: Largest number of parts for the comparison of models, and parts per run.
-_MOST_PARTS: Final = 1000
-_RUN: Final = 50
+_MOST_PARTS: Final = 1000  # largest number of parts for the comparison of models
+_RUN: Final = 50  # parts per run, of a larger number
 
 
 @dataclass(frozen=True, slots=True, eq=False)

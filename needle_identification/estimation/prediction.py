@@ -16,8 +16,7 @@ from needle_dynamics.arrays import FloatArray
 import numpy as np
 from scipy.special import chdtri
 
-#: Ratio of the error of predicted recordings to the residuals above which a warning is given.
-WORSE: Final = 1.5
+WORSE: Final = 1.5  #: error of predicted recordings over the residuals for a warning
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -44,21 +44,11 @@ from scipy.special import fdtrc, stdtrit
 #: determined: an error of 1 % in the response would change a parameter by a fifth.
 LARGEST_CONDITION: Final = 20.0
 
-#: Largest component of a determined parameter in such a direction; its error includes it.
-_LARGEST_SHARE: Final = 0.1
-
+_LARGEST_SHARE: Final = 0.1  # largest share of such a direction in a determined parameter
 _ROUNDING: Final = 1e-9  # relative size of rounding errors
-
-#: Weight of the noise of all groups in the variance of each group [correlation windows].
-_PRIOR: Final = 5.0
-
-#: Residual beyond which Huber's weight falls [standard deviations]. It makes the estimator 95 %
-#: efficient for normal noise.
-_HUBER_LIMIT: Final = 1.345
-
-#: Standard deviation of normal noise over its median absolute deviation.
-DEVIATION_OVER_MEDIAN: Final = 1.4826
-
+_PRIOR: Final = 5.0  # weight of the noise of all groups in each group [correlation windows]
+_HUBER_LIMIT: Final = 1.345  # residual over its deviation of falling weight; 95 % efficient
+DEVIATION_OVER_MEDIAN: Final = 1.4826  #: standard over median deviation, normal
 _MAX_ITERATIONS: Final = 100
 
 
@@ -75,10 +65,8 @@ class Regression:
     determination: float  #: coefficient of determination R^2
     samples: int  #: number of samples used
     effective_samples: float  #: number of independent samples with the same information
-    #: (k,) degrees of freedom of the errors; few where few samples determine a parameter.
-    degrees_of_freedom: FloatArray
-    #: Autocorrelation of the noise, included in the errors; None if not requested.
-    memory: Memory | None = None
+    degrees_of_freedom: FloatArray  #: (k,) of the errors, by the samples behind each
+    memory: Memory | None = None  #: autocorrelation in the errors, if requested
 
     def __repr__(self) -> str:
         pairs = zip(self.values.tolist(), self.errors.tolist(), strict=True)

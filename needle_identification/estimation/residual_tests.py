@@ -11,12 +11,8 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 _FEWEST_PARTS: Final = 10  # smallest number of parts for any test
-
-#: Smallest number of parts for the test of d'Agostino and Pearson; below, Shapiro and Wilk.
-_FEWEST_FOR_MOMENTS: Final = 20
-
-#: p-value below which a test fails: 1 % of the recordings fail any of the four by chance.
-_SIGNIFICANCE: Final = 0.0025
+_FEWEST_FOR_MOMENTS: Final = 20  # smallest number of parts, else Shapiro and Wilk
+_SIGNIFICANCE: Final = 0.0025  # 1 % of the recordings fail any of the four by chance
 
 #: Result of each test in words, if failed and if passed.
 _WORDS: Final = {

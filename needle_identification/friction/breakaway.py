@@ -20,15 +20,9 @@ import numpy as np
 from scipy.special import stdtrit
 
 _RISING: Final = 0.3  # time before the motion in which the rise of the force is measured [s]
-
-#: Smallest rise of the force in that time, as a fraction of the force and of mu_s.
-_SMALLEST_RISE: Final = 0.05
-
+_SMALLEST_RISE: Final = 0.05  # smallest rise, as a fraction of the force and of mu_s
 _CLEAR_RISE: Final = 5.0  # smallest slope of the rise [standard errors]
-
-#: Fraction of the usual correlation length used here, because the rise of the force is short.
-_WINDOW_PART: Final = 0.4
-
+_WINDOW_PART: Final = 0.4  # part of the usual correlation length, for a short rise
 _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='N')
 
 

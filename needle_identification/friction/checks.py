@@ -13,13 +13,8 @@ from needle_identification.friction.terms import columns_of
 import numpy as np
 
 _UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
-
-#: Growth of the standard errors by autocorrelated noise above which a warning is given.
-_MUCH_LARGER: Final = 1.5
-
-#: Noise correlated over more than this fraction of the recording has no finite correlation time.
-_WANDERS: Final = 0.25
-
+_MUCH_LARGER: Final = 1.5  # growth of the errors by autocorrelated noise for a warning
+_WANDERS: Final = 0.25  # part of the recording: longer correlation is not finite
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 
 

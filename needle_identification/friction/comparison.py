@@ -19,9 +19,7 @@ import numpy as np
 SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
 
 
-#: Growth of the standard errors by autocorrelation that two missing terms may explain.
-_LIKE_MEMORY: Final = 1.5
-
+_LIKE_MEMORY: Final = 1.5  # growth of the errors that two missing terms may explain
 _FOLDS: Final = 5  # folds of the cross-validation over strokes
 _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
@@ -32,8 +30,7 @@ class CandidateFit:
 
     terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
     criterion: str = 'BIC'  #: with the effective number of samples
-    #: BIC of the alternative set minus BIC of the chosen set; nan if it is not determined.
-    difference: float = nan
+    difference: float = nan  #: BIC minus BIC of the chosen set; nan: not determined
     #: Of the Wald test that the differing terms are zero, with errors for autocorrelated noise,
     #: corrected for the number of terms tried (Holm).
     p_value: float = 1.0

@@ -24,15 +24,9 @@ from needle_identification.friction.terms import columns_of, NeedleMotion, regre
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-#: Smallest number of independent samples in motion for a meaningful standard error.
-FEWEST_SAMPLES: Final = 10.0
-
+FEWEST_SAMPLES: Final = 10.0  #: smallest number of independent samples in motion
 _SETTLING: Final = 3.0  # settling time of the sensor filters after a change [lags of the force]
-
-#: Tolerance within which the needle is at its largest insertion depth [m]: encoder counts,
-#: noise, backlash.
-_SAME_DEPTH: Final = 5e-5
-
+_SAME_DEPTH: Final = 5e-5  # tolerance of the largest depth [m]: counts, noise, backlash
 _EFFECT: Final = 0.05  # smallest fraction of the full size of a term that counts as an effect
 _LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 

@@ -26,23 +26,14 @@ if TYPE_CHECKING:
     # Takes a fifth of a second to import; only filtering a recording needs it.
     from scipy.interpolate import BSpline
 
-#: Half the length of a Hann window that halves the power at its cutoff [periods of the cutoff].
-HALF_LENGTH: Final = 0.36
-
-#: Length over which filtered noise is correlated [periods of the cutoff].
-CORRELATION_LENGTH: Final = 3.0
-
+HALF_LENGTH: Final = 0.36  #: half of a Hann window [periods of its cutoff at half power]
+CORRELATION_LENGTH: Final = 3.0  #: of filtered noise [periods of the cutoff]
 GAP: Final = 3.5  #: longest step between samples that is not a gap [sampling periods]
 _CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations of the noise]
 _KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
-
-#: Ratio of the hold time at a limit of the sensor to the longest hold time at other values.
-_LONGER: Final = 3
-
+_LONGER: Final = 3  # hold time at a limit of the sensor over the longest at other values
 _MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
-
-#: Largest number of resampled points per sample; with more, most of the time base is gaps.
-_LARGEST_GRID: Final = 10.0
+_LARGEST_GRID: Final = 10.0  # resampled points per sample; more are mostly gaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -33,17 +33,10 @@ from needle_identification.recordings.recording import Recording
 import numpy as np
 
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
-
-#: Positions replace velocities if their velocity noise is below this fraction.
-_CLEANER: Final = 0.5
-
-#: Time after a change within which the force may deviate from the terms [s], and the p-value
-#: of the deviation below which these samples are left out.
-_TRANSITION: Final = 0.1
-_TRANSITIONS_DIFFER: Final = 0.001
-
-#: Largest difference of parameters that agree [standard errors for white noise].
-_CLOSE: Final = 3.0
+_CLEANER: Final = 0.5  # velocity noise of positions that replace velocities, at most
+_TRANSITION: Final = 0.1  # time of a possible deviation after a change [s]
+_TRANSITIONS_DIFFER: Final = 0.001  # p-value below which these samples are left out
+_CLOSE: Final = 3.0  # difference of parameters that agree [standard errors, white]
 
 
 def identify_friction(

@@ -23,9 +23,7 @@ _BETTER: Final = 0.5  # largest fraction of the misfit that remains with an acce
 _MAX_SAMPLES: Final = 1000  # largest number of samples for the coarse search
 
 _MAX_ITERATIONS: Final = 10
-
-#: Largest fraction of noise in the power of the acceleration for an estimate of the lag.
-_LARGEST_NOISE: Final = 0.1
+_LARGEST_NOISE: Final = 0.1  # largest share of noise in the power of the acceleration
 
 #: Smallest ratio of root mean square and largest acceleration at which the lag is reported.
 #: Filter and spline produce smaller accelerations from velocity steps.

@@ -28,31 +28,16 @@ import numpy as np
 #: Terms that depend on the time since the start or on the insertion depth.
 _OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 
-#: Smallest number of independent blocks for a meaningful standard error.
-_FEWEST_PARTS: Final = 10.0
-
+_FEWEST_PARTS: Final = 10.0  # smallest number of independent blocks for an error
 _PART_LENGTH: Final = 2.0  # length of a block [correlation lengths of filtered noise]
-
-#: Age at which a block is discarded [forgetting times]; its weight is then below 4e-4.
-_REMEMBERED: Final = 8.0
-
-#: Relative threshold below which singular values of the information are rounding errors.
-_ROUNDING: Final = 1e-7
-
-#: Time for which a sensor with an unknown filter settles after a change of regime [s].
-_SETTLING: Final = 0.05
-
+_REMEMBERED: Final = 8.0  # largest age of a block [forgetting times]: weight 4e-4
+_ROUNDING: Final = 1e-7  # relative size of singular values that are rounding errors
+_SETTLING: Final = 0.05  # of a sensor with an unknown filter after a change [s]
 _LAGS: Final = 5  # number of blocks over which the noise may be correlated
 _FIRST: Final = 50  # number of pairs that determine the sampling rate
 _LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
-
-#: Backward step of a stamp above which the clock was set back [s]; after a smaller step, the
-#: message arrived late.
-_SET_BACK: Final = 1.0
-
-#: Largest plausible values: forces [N]; depths [m] or velocities [m/s].
-_LARGEST: Final = {'force': 1e4, 'motion': 100.0}
-
+_SET_BACK: Final = 1.0  # backward step of a clock set back, not of a late message [s]
+_LARGEST: Final = {'force': 1e4, 'motion': 100.0}  # [N], and [m] or [m/s]: implausible
 _MAX_WAITING: Final = 20_000  # largest number of samples that wait for the other topic
 
 

@@ -3,5 +3,4 @@
 
 from typing import Final
 
-#: Sources of the stamps of a recording: message headers or receive times.
-TIMES: Final = ('header', 'receive')
+TIMES: Final = ('header', 'receive')  #: stamps: of messages or their receipt

@@ -36,9 +36,7 @@ _FORCE: Final = (wire.WRENCH,)
 
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
 _MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
-
-#: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
-_EXPLAINED: Final = 0.3
+_EXPLAINED: Final = 0.3  # smallest part of a force that is like friction
 
 #: Least motion of a steered insertion, by role [m, rad].
 _STEERED: Final = {'guide_x': 2e-4, 'guide_z': 2e-4, 'roll': 0.1}

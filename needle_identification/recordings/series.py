@@ -7,9 +7,7 @@ from needle_dynamics.arrays import FloatArray
 import numpy as np
 from numpy.typing import NDArray
 
-#: Finest bin [ns]: 400 Hz, well above the cutoff frequency of the friction filter.
-FINEST: Final = 2_500_000
-
+FINEST: Final = 2_500_000  #: finest bin [ns]: 400 Hz, above the cutoff of the friction filter
 LARGEST: Final = 2**20  #: largest number of samples that are kept
 _GATHERED: Final = 2**16  # smallest number of added samples that is sorted
 

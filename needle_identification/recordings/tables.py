@@ -54,8 +54,7 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'tip_z': _LENGTHS,
 }
 
-#: Roles of the columns for friction; depth or speed is sufficient.
-ROLES: Final = ('time', 'depth', 'speed', 'force')
+ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
 
 #: Usual names of a column of time.
 TIME_NAMES: Final = ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec')
@@ -71,16 +70,11 @@ _USUAL: Final = {
 #: Exceptions of SciPy for damaged bytes.
 _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 
-#: Header length of a MATLAB file [bytes], and type code of its compressed variables.
-_MATLAB_HEAD: Final = 128
-_COMPRESSED: Final = 15
-
+_MATLAB_HEAD: Final = 128  # length of the header of a MATLAB file [bytes]
+_COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
-
-#: Ranges above which a depth or speed without unit is probably not in SI units.
-_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
-
+_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}  # ranges that are rarely in SI units
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')

@@ -41,11 +41,8 @@ _SETTLED: Final = 1e-7  # change of the delay in the last round [s]
 #: Factors of wrong units, and the largest difference of decimal logarithms.
 _UNITS: Final = {1e3: '[mm]', 1e2: '[cm]', 1e-3: '[m], with the true position in mm'}
 _SIMILAR: Final = 0.3
-
-#: Ratio of residuals above which axes are exchanged, and smallest residual [m].
-_EXCHANGED: Final = 5.0
-_BIASED: Final = 2e-3
-
+_EXCHANGED: Final = 5.0  # ratio of residuals above which axes are exchanged
+_BIASED: Final = 2e-3  # smallest residual of exchanged axes [m]
 _LONG: Final = 20.0  #: Duration of a recording over a correlation time that it determines well.
 
 

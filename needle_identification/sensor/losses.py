@@ -10,10 +10,7 @@ from scipy.special import betaincinv
 
 _REGULAR: Final = 0.25  # largest deviation of a step from a multiple of the period [periods]
 _IRREGULAR: Final = 0.05  # largest fraction of steps beyond it
-
-#: Number of standard errors by which the memory of losses exceeds that of independent losses.
-_BURSTS: Final = 2.6
-
+_BURSTS: Final = 2.6  # memory of losses that are not independent [standard errors]
 _UNKNOWN: Final = (-inf, inf)
 
 

@@ -54,8 +54,7 @@ class NoiseFit(NamedTuple):
     deviance: float  #: -2 log restricted likelihood
     freedom: int  #: values less constants
     information: float  #: number of independent samples with the same information on the bias
-    #: Covariance of the logarithms of white deviation, ratio and time, (3, 3).
-    spread: FloatArray = np.full((3, 3), np.nan)
+    spread: FloatArray = np.full((3, 3), np.nan)  #: covariance of the logarithms
 
 
 class NoiseLikelihood:

@@ -34,26 +34,15 @@ _USUAL: Final = {
     'roll': ('roll', 'rotation', 'theta'),
 }
 
-#: Largest depth in m, and smallest depth in mm; between them the unit is cm or mm.
-_LARGE: Final = 1.0
-_SMALL: Final = 25.0
-
-#: Largest lateral motion, and largest distance from the origin of a frame [m].
-_LATERAL: Final = 0.1
-_FAR: Final = 2.0
-
+_LARGE: Final = 1.0  # largest depth in m
+_SMALL: Final = 25.0  # smallest depth in mm; between them the unit is cm or mm
+_LATERAL: Final = 0.1  # largest lateral motion [m]
+_FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
-
-#: Motion of the tip along the needle over the insertion of the needle, at least.
-_ALONG: Final = 0.5
-
-#: Usual names of the position of the tip along the needle.
-_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}
-
+_ALONG: Final = 0.5  # least motion of the tip along the needle over the insertion
+_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}  # position along the needle
 _MOVED: Final = ('depth', 'guide_x', 'guide_z')
-
-#: Last part of the name of a component, such as ``x`` of ``Base x``.
-_COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)
+_COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)  # ``x`` of ``Base x``
 
 
 def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> dict[str, str]:

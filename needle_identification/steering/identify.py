@@ -55,11 +55,8 @@ _LARGEST: Final = 0.5  # largest error of a drift constant that is determined [r
 class SteeringSettings:
     """Settings of the steering identification."""
 
-    #: Drift terms, of `TERMS`; None selects the term with the smallest residual.
-    terms: tuple[str, ...] | None = None
-    #: Whether guide and needle move ``together`` between samples, or the ``guide first``; None
-    #: selects the order with the smaller residual.
-    order: str | None = None
+    terms: tuple[str, ...] | None = None  #: drift terms; None selects the best
+    order: str | None = None  #: ``together`` or ``guide first``; None selects the better
     free_length: float | None = None  #: known free length [m]; None to estimate it
 
     def __post_init__(self) -> None:

@@ -39,9 +39,7 @@ _SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
 _RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
-
-#: Constants without effect are 0 +- 1 rad or 1/m, for this deviation of the white noise [m].
-_WEAK: Final = 1e-4
+_WEAK: Final = 1e-4  # noise for which constants without effect are 0 +- 1 rad or 1/m [m]
 
 
 class Likelihood(NamedTuple):

@@ -45,8 +45,7 @@ JOINTS: Final = {
     'roll': contract.ROLL,
 }
 
-#: Components of the tip by role.
-_TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
+_TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}  # components of the tip by role
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
 _MOVED: Final = 1e-4  # largest change of a constant tilt [rad]

@@ -13,11 +13,9 @@ from needle_identification.steering.response import drift, SimulatedCauses, TipR
 import numpy as np
 from scipy.optimize import least_squares
 
-#: Bounds of free length, bending length and skin [m].
-FREE: Final = (1e-3, 0.3)
-LENGTH: Final = (4e-3, 0.5)
-SKIN: Final = (0.0, 0.5)
-
+FREE: Final = (1e-3, 0.3)  #: bounds of the free length [m]
+LENGTH: Final = (4e-3, 0.5)  #: bounds of the bending length [m]
+SKIN: Final = (0.0, 0.5)  #: bounds of the skin [m]
 _SCALE: Final = 0.02  # the search variable of the skin is skin / (skin + scale) [m]
 
 #: Grid of the global search: free lengths, bending lengths and skins [m].

@@ -38,11 +38,8 @@ _FEWEST_PRESSES: Final = 3  # smallest number of presses of a level
 #: attenuation by the noise of the displacements is then below 1 %.
 _SMALLEST_SPREAD: Final = 10.0
 
-#: Ratio of column norm to error below which a column contains only noise.
-_LARGEST_NOISE: Final = 3.0
-
-#: Gradient of the curl k_zx - k_xz with respect to the entries of K.
-_CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])
+_LARGEST_NOISE: Final = 3.0  # column norm over error of a column with only noise
+_CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])  # gradient of k_zx - k_xz by K
 
 
 class MatrixFit(NamedTuple):

@@ -15,10 +15,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
 _SAME_DIRECTION: Final = pi / 18.0  # largest angle between forces of the same direction [rad]
-#: Smallest ratio of creep or hysteresis to its error, and smallest fraction that counts.
-_CLEARLY: Final = 4.0
-_LEAST_MEMORY: Final = 1e-3
-
+_CLEARLY: Final = 4.0  # smallest ratio of creep or hysteresis to its error
+_LEAST_MEMORY: Final = 1e-3  # smallest creep or hysteresis that counts
 _FEWEST_FOR_MEMORY: Final = 4  # smallest number of presses with a rest after them
 _WORTH_WARNING: Final = 0.1  # relative drift of the zero above which a warning is given
 
