@@ -32,7 +32,7 @@ def breakaway_force(
     """Return the mean force [N] at which the needle left a rest with a rising force, if any."""
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
-    found, signs = [], []
+    found = []
     coulomb = [p.value for p in parameters if p.name == 'coulomb_friction' and p.determined]
     least = _SMALLEST_RISE * max(coulomb, default=0.0)
     for start in starts:
@@ -41,12 +41,11 @@ def breakaway_force(
         end = int(after[0]) if len(after) else len(design.velocity)
         push = _push(design, (rest, int(start), end), least)
         if push is not None:
-            found.append(push)
-            signs.append(design.regime[start])
+            found.append((*push, design.regime[start]))
     if not found:
         return None
-    values, errors, half_widths = np.array(found).T
-    value, count, bias = float(values.mean()), len(found), float(np.mean(signs))
+    values, errors, half_widths, signs = np.array(found).T
+    value, count, bias = float(values.mean()), len(found), float(signs.mean())
     error = sqrt(float(errors @ errors)) / count
     half_width = sqrt(float(half_widths @ half_widths)) / count
     for parameter in parameters:

@@ -86,9 +86,9 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
     """Warn of a lag that exceeds usual filters, or that indicates a mass."""
     if not lag.determined:
         if coarse:
-            way = 'behind' if coarse > 0.0 else 'ahead of'
+            order = 'behind' if coarse > 0.0 else 'ahead of'
             size = f'{1e3 * abs(coarse):.2g} ms'
-            yield f'the force is about {size} {way} the motion (from steady strokes); corrected'
+            yield f'the force is about {size} {order} the motion (from steady strokes); corrected'
     elif not lag.interval[0] <= 0.0 <= lag.interval[1]:
         size = f'{1e3 * abs(lag.value):.3g} ± {1e3 * lag.error:.2g} ms'
         if lag.value > max(_UNUSUAL_LAG, period):

@@ -52,6 +52,11 @@ class Design:
         return self.lag_column.size > 0
 
     @property
+    def terms(self) -> int:
+        """Number of coefficients of the chosen terms."""
+        return len(columns_of(self.signals.settings.terms, self.signals.settings))
+
+    @property
     def is_enough(self) -> bool:
         needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
         return bool(np.count_nonzero(self.used) >= needed)

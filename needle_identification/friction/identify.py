@@ -28,7 +28,6 @@ from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.lag import find_lag, lag_estimate
 from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
-from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
@@ -173,7 +172,7 @@ def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
 def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Leave out more samples around each change if the force deviates from the terms there."""
     settings, whole = chosen.design.signals.settings, chosen.fit
-    count = len(columns_of(settings.terms, settings))
+    count = chosen.design.terms
     design = chosen.design.far_from_changes(_TRANSITION)
     if whole.is_exact or not design.is_enough:
         return None
@@ -201,7 +200,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     """Test the chosen fit, compare it with other terms, and assemble the result."""
     design, fit, signals = chosen.design, chosen.fit, chosen.design.signals
     settings, used = signals.settings, design.used
-    known = fit.values[: len(columns_of(settings.terms, settings))]
+    known = fit.values[: design.terms]
     mean_speed = float(np.mean(np.abs(design.velocity[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     checks.check_friction(parameters)
