@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
+from math import nan
 from pathlib import Path
 import shlex
 from typing import Final, NamedTuple
@@ -60,7 +61,7 @@ class Content:
     name: str  #: of the topic, or of the file
     type_name: str  #: of the messages, or ``table``
     count: int  #: number of messages or rows
-    rate: float = float('nan')  #: messages per second, from the median step; nan if not inspected
+    rate: float = nan  #: messages per second, from the median step; nan if not inspected
     gaps: int = 0  #: number of pauses of more than ten steps
     columns: tuple[ColumnSummary, ...] = ()  #: components; none if the type is not supported
 
@@ -103,12 +104,13 @@ def inspect_recording(path: Path | str) -> Inspection:
 
 def _table(path: Path) -> Inspection:
     table = read_table(path)
-    roles = {role: with_unit(table, role, spec) for role, spec in guessed(table).items()}
+    roles = {
+        role: with_unit(role, spec, table.columns.get(spec, np.empty(0)))
+        for role, spec in guessed(table).items()
+    }
     columns = tuple(_column(name, values) for name, values in table.columns.items())
-    content = Content(
-        name=path.name, type_name='table', count=len(next(iter(table.columns.values()))),
-        columns=columns,
-    )  # fmt: skip
+    count = len(next(iter(table.columns.values())))
+    content = Content(name=path.name, type_name='table', count=count, columns=columns)
     words = [f'{role} by its name: {spec}' for role, spec in roles.items()]
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
     lacking = [role for role in ('time', 'force') if role not in roles]
@@ -137,9 +139,8 @@ def _table(path: Path) -> Inspection:
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:
     finite = values[np.isfinite(values)]
-    if not len(finite):
-        return ColumnSummary(name, float('nan'), float('nan'))
-    return ColumnSummary(name, float(finite.min()), float(finite.max()))
+    low, high = (finite.min(), finite.max()) if len(finite) else (nan, nan)
+    return ColumnSummary(name, float(low), float(high))
 
 
 # Bags.
@@ -239,12 +240,8 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
     """Find the pair of force and motion that is most similar to friction."""
     forces = [one for one in signals if one.topic.type_name in _FORCE]
     motions = [one for one in signals if one.topic.type_name in _MOTION]
-    best: tuple[float, float, _Signal, _Signal] | None = None
-    for force in forces:
-        for motion in motions:
-            explained, size = _friction(force, motion)
-            if best is None or explained > best[0]:
-                best = explained, size, force, motion
+    pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
+    best = max(pairs, key=lambda pair: pair[0], default=None)
     if best is None or best[0] < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
         why = 'no force depends on the direction of a motion'
@@ -263,11 +260,12 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
         options += ['--wrench-topic', force.topic.name]
     if len({one.topic for one in motions}) > 1:
         options += ['--motion-topic', motion.topic.name]
-    turned = '-' if size < 0.0 else ''
-    if turned:
+    axis = force.axis
+    if size < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
-    if turned or force.axis != 'y':
-        options += ['--force-axis', turned + force.axis]
+        axis = f'-{axis}'
+    if axis != 'y':
+        options += ['--force-axis', axis]
     is_joint = motion.topic.type_name == wire.JOINT_STATE
     others = [one for one in motions if one.topic == motion.topic]
     if (is_joint and len(others) > 1) or (not is_joint and motion.axis != 'y'):
@@ -298,8 +296,6 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     if not variance:
         return 0.0, 0.0
     # With motion in one direction, friction and an offset are not distinguishable.
-    along = float(np.var(x[:, :2] @ solution[:2]))
-    left = float(np.var(y - x @ solution))
-    return max(0.0, min(along, variance - left) / variance), float(
-        np.mean((x[:, :2] @ solution[:2]) * np.sign(velocity[moving]))
-    )
+    friction = x[:, :2] @ solution[:2]
+    along, left = float(np.var(friction)), float(np.var(y - x @ solution))
+    return max(0.0, min(along, variance - left) / variance), float(np.mean(friction * x[:, 0]))

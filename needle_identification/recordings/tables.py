@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
-from math import pi
+from math import inf, pi
 import os
 from pathlib import Path
 import re
 import struct
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 import zlib
 
 from needle_dynamics.arrays import FloatArray, IntArray
@@ -80,6 +80,9 @@ _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
 
+Roles: TypeAlias = Mapping[str, str]  #: columns by role
+
+
 class Table(NamedTuple):
     """Content of a table file, by name."""
 
@@ -134,7 +137,22 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
         losses.append(f'columns by their names: {words}')
-    return _recording(path, values, losses)
+    roles = [role for role in ('force', 'depth', 'speed') if role in values]
+    rows = np.column_stack([values[role] for role in roles])
+    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
+    found = dict(zip(roles, rows.T, strict=True))
+    times = 1e-9 * (stamps - stamps[0])
+    if 'depth' not in found:
+        losses.append('no depth: it is the integral of the speed from 0')
+        found['depth'] = integrated(times, found['speed'])
+    return Recording(
+        name=str(path),
+        time=times,
+        depth=found['depth'],
+        velocity=found.get('speed'),
+        force=found['force'],
+        losses=tuple(losses),
+    )
 
 
 def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
@@ -178,12 +196,10 @@ def unit_of(name: str, role: str) -> str | None:
     return word if word in UNITS[role] and word != name else None
 
 
-def with_unit(table: Table, role: str, name: str) -> str:
-    """Return a column for friction with mm or mm/s if it states no unit and is too large in m."""
-    if role not in _SUSPICIOUS or unit_of(name, role) is not None:
-        return name
-    finite = table.columns[name][np.isfinite(table.columns[name])]
-    if len(finite) and np.ptp(finite) > _SUSPICIOUS[role]:
+def with_unit(role: str, name: str, values: FloatArray) -> str:
+    """Return a column with mm or mm/s if its name states no unit and its values are large in m."""
+    finite = values[np.isfinite(values)]
+    if unit_of(name, role) is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, inf):
         return f'{name}[mm{"/s" if role == "speed" else ""}]'
     return name
 
@@ -215,11 +231,10 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
     if factor is not None:
         scale *= _factor(table, role, spec, factor)
     found = scale * column
-    finite = found[np.isfinite(found)]
-    if unit is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, np.inf):
+    if unit is None and (other := with_unit(role, name, found)) != name:
         losses.append(
-            f'{name} has no unit and spans {np.ptp(finite):.3g}, taken in SI units: perhaps '
-            f'{role}={name}[mm{"/s" if role == "speed" else ""}]'
+            f'{name} has no unit and spans {np.ptp(found[np.isfinite(found)]):.3g}, taken in SI '
+            f'units: perhaps {role}={other}'
         )
     return np.asarray(found)
 
@@ -248,26 +263,6 @@ def _factor(table: Table, role: str, spec: str, factor: str) -> float:
     raise RecordingError(
         f'--columns {role}={spec}: the factor must be a number or the name of one, got '
         f'{factor!r}; {table.path} has {has}'
-    )
-
-
-def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) -> Recording:
-    """Build a recording from columns in SI units: sort samples, discard invalid rows."""
-    roles = [role for role in ('force', 'depth', 'speed') if role in values]
-    rows = np.column_stack([values[role] for role in roles])
-    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
-    found = dict(zip(roles, rows.T, strict=True))
-    times = 1e-9 * (stamps - stamps[0])
-    if 'depth' not in found:
-        losses.append('no depth: it is the integral of the speed from 0')
-        found['depth'] = integrated(times, found['speed'])
-    return Recording(
-        name=str(path),
-        time=times,
-        depth=found['depth'],
-        velocity=found.get('speed'),
-        force=found['force'],
-        losses=tuple(losses),
     )
 
 

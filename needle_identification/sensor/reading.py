@@ -15,6 +15,7 @@ from needle_identification.recordings.tables import (
     guessed,
     is_table,
     read_table,
+    Roles,
     sorted_rows,
     TIME_NAMES,
 )
@@ -92,14 +93,13 @@ def read_sensor_recording(
     axes = tuple(axes)
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
         raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
-    path, losses = Path(path), list[str]()
-    stamps, tip = _positions(path, _TIP, tip_topic, axes, time, columns or {}, losses)
+    path = Path(path)
+    stamps, tip, losses = _positions(path, _TIP, tip_topic, axes, time, columns or {})
     if isinstance(truth, (str, Path)):
-        there = list[str]()
-        true_stamps, true_tip = _positions(
-            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}, there
+        true_stamps, true_tip, others = _positions(
+            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}
         )
-        losses += [f'true position: {loss}' for loss in there]
+        losses += [f'true position: {loss}' for loss in others]
         if stamps[-1] < true_stamps[0] or true_stamps[-1] < stamps[0]:
             spans = (
                 f'from {part[0] / NANOSECONDS:.3f} to {part[-1] / NANOSECONDS:.3f} s'
@@ -127,52 +127,37 @@ def read_sensor_recording(
 
 
 def _positions(
-    path: Path,
-    wanted: Wanted,
-    topic: str | None,
-    axes: Sequence[str],
-    time: str,
-    columns: Mapping[str, str],
-    losses: list[str],
-) -> tuple[IntArray, FloatArray]:
-    """Return stamps [ns], (n,), and positions on the axes [m], (n, k)."""
+    path: Path, wanted: Wanted, topic: str | None, axes: Sequence[str], time: str, columns: Roles
+) -> tuple[IntArray, FloatArray, list[str]]:
+    """Return stamps [ns], (n,), positions on the axes [m], (n, k), and losses."""
     if not is_table(path):
-        return _of_bag(path, wanted, topic, axes, time, columns, losses)
+        return _of_bag(path, wanted, topic, axes, time, columns)
     if topic is not None:
         option = wanted.option.replace('_', '-')
         raise RecordingError(f'{path} is a table: name columns instead of --{option}')
     table = read_table(path)
-    specs = {**guessed(table, _USUAL), **columns}
-    roles = [f'tip_{axis}' for axis in axes]
-    if missing := [role for role in ('time', *roles) if role not in specs]:
+    specs, losses = {**guessed(table, _USUAL), **columns}, list(table.losses)
+    roles = ['time', *(f'tip_{axis}' for axis in axes)]
+    if missing := [role for role in roles if role not in specs]:
         option = '--truth-columns' if wanted is _TRUTH else '--columns'
         raise RecordingError(
             f'{path}: no column found for {" and ".join(missing)}, it has '
             f'{", ".join(table.columns)}: use {option} {missing[0]}=NAME,...'
         )
-    losses += table.losses
-    if words := ', '.join(
-        f'{role}={specs[role]}' for role in ('time', *roles) if role not in columns
-    ):
+    if words := ', '.join(f'{role}={specs[role]}' for role in roles if role not in columns):
         losses.append(f'columns by their names: {words}')
-    values = {role: column_values(table, role, specs[role], losses) for role in ('time', *roles)}
-    rows = np.column_stack([values[role] for role in roles])
-    start, stamps, found = sorted_rows(path, values['time'], rows, losses)
+    times, *tips = (column_values(table, role, specs[role], losses) for role in roles)
+    rows = np.column_stack(tips)
+    start, stamps, found = sorted_rows(path, times, rows, losses)
     if not abs(start) < _LATEST:
         raise RecordingError(f'{path}: time starts at {start:.3g} s: is its unit right?')
     _check_means(losses, int(np.count_nonzero(np.isfinite(rows).all(axis=1))), len(stamps))
-    return round(NANOSECONDS * start) + stamps, found
+    return round(NANOSECONDS * start) + stamps, found, losses
 
 
 def _of_bag(
-    path: Path,
-    wanted: Wanted,
-    name: str | None,
-    axes: Sequence[str],
-    time: str,
-    columns: Mapping[str, str],
-    losses: list[str],
-) -> tuple[IntArray, FloatArray]:
+    path: Path, wanted: Wanted, name: str | None, axes: Sequence[str], time: str, columns: Roles
+) -> tuple[IntArray, FloatArray, list[str]]:
     bag = Bag(path)
     topic = chosen_topic(bag, bag.topics(), wanted, name)
     words = [columns.get(f'tip_{axis}', axis) for axis in axes]
@@ -184,9 +169,9 @@ def _of_bag(
         source = source_of(topic.type_name, [axis for _, axis in parsed])
     gathered, _ = read_samples(bag, {topic: source}, time)
     samples = gathered[topic].samples(bag)
-    losses += bag.losses
+    losses = list(bag.losses)
     _check_means(losses, bag.counts[topic], len(samples.stamps))
-    return samples.stamps, samples.values * [sign for sign, _ in parsed]
+    return samples.stamps, samples.values * [sign for sign, _ in parsed], losses
 
 
 def _check_means(losses: list[str], count: int, samples: int) -> None:
