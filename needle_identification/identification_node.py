@@ -148,7 +148,6 @@ class IdentificationNode(BaseNode):
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
 
     def cleanup(self) -> None:
-        """Disconnect from the nodes of ``apply_to``."""
         self._calls.abandon()
         self._setters.clear()
 

@@ -46,13 +46,11 @@ _CLOCK_PERIOD: Final = 1_000_000  # shortest time between two messages on /clock
 _LATE: Final = 0.1  # delay that is reported [s]; less is normal on a busy machine
 _FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
 
+#: Last parts of the names of topics with requests of a user to the whole system.
+_REQUESTS: Final = (SYSTEM_STATE.name, EMERGENCY_STOP.name)
+
 #: QoS of the subscription of rclpy to /clock.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-def _requests(topic: str) -> bool:
-    """Return whether a topic has requests of a user to the whole system."""
-    return topic.rpartition('/')[2] in (SYSTEM_STATE.name, EMERGENCY_STOP.name)
 
 
 class PlayerNode(BaseNode):
@@ -137,7 +135,8 @@ class PlayerNode(BaseNode):
             listing = ', '.join(map(str, topics))
             raise RecordingError(f'{path} has no topic {", ".join(missing)}; it has {listing}')
         if '*' in words:
-            named |= {name for name in there if not (is_hidden(name) or _requests(name))}
+            requests = {name for name in there if name.rpartition('/')[2] in _REQUESTS}
+            named |= {name for name in there - requests if not is_hidden(name)}
         # This node publishes its own configuration.
         named.discard(self.resolve_topic_name('~/configuration'))
         if publishes:
@@ -165,7 +164,6 @@ class PlayerNode(BaseNode):
         self._playback.change(self.settings('', PlaybackSettings, changes))
 
     def activate(self) -> None:
-        """Play from the start."""
         self._playback.start(paused=bool(self.get_parameter('paused').value))
         self._reset_clock()
         self._played = 0
@@ -204,7 +202,6 @@ class PlayerNode(BaseNode):
             self.publish_diagnostics()
 
     def _play(self) -> None:
-        """Publish the messages that are due."""
         deadline = time.monotonic() + _LONGEST_BURST
         while self._playback.has_next:
             if not self._playback.is_due():

@@ -11,7 +11,6 @@ from needle_identification.stiffness.estimate import StiffnessEstimate, Stiffnes
 
 
 def live_statuses(found: Sequence[Statistic], samples: int) -> list[DiagnosticStatus]:
-    """Return one status per parameter identified from running topics."""
     return [_of_statistic(one, samples=samples, source='live') for one in found]
 
 

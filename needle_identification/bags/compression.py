@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from math import isfinite
 import os
 from pathlib import Path
@@ -39,15 +40,20 @@ _RECORDS: Final = 2**20  # records allowed for any file, else one per byte
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
 
-def open_file(file: Path, budget: Budget) -> Any:
+@contextmanager
+def open_file(file: Path, budget: Budget) -> Iterator[Any]:
     """Open the decompressed content of a file as a binary stream; count each byte read."""
+    stream: Any
     if file.suffix == '.lz4':
-        archive = lz4.frame.LZ4FrameFile(file)
+        stream = lz4.frame.LZ4FrameFile(file)
         # `read` would discard the last data of a truncated file.
-        archive.read = archive.read1
-        return _Metered(archive, budget)
-    stream = file.open('rb')
-    return _Metered(_zstd_stream(stream) if file.suffix in COMPRESSED else stream, budget)
+        stream.read = stream.read1
+    else:
+        stream = file.open('rb')
+        if file.suffix in COMPRESSED:
+            stream = _zstd_stream(stream)
+    with closing(stream):
+        yield _Metered(stream, budget)
 
 
 def read_up_to(stream: Any, length: int) -> bytes:
@@ -121,12 +127,6 @@ class Budget:
 class _Metered:
     def __init__(self, stream: Any, budget: Budget) -> None:
         self._stream, self._budget = stream, budget
-
-    def __enter__(self) -> _Metered:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._stream.close()
 
     def read(self, size: int) -> bytes:
         part: bytes = self._stream.read(size)

@@ -54,7 +54,6 @@ class _Channels:
         self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
 
     def define(self, opcode: int, record: bytes) -> None:
-        """Add a schema, channel or statistics record; ignore other records."""
         stream = ReadDataStream(BytesIO(record))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)

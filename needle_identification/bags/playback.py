@@ -66,7 +66,6 @@ class BagPlayback:
         return self._origin + round(self.settings.start * NANOSECONDS)
 
     def change(self, settings: PlaybackSettings) -> None:
-        """Change the rate during playback."""
         self._set_position(self.position)
         self.settings = settings
 

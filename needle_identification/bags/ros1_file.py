@@ -94,7 +94,6 @@ def _messages(reader: Reader, budget: Budget) -> Iterator[tuple[int, int, bytes]
 
 
 def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:
-    """Convert a message to ROS 2; return b'' if it is not readable."""
     try:
         return bytes(convert(data))
     except _DAMAGED:

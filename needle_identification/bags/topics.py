@@ -35,7 +35,6 @@ class OfferedQos(NamedTuple):
     liveliness_lease_duration: int = UNLIMITED  # longest time without a signal of the publisher
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the profile in the storage format of rosbag2."""
         times = {}
         for name in DURATIONS:
             sec, nsec = divmod(getattr(self, name), NANOSECONDS)

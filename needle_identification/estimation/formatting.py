@@ -45,7 +45,6 @@ def between(interval: tuple[float, float]) -> str:
 
 
 def _format(error: float) -> str:
-    """Return the format specification for two digits of the error."""
     if not _SMALLEST_ERROR < error < inf:
         return '.6g'
     return f'.{max(1 - floor(log10(error)), 0)}f'

@@ -84,7 +84,6 @@ class Screening:
         )
 
     def _scores(self, x: FloatArray, left: FloatArray) -> FloatArray:
-        """Return the sums of scores over each part."""
         return np.asarray(np.add.reduceat(x * left[:, np.newaxis], self._starts, axis=0))
 
     def _unknown(self, both: FloatArray, z: FloatArray) -> BoolArray:

@@ -113,7 +113,6 @@ def noise_bias(design: Design, fit: Regression) -> float:
 
 
 def noise_words(design: Design, bias: float) -> str:
-    """Describe the bias of mu_v [N s/m] by velocity noise."""
     noise = design.signals.velocity_noise
     return f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
 

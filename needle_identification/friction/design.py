@@ -142,7 +142,6 @@ class Design:
         )
 
     def check(self) -> None:
-        """Raise `IdentificationError` if the motion is too short or the force is constant."""
         signals = self.signals
         if not self.is_enough:
             needed = FEWEST_SAMPLES * independent_span(signals.correlation) * signals.period

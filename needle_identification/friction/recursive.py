@@ -321,7 +321,6 @@ class LiveFriction:
         return time
 
     def _pair(self) -> None:
-        """Process force samples up to the latest motion sample."""
         motion = self._motion
         while self._force and motion and motion[-1][0] >= self._force[0][0]:
             time, force = self._force.popleft()

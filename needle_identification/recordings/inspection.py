@@ -21,8 +21,8 @@ from needle_identification.steering.columns import (
     check_depth,
     is_inverted,
     steering_columns,
-    steering_names,
     STEERING_ROLES,
+    USUAL,
 )
 from needle_identification.steering.reading import JOINTS, read_steering_recording
 from needle_identification.stiffness.identify import identify_stiffness
@@ -106,7 +106,7 @@ def _table(path: Path) -> Inspection:
     table = read_table(path)
     roles = {
         role: with_unit(role, spec, table.columns.get(spec, np.empty(0)))
-        for role, spec in guessed(table).items()
+        for role, spec in guessed(table.columns).items()
     }
     columns = tuple(_column(name, values) for name, values in table.columns.items())
     count = len(next(iter(table.columns.values())))
@@ -213,7 +213,7 @@ def _bag(path: Path) -> Inspection:
 def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Return words and command for an insertion with a moved guide or a rotated needle."""
     joints = {one.axis: one for one in signals if one.topic.type_name == wire.JOINT_STATE}
-    found = {role: name for role, name in steering_names(joints).items() if role in JOINTS}
+    found = {role: name for role, name in guessed(joints, USUAL).items() if role in JOINTS}
     moved = [
         role for role, least in _STEERED.items()
         if role in found and np.ptp(joints[found[role]].values) > least

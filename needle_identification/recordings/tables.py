@@ -9,7 +9,7 @@ two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
@@ -124,7 +124,7 @@ def read_table(path: Path) -> Table:
 def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     """Read force and motion from a table; roles missing in `columns` are found by usual names."""
     table = read_table(path)
-    specs = {**guessed(table), **columns}
+    specs = {**guessed(table.columns), **columns}
     missing = [role for role in ('time', 'force') if role not in specs]
     if not {'depth', 'speed'} & set(specs):
         missing.append('depth or speed')
@@ -155,21 +155,23 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     )
 
 
-def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
-    """Find columns by role from usual names, in order of preference, lower case without signs."""
-    plain = {name: plain_name(name) for name in table.columns}
+def guessed(
+    names: Iterable[str], usual_names: Mapping[str, Sequence[str]] = _USUAL
+) -> dict[str, str]:
+    """Find names by role from usual names, in order of preference, lower case without signs."""
+    plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
         for word in usual:
-            names = [name for name, short in plain.items() if short == word]
-            names += [name for name, short in plain.items() if name.lower().endswith('.' + word)]
-            if names:
-                found[role] = names[0]
+            alike = [name for name, short in plain.items() if short == word]
+            alike += [name for name in plain if name.lower().endswith('.' + word)]
+            if alike:
+                found[role] = alike[0]
                 break
     pairs = [
         (sec, nanosec)
-        for sec in table.columns
-        for nanosec in table.columns
+        for sec in plain
+        for nanosec in plain
         if re.search(r'(?i)n(ano)?sec', nanosec)
         and re.sub(r'(?i)n(ano)?secs?', 'sec', nanosec) == re.sub(r'(?i)secs?', 'sec', sec)
         and sec != nanosec
@@ -329,7 +331,6 @@ def _text(path: Path) -> Table:
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
-    """Parse line by line; a non-numeric word is nan."""
     found, lost = array('d'), 0
     for line in islice(_lines(path), first, None):
         words = _split(line, separator)
@@ -352,7 +353,6 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _separator(line: str) -> str | None:
-    """Return the separator of columns; None for blanks."""
     return next((mark for mark in (';', '\t', ',') if mark in line), None)
 
 

@@ -122,7 +122,6 @@ def _check_count(one: SensorRecording, count: int) -> None:
 
 
 def _true(one: SensorRecording, time: FloatArray) -> FloatArray:
-    """Return the true position at times [s], (n, k)."""
     columns = [np.interp(time, one.true_time, column) for column in one.true_tip.T]
     return np.column_stack(columns)
 

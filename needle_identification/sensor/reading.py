@@ -136,7 +136,7 @@ def _positions(
         option = wanted.option.replace('_', '-')
         raise RecordingError(f'{path} is a table: name columns instead of --{option}')
     table = read_table(path)
-    specs, losses = {**guessed(table, _USUAL), **columns}, list(table.losses)
+    specs, losses = {**guessed(table.columns, _USUAL), **columns}, list(table.losses)
     roles = ['time', *(f'tip_{axis}' for axis in axes)]
     if missing := [role for role in roles if role not in specs]:
         option = '--truth-columns' if wanted is _TRUTH else '--columns'

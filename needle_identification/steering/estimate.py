@@ -80,5 +80,4 @@ class SteeringEstimate(DisplayedEstimate):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals, per axis [m]."""
         return float(np.sqrt(np.mean(np.concatenate(self.residuals) ** 2)))

@@ -74,5 +74,4 @@ def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int)
 
 
 def rms_of(errors: Sequence[FloatArray]) -> float:
-    """Return the root mean square of errors (n, 2), per axis [m]."""
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))

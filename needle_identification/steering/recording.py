@@ -64,7 +64,6 @@ class SteeringRecording(Displayed):
 
     @property
     def samples(self) -> int:
-        """Number of samples with a tip position."""
         return int(np.count_nonzero(self.known))
 
 

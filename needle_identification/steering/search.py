@@ -110,7 +110,6 @@ class Search:
         return r.guide[one.known].T, columns[:, one.known]
 
     def fits(self, x: FloatArray) -> list[Likelihood]:
-        """Return the fit of each medium."""
         return [self._part(k, *own) for k, own in enumerate(self.lengths(x))]
 
     def _fit(self, medium: int, free: float, length: float, skin: float) -> Likelihood:
@@ -214,7 +213,6 @@ class Search:
         return found
 
     def _starts(self) -> list[FloatArray]:
-        """Return the best point of a grid for each skin."""
         starts = []
         for skin in _SKINS:
             trials = []

@@ -150,7 +150,6 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
 def _deviation(
     residual: FloatArray, freedom: float, estimator: str
 ) -> tuple[float, float, FloatArray]:
-    """Return standard deviation, degrees of freedom, and used values of residuals."""
     # For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
     # reduces the degrees of freedom by 1.
     if estimator != 'huber':

@@ -102,14 +102,9 @@ def _steady_runs(
         taken[start : start + length] = True
         # Ends of ramps may add a trend to a hold.
         begin, end = _trimmed(scaled[start : start + length])
-        if _trend(scaled[start + begin : start + end, :2]) <= _STEADY_TREND:
+        if norm(_line(scaled[start + begin : start + end, :2])) <= _STEADY_TREND:
             found.append((int(start) + begin, end - begin))
     return sorted(found)
-
-
-def _trend(values: FloatArray) -> float:
-    """Return the size of the change of a fitted line from the first to the last row."""
-    return float(norm(_line(values)))
 
 
 def _line(values: FloatArray) -> FloatArray:

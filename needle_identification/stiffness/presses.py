@@ -122,7 +122,7 @@ def find_presses(
     )
     for array in (getattr(presses, name) for name in Presses.__slots__):
         array.setflags(write=False)
-    return presses, noise, [*_warnings(presses, plateaus, settings), *_of_memory(noise)]
+    return presses, noise, _warnings(presses, noise, plateaus, settings)
 
 
 def _fraction(change: FloatArray, displacement: FloatArray) -> float:
@@ -144,17 +144,9 @@ def _remaining(plateaus: Plateaus, displacement: FloatArray) -> float:
     return _fraction(after - after.mean(axis=0), displacement[follows])
 
 
-def _of_memory(noise: PressNoise) -> list[str]:
-    """Warn of creep and hysteresis, which the errors include."""
-    found = []
-    if noise.creep:
-        found.append(f'the displacement grows by {noise.creep:.1%} during a hold (creep)')
-    if noise.set:
-        found.append(f'{noise.set:.1%} of it remain at the next rest (hysteresis or creep)')
-    return [' and '.join(found) + ': the errors include it'] if found else []
-
-
-def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings) -> list[str]:
+def _warnings(
+    presses: Presses, noise: PressNoise, plateaus: Plateaus, settings: StiffnessSettings
+) -> list[str]:
     warnings = []
     if plateaus.missed:
         warnings.append(
@@ -170,6 +162,13 @@ def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings)
             warnings.append(
                 f'the {what} at rest drifted by {drift:.2g} {unit}; the drift was subtracted'
             )
+    memory = []
+    if noise.creep:
+        memory.append(f'the displacement grows by {noise.creep:.1%} during a hold (creep)')
+    if noise.set:
+        memory.append(f'{noise.set:.1%} of it remain at the next rest (hysteresis or creep)')
+    if memory:
+        warnings.append(f'{" and ".join(memory)}: the errors include it')
     return warnings
 
 
