@@ -7,9 +7,10 @@ from functools import partial
 import sys
 from typing import Any, ClassVar, Final
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.friction.estimate import FrictionSummary, summarize
+from needle_identification.estimation.formatting import measured
+from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary, summarize
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
@@ -19,8 +20,11 @@ from needle_identification.recordings.reading import (
     read_indentation_recording,
 )
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.status_node import live_statuses, sentence, summary_statuses
-from needle_identification.stiffness.estimate import StiffnessSummary, summarize_stiffness
+from needle_identification.stiffness.estimate import (
+    StiffnessEstimate,
+    StiffnessSummary,
+    summarize_stiffness,
+)
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_ros import contract
@@ -186,7 +190,7 @@ class IdentificationNode(BaseNode):
             if not samples:
                 message = f'no joint_states of {self._joint[1]} paired with base_wrench'
                 return Diagnosis(Severity.WARNING, message, status)
-            return Diagnosis(Severity.INFO, sentence(self._live_statistics()), status)
+            return Diagnosis(Severity.INFO, _sentence(self._live_statistics()), status)
         message = self._words if self._found else 'nothing identified yet'
         return Diagnosis(Severity.INFO, message, status)
 
@@ -235,8 +239,8 @@ class IdentificationNode(BaseNode):
         if output := self.text('output'):
             write(output)
         self._found = found
-        self._publish(publisher, summary_statuses(summary))
-        self._words = f'{sentence(found)} from {len(summary.estimates)} recordings'
+        self._publish(publisher, _summary_statuses(summary))
+        self._words = f'{_sentence(found)} from {len(summary.estimates)} recordings'
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
@@ -287,7 +291,7 @@ class IdentificationNode(BaseNode):
         if self._live is not None and found:
             if any(one.count for one in found):
                 self._found = found
-            self._publish(self._friction, live_statuses(found, self._live.samples))
+            self._publish(self._friction, _live_statuses(found, self._live.samples))
 
     # Parameters of running nodes.
 
@@ -343,6 +347,83 @@ def _answer_later(service: Service) -> None:
             send(response, header)
 
     service.send_response = send_later  # type: ignore[method-assign]
+
+
+def _live_statuses(found: Sequence[Statistic], samples: int) -> list[DiagnosticStatus]:
+    return [_of_statistic(one, samples=samples, source='live') for one in found]
+
+
+def _summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[DiagnosticStatus]:
+    """Return one status per parameter and force level, then one per recording."""
+    if isinstance(summary, FrictionSummary):
+        samples = sum(one.samples for one in summary.estimates)
+        statuses = [_of_statistic(one, samples=samples) for one in summary.statistics]
+        return [*statuses, *map(_of_friction, summary.estimates)]
+    statuses = [_of_statistic(summary.tissue_stiffness)]
+    for level in summary.levels:
+        at = f' at {level.force:.2f} N'
+        statuses += [_of_statistic(one, level=at) for one in level.statistics]
+    return [*statuses, *map(_of_stiffness, summary.estimates)]
+
+
+def _of_statistic(
+    one: Statistic, *, level: str = '', samples: int | None = None, source: str = 'recordings'
+) -> DiagnosticStatus:
+    values = {
+        'estimate': one.mean,
+        'interval_low': one.interval[0],
+        'interval_high': one.interval[1],
+        'unit': one.unit,
+        'standard_error': one.error,
+        'standard_deviation': one.deviation,
+        'recordings': one.count,
+        'samples': samples,
+    }
+    message = measured(one.mean, one.error, one.unit)
+    status = _status(f'{one.name}{level}', message, values, source)
+    status.level = DiagnosticStatus.OK if one.count else DiagnosticStatus.WARN
+    return status
+
+
+def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
+    parameters = (*estimate.parameters, estimate.breakaway, estimate.lag)
+    values = {
+        **{p.name: measured(p.value, p.error, p.unit) for p in parameters if p is not None},
+        'samples': estimate.samples,
+        'residual': estimate.residual,
+        'determination': estimate.determination,
+        'condition': estimate.condition,
+    }
+    return _status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
+
+
+def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:
+    worst = min(level.determination for level in estimate.levels)
+    values = {
+        'presses': sum(level.presses for level in estimate.levels),
+        'determination': worst,
+        'condition': max(level.condition for level in estimate.levels),
+        'off_plane': estimate.off_plane,
+        **{f'at {level.force:.2f} N': level.words for level in estimate.levels},
+    }
+    return _status(estimate.name, f'R^2 >= {worst:.4f}', values)
+
+
+def _status(
+    name: str, message: str, values: Mapping[str, object], source: str = ''
+) -> DiagnosticStatus:
+    """Return a status, without values that are None."""
+    return DiagnosticStatus(
+        name=name,
+        message=message,
+        hardware_id=source,
+        values=[KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None],
+    )
+
+
+def _sentence(found: Sequence[Statistic]) -> str:
+    """Format parameters in one line, such as ``mu_s = 0.5600 ± 0.0083 N, mu_v = ...``."""
+    return ', '.join(f'{one.symbol} = {measured(one.mean, one.error, one.unit)}' for one in found)
 
 
 if __name__ == '__main__':

@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import TypeVar
 
 from needle_identification.errors import IdentificationError
@@ -44,6 +44,17 @@ class Statistic:
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
+
+
+def estimated(
+    name: str, symbol: str, unit: str, value: float, error: float, interval: tuple[float, float]
+) -> ParameterEstimate:
+    """Return an estimate, determined if its value and its interval are finite."""
+    known = isfinite(value) and all(map(isfinite, interval))
+    return ParameterEstimate(
+        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=interval,
+        determined=known,
+    )  # fmt: skip
 
 
 def with_half_width(

@@ -32,9 +32,10 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation import check_estimator
+from needle_identification.estimation import ESTIMATORS
 from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import check_choice
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import convolve1d
@@ -174,7 +175,7 @@ def regress(
     [True, True]
 
     """
-    check_estimator(estimator)
+    check_choice('estimator', estimator, ESTIMATORS)
     x, y, used = _checked(regressors, response, used)
     samples, k = int(np.count_nonzero(used)), x.shape[1]
     span = independent_span(correlation)

@@ -167,11 +167,10 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
 
 def _holm(p_values: Sequence[float]) -> list[float]:
     """Correct p-values for multiple tests (Holm): controls the probability of any false alarm."""
-    corrected = np.ones(len(p_values))
-    largest = 0.0
-    for rank, k in enumerate(np.argsort(p_values)):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[k]))
-        corrected[k] = largest
+    order, factors = np.argsort(p_values), np.arange(len(p_values), 0, -1)
+    corrected = np.empty(len(p_values))
+    smallest = np.minimum(factors * np.array(p_values)[order], 1.0)
+    corrected[order] = np.maximum.accumulate(smallest)
     return corrected.tolist()
 
 

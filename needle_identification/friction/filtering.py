@@ -10,7 +10,7 @@ near a start, a stop or a reversal are left out later; see `design`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, e, sqrt
+from math import ceil, sqrt
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -20,7 +20,6 @@ from needle_identification.recordings.recording import Recording
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.ndimage import maximum_filter1d
-from scipy.special import lambertw
 
 if TYPE_CHECKING:
     # Takes a fifth of a second to import; only filtering a recording needs it.
@@ -142,19 +141,12 @@ def filter_taps(cutoff: float, period: float) -> FloatArray:
 
 
 def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
-    """Filter a signal by FFT of overlapping blocks, with constant extension at both ends."""
+    """Filter a signal by FFT, with constant extension at both ends."""
     padded = np.pad(signal, len(taps) // 2, mode='edge')
-    overlap = len(taps) - 1
-    # The size with the fewest operations per sample.
-    size = next_fast_len(ceil(-overlap * lambertw(-1.0 / (2.0 * e * overlap), k=-1).real))
-    step = size - overlap
-    if max(size, 2 * len(taps)) >= len(padded):
-        size, step = next_fast_len(len(padded) + overlap, real=True), len(padded)
-    count = ceil((len(padded) + overlap) / step)
-    blocks = np.pad(padded, (0, count * step - len(padded))).reshape(count, step)
-    parts = np.fft.irfft(np.fft.rfft(blocks, size) * np.fft.rfft(taps, size), size)
-    parts[1:, :overlap] += parts[:-1, step : step + overlap]
-    return np.asarray(parts[:, :step].ravel()[overlap : len(padded)])
+    size = next_fast_len(len(padded), real=True)
+    found = np.fft.irfft(np.fft.rfft(padded, size) * np.fft.rfft(taps, size), size)
+    # The first values contain the end of the signal.
+    return np.asarray(found[len(taps) - 1 : len(padded)])
 
 
 def _filtered_velocity(

@@ -15,7 +15,7 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import estimated, ParameterEstimate
 from needle_identification.recordings.samples import are_gaps
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.losses import binomial_interval, fit_losses
@@ -86,30 +86,26 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     _check_count(one, int(np.count_nonzero(kept)))
     time, tip = time[kept], one.tip[usable][kept]
     fit, delay = _fit(one, time, tip, delay)
-    losses = fit_losses(one.time)
-    period = float(np.median(np.diff(one.time)))
-    duration = float(time[-1] - time[0])
-    count = int(np.count_nonzero(far))
-    outliers = count / len(far)
-    low, high = binomial_interval(count, len(far))
+    dropout, dropout_time = fit_losses(one.time)
+    duration, count = float(time[-1] - time[0]), int(np.count_nonzero(far))
+    fraction, error = count / len(far), sqrt(count) / len(far)
+    between = binomial_interval(count, len(far))
     parameters = (
         *_noise(fit),
         *_biases(one, fit),
         _delay(one, fit, delay),
-        _known('outliers', 'p_o', '1', outliers, sqrt(outliers / len(far)), (low, high)),
-        _known('dropout', 'p', '1', losses.fraction, losses.error, losses.fraction_interval),
-        _known(
-            'dropout_time', 'T', 's', losses.time, losses.time_error, losses.time_interval
-        ),
-    )  # fmt: skip
+        estimated('outliers', 'p_o', '1', fraction, error, between),
+        dropout,
+        dropout_time,
+    )
     return SensorEstimate(
         name=one.name,
         axes=one.axes,
         parameters=parameters,
-        rate=1.0 / period,
+        rate=1.0 / float(np.median(np.diff(one.time))),
         samples=len(one.time),
         duration=duration,
-        warnings=tuple(_warnings(fit, duration, isfinite(losses.fraction))),
+        warnings=tuple(_warnings(fit, duration, isfinite(dropout.value))),
     )
 
 
@@ -219,15 +215,6 @@ def _fit(
     return linearized(delay).best(), delay
 
 
-def _known(
-    name: str, symbol: str, unit: str, value: float, error: float, interval: tuple[float, float]
-) -> ParameterEstimate:
-    return ParameterEstimate(
-        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=interval,
-        determined=isfinite(value) and all(map(isfinite, interval)),
-    )  # fmt: skip
-
-
 def _noise(fit: NoiseFit) -> Iterator[ParameterEstimate]:
     """Return the deviations of white and slow noise, and the correlation time."""
     spread, is_slow = fit.spread, fit.log_ratio > -inf
@@ -241,7 +228,7 @@ def _noise(fit: NoiseFit) -> Iterator[ParameterEstimate]:
     for name, symbol, unit, logarithm, variance in values:
         value, known = exp(logarithm), isfinite(variance) and variance < 1.0
         interval = log_interval(logarithm, variance) if known else (-inf, inf)
-        yield _known(name, symbol, unit, value, value * sqrt(variance), interval)
+        yield estimated(name, symbol, unit, value, value * sqrt(variance), interval)
     if not is_slow:
         yield ParameterEstimate(name='slow_noise', symbol='s_s', unit='m')
         yield ParameterEstimate(name='slow_time', symbol='tau', unit='s')
@@ -256,7 +243,7 @@ def _biases(one: SensorRecording, fit: NoiseFit) -> Iterator[ParameterEstimate]:
     ):
         error = sqrt(variance)
         interval = value - quantile * error, value + quantile * error
-        yield _known(f'bias_{axis}', f'b_{axis}', 'm', value, error, interval)
+        yield estimated(f'bias_{axis}', f'b_{axis}', 'm', value, error, interval)
 
 
 def _delay(one: SensorRecording, fit: NoiseFit, delay: float) -> ParameterEstimate:
@@ -266,7 +253,7 @@ def _delay(one: SensorRecording, fit: NoiseFit, delay: float) -> ParameterEstima
         noise = exp(fit.log_noise) * sqrt(1.0 + exp(fit.log_ratio))
         clear = sqrt(float(one.true_tip.var(axis=0).mean())) > _CLEAR * noise
         if clear and error < _VAGUE and _DELAYS[0] < low < high < _DELAYS[1]:
-            return _known('delay', 'D', 's', delay, error, (low, high))
+            return estimated('delay', 'D', 's', delay, error, (low, high))
     return ParameterEstimate(name='delay', symbol='D', unit='s')
 
 

@@ -99,7 +99,7 @@ def read_steering_recording(
         for option, given in (('--tip-topic', tip_topic), ('--motion-topic', motion_topic)):
             if given is not None:
                 raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
-        return read_steering_table(path, columns, medium)
+        return _of_table(path, columns, medium)
     bag = Bag(path)
     topics = bag.topics()
     tip = chosen_topic(bag, topics, _TIP, tip_topic)
@@ -131,15 +131,8 @@ def read_steering_recording(
     return recorded_insertion(path, medium, values, losses)
 
 
-def read_steering_table(
-    path: Path | str, columns: Mapping[str, str], medium: str = ''
-) -> SteeringRecording:
-    """
-    Read an insertion from a table; roles missing in ``columns`` are found by names and values.
-
-    Rows without a new measurement of the guide are left out.
-    """
-    path = Path(path)
+def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRecording:
+    """Read a table; roles missing in ``columns`` are found by names and values."""
     table = read_table(path)
     specs = steering_columns(table, columns)
     specs = {role: specs[role] for role in STEERING_ROLES if role in specs}

@@ -3,12 +3,12 @@
 
 from dataclasses import dataclass
 
-from needle_identification.estimation import check_estimator
-from needle_ros.settings import check_constants, constant
+from needle_identification.estimation import ESTIMATORS
+from needle_ros.settings import CheckedSettings, choice, constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StiffnessSettings:
+class StiffnessSettings(CheckedSettings):
     """
     Settings of `identify_stiffness`; fields describe meaning and unit.
 
@@ -33,8 +33,4 @@ class StiffnessSettings:
     largest_asymmetry: float = constant(
         0.1, '1', 'antisymmetric part over symmetric up to which it counts as a spring'
     )
-    estimator: str = 'ordinary'
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        check_estimator(self.estimator)
+    estimator: str = choice('ordinary', ESTIMATORS)
