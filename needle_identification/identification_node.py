@@ -303,11 +303,8 @@ class IdentificationNode(BaseNode):
         if not values:
             response.message = 'nothing identified yet that plant and controller can use'
             return response
-        request = SetParameters.Request(
-            parameters=[
-                Parameter(name, value=one).to_parameter_msg() for name, one in values.items()
-            ]
-        )
+        parameters = [Parameter(name, value=one) for name, one in values.items()]
+        request = SetParameters.Request(parameters=[one.to_parameter_msg() for one in parameters])
         answers = {
             name: self._calls.call(client, request) if client.service_is_ready() else None
             for name, client in self._setters.items()
@@ -413,12 +410,8 @@ def _status(
     name: str, message: str, values: Mapping[str, object], source: str = ''
 ) -> DiagnosticStatus:
     """Return a status, without values that are None."""
-    return DiagnosticStatus(
-        name=name,
-        message=message,
-        hardware_id=source,
-        values=[KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None],
-    )
+    pairs = [KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None]
+    return DiagnosticStatus(name=name, message=message, hardware_id=source, values=pairs)
 
 
 def _sentence(found: Sequence[Statistic]) -> str:

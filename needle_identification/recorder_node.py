@@ -100,11 +100,7 @@ class RecorderNode(BaseNode):
 
     def cleanup(self) -> None:
         """Complete the bag after an error; otherwise it is complete already."""
-        if self._bag is not None:
-            self._end(self._bag)
-
-    def activate(self) -> None:
-        self._begin()
+        self.deactivate()
 
     def deactivate(self) -> None:
         if self._bag is not None:
@@ -113,14 +109,10 @@ class RecorderNode(BaseNode):
     def diagnose(self) -> Diagnosis[RecorderStatus]:
         if self._bag is None:
             return Diagnosis(Severity.INFO, 'not recording', RecorderStatus())
+        path, size = str(self._bag.path), self._bag.size
         counts, lost = dict(self._bag.counts), dict(self._bag.lost)
-        status = RecorderStatus(
-            path=str(self._bag.path),
-            messages=sum(counts.values()),
-            size=self._bag.size,
-            recorded=counts,
-            lost=lost,
-        )
+        number = sum(counts.values())
+        status = RecorderStatus(path=path, messages=number, size=size, recorded=counts, lost=lost)
         what = f'recording to {self._bag.path}'
         if lost:
             return Diagnosis(Severity.WARNING, f'{what}; lost {described(lost)}', status)
@@ -134,7 +126,7 @@ class RecorderNode(BaseNode):
             if not self.is_active:
                 raise RecordingError('not active')
             if self._bag is None:
-                self._begin()
+                self.activate()
             response.success, response.message = True, self.diagnose().message
         except RecordingError as error:
             response.message = str(error)
@@ -150,7 +142,8 @@ class RecorderNode(BaseNode):
 
     # Recording.
 
-    def _begin(self) -> None:
+    def activate(self) -> None:
+        """Start a recording."""
         number = self._recordings + 1
         path = self._path.with_name(f'{self._path.name}_{number}') if number > 1 else self._path
         self._bag = BagWriter(path, self._compression)

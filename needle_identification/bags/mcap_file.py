@@ -61,14 +61,10 @@ class _Channels:
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
             schema = self._schemas[channel.schema_id]
-            self.topics[channel.id] = make_topic(
-                channel.topic,
-                schema.name,
-                channel.message_encoding,
-                schema.encoding,
-                schema.data.decode(errors='replace'),
-                channel.metadata.get('offered_qos_profiles', ''),
-            )
+            definition = schema.data.decode(errors='replace')
+            profiles = channel.metadata.get('offered_qos_profiles', '')
+            own = channel.topic, schema.name, channel.message_encoding
+            self.topics[channel.id] = make_topic(*own, schema.encoding, definition, profiles)
         elif opcode == Opcode.STATISTICS:
             self.counts = Statistics.read(stream).channel_message_counts
 

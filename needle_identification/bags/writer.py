@@ -106,12 +106,9 @@ class BagWriter:
                 type_name, 'ros2msg', definition.encode()
             )
         profiles = [qos.as_mapping() for qos in offered]
-        self._channels[topic] = self._writer.register_channel(
-            topic,
-            'cdr',
-            self._schemas[type_name],
-            {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash},
-        )
+        about = {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash}
+        schema = self._schemas[type_name]
+        self._channels[topic] = self._writer.register_channel(topic, 'cdr', schema, about)
         self.counts.setdefault(topic, 0)
         self._topics[topic] = {
             'name': topic,

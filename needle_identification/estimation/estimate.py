@@ -96,11 +96,7 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     error = sqrt(max(within, between) / count)
     half_width = error * (float(stdtrit(count - 1, 0.975)) if between > within else 2.0)
     mean = float(values.mean())
+    ends = mean - half_width, mean + half_width
     return replace(
-        unknown,
-        mean=mean,
-        deviation=deviation,
-        error=error,
-        interval=(mean - half_width, mean + half_width),
-        count=count,
+        unknown, mean=mean, deviation=deviation, error=error, interval=ends, count=count
     )

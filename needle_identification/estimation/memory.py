@@ -183,12 +183,8 @@ def memory_of(
         deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
     white, found = np.sqrt(left[0] / free * plain), np.array(deviations)
-    return Memory(
-        inflation=_growth(weights[counts], found, white, 0.05),
-        far=_growth(weights[counts], found, white, 0.004),
-        length=length,
-        ratio=ratio,
-    )
+    usual, far = (_growth(weights[counts], found, white, outside) for outside in (0.05, 0.004))
+    return Memory(inflation=usual, far=far, length=length, ratio=ratio)
 
 
 def _spread_out(count: int) -> IntArray:

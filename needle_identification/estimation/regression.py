@@ -210,13 +210,8 @@ def regress(
     # variance (Satterthwaite).
     influence = solution.influence @ (back @ solution.inverse).T
     shares = influence**2
-    variance_of_shares = np.diag(score_covariance(shares, correlation))
-    behind = np.divide(
-        shares.sum(axis=0) ** 2,
-        variance_of_shares,
-        out=np.ones_like(variance_of_shares),
-        where=variance_of_shares > 0,
-    )
+    total, spread = shares.sum(axis=0), np.diag(score_covariance(shares, correlation))
+    behind = np.divide(total**2, spread, out=np.ones_like(spread), where=spread > 0)
     values = back @ solution.values
     covariance = back @ (solution.inverse @ middle @ solution.inverse.T) @ back.T
     memory = None

@@ -79,12 +79,9 @@ def _push(
     if last - first < correlation:
         return None
     elapsed = signals.time[first:last] - onset
+    columns = np.column_stack([np.ones_like(elapsed), elapsed])
     try:
-        line = regress(
-            np.column_stack([np.ones_like(elapsed), elapsed]),
-            signals.force[first:last],
-            correlation=correlation,
-        )
+        line = regress(columns, signals.force[first:last], correlation=correlation)
     except IdentificationError:
         return None
     value, slope = sign * line.values

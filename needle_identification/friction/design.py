@@ -78,13 +78,10 @@ class Design:
     def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
         """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
-        motion = NeedleMotion(
-            self.velocity - later * self.acceleration,
-            self.acceleration,
-            signals.time - signals.time[0],
-            self.depth - later * self.velocity,
-            self.fresh,
-        )
+        velocity = self.velocity - later * self.acceleration
+        depth = self.depth - later * self.velocity
+        time = signals.time - signals.time[0]
+        motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh)
         return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:

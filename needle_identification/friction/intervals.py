@@ -29,12 +29,10 @@ def parameter_estimates(
     for k, column in enumerate(columns):
         parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
         if fit.determined[k]:
+            value, error = float(fit.values[k]), float(fit.errors[k])
+            low, high = intervals[k].tolist()
             parameter = replace(
-                parameter,
-                value=float(fit.values[k]),
-                error=float(fit.errors[k]),
-                interval=(float(intervals[k, 0]), float(intervals[k, 1])),
-                determined=True,
+                parameter, value=value, error=error, interval=(low, high), determined=True
             )
         found.append(parameter)
     if 'moving_mass' in at and 'viscous_friction' in at:

@@ -86,13 +86,9 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
-    motion = NeedleMotion(
-        velocity[moving],
-        acceleration[moving],
-        time[moving] - time[0],
-        np.interp(then[moving], signals.time, signals.depth),
-        np.zeros(np.count_nonzero(moving), dtype=np.bool_),
-    )
+    depth = np.interp(then[moving], signals.time, signals.depth)
+    since, fresh = time[moving] - time[0], np.zeros(len(depth), dtype=np.bool_)
+    motion = NeedleMotion(velocity[moving], acceleration[moving], since, depth, fresh)
     x = regressors(motion, settings.terms, settings)
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))

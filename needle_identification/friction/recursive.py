@@ -89,12 +89,10 @@ class RecursiveFriction:
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
         length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
-        self._information = _Information(
-            len(columns_of(settings.terms, settings)) + self._estimates_lag,
-            exp(-self._period / forgetting),
-            length,
-            ceil(_REMEMBERED * forgetting * rate / length),
-        )
+        count = len(columns_of(settings.terms, settings)) + self._estimates_lag
+        blocks = ceil(_REMEMBERED * forgetting * rate / length)
+        decay = exp(-self._period / forgetting)
+        self._information = _Information(count, decay, length, blocks)
         self._speed_sum = self._weight = 0.0
         self._time = -inf
         self._regime = 0.0

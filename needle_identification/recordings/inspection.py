@@ -14,7 +14,11 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import first_names, read_indentation_recording
+from needle_identification.recordings.reading import (
+    first_names,
+    MOTIONS,
+    read_indentation_recording,
+)
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES, with_unit
 from needle_identification.steering.columns import (
@@ -31,10 +35,7 @@ from needle_ros.axes import AXES
 from needle_ros.errors import NeedleError
 import numpy as np
 
-#: Message types of motions and of forces.
-_MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
-_FORCE: Final = (wire.WRENCH,)
-
+_FORCE: Final = (wire.WRENCH,)  # message types of forces
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
 _MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
 _EXPLAINED: Final = 0.3  # smallest part of a force that is like friction
@@ -157,7 +158,7 @@ class _Signal(NamedTuple):
 
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
-    topics = [topic for topic in bag.topics() if topic.type_name in (*_MOTION, *_FORCE)]
+    topics = [topic for topic in bag.topics() if topic.type_name in (*MOTIONS, *_FORCE)]
     read: dict[BagTopic, list[str]] = {}
     gathered: dict[BagTopic, Gathering] = {}
     for topic in topics:
@@ -184,12 +185,9 @@ def _bag(path: Path) -> Inspection:
                 losses += bag.losses
                 columns = dict(zip(read[topic], samples.values.T, strict=True))
                 steps = np.diff(samples.stamps)
-                content = replace(
-                    content,
-                    rate=float(1e9 / np.median(steps)),
-                    gaps=int(np.count_nonzero(are_gaps(steps))),
-                    columns=tuple(_column(axis, values) for axis, values in columns.items()),
-                )
+                rate, gaps = 1e9 / np.median(steps), np.count_nonzero(are_gaps(steps))
+                found = tuple(_column(axis, values) for axis, values in columns.items())
+                content = replace(content, rate=float(rate), gaps=int(gaps), columns=found)
                 signals += [
                     _Signal(topic, axis, samples.stamps, values)
                     for axis, values in columns.items()
@@ -239,7 +237,7 @@ def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Find the pair of force and motion that is most similar to friction."""
     forces = [one for one in signals if one.topic.type_name in _FORCE]
-    motions = [one for one in signals if one.topic.type_name in _MOTION]
+    motions = [one for one in signals if one.topic.type_name in MOTIONS]
     pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
     best = max(pairs, key=lambda pair: pair[0], default=None)
     if best is None or best[0] < _EXPLAINED:

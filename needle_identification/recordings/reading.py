@@ -35,6 +35,10 @@ from needle_ros.errors import MessageError, ParameterError
 _FIRST: Final = 50  # number of messages that are read for joint names
 
 
+#: Message types of the motion of a needle.
+MOTIONS: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
+
+
 class Wanted(NamedTuple):
     """Criteria for a topic: its option, valid types, and usual last names."""
 
@@ -44,16 +48,10 @@ class Wanted(NamedTuple):
 
 
 _WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
-_FRICTION_MOTION: Final = Wanted(
-    'motion_topic',
-    (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY),
-    (JOINT_STATES.name, END_EFFECTOR_POSE.name),
-)
-_INDENTATION_MOTION: Final = Wanted(
-    'motion_topic',
-    (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE),
-    (END_EFFECTOR_POSE.name, JOINT_STATES.name),
-)
+_POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
+_USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
+_FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])
+_INDENTATION_MOTION: Final = Wanted('motion_topic', _POSES, _USUAL)
 
 
 def read_friction_recording(

@@ -156,16 +156,11 @@ def summarize_stiffness(
     summaries = []
     for number in range(int(group.max()) + 1):
         members = [level for level, of in zip(levels, group, strict=True) if of == number]
-        summaries.append(
-            LevelSummary(
-                force=float(np.mean([level.force for level in members])),
-                statistics=tuple(
-                    statistic([level[name] for level in members])
-                    for name in (*ENTRIES, 'curl', 'tissue_stiffness')
-                ),
-                prediction=predicted([level.moments for level in members]),
-            )
-        )
+        mean = float(np.mean([level.force for level in members]))
+        names = (*ENTRIES, 'curl', 'tissue_stiffness')
+        found = tuple(statistic([level[name] for level in members]) for name in names)
+        prediction = predicted([level.moments for level in members])
+        summaries.append(LevelSummary(force=mean, statistics=found, prediction=prediction))
     chosen = summaries[-1]
     if force is not None:
         chosen = min(summaries, key=lambda summary: abs(summary.force - force))

@@ -116,7 +116,7 @@ def identify_stiffness(
 def _level(
     presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
-    k_zz = float(fit.matrix[1, 1])
+    k_zz, length = float(fit.matrix[1, 1]), settings.contact_length
     curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
     first, second, angle = principal_estimates(fit)
     force = presses.force[chosen]
@@ -138,11 +138,7 @@ def _level(
         principal=(first, second),
         angle=angle,
         tissue_stiffness=fit.derived(
-            'tissue_stiffness',
-            'k_a',
-            'N/m^2',
-            k_zz / settings.contact_length,
-            units[3] / settings.contact_length,
+            'tissue_stiffness', 'k_a', 'N/m^2', k_zz / length, units[3] / length
         ),
         presses=len(force),
         directions=len(np.unique(presses.direction[chosen])),

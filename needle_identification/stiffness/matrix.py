@@ -112,17 +112,14 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
     residual = np.empty_like(force)
     freedom = float(len(chosen) - len(columns))
     freedoms = [freedom, freedom]
-    whitened = []
+    # Weights are in the covariances.
+    kind = 'ordinary' if estimator == 'weighted' else estimator
+    spread, whitened = np.full(len(columns), error / sqrt(len(chosen))), []
     for row, covariance in enumerate(covariances):
         size = float(np.mean(np.diag(covariance)))
         root = np.linalg.cholesky(covariance / size)
         x, y = (solve_triangular(root, a, lower=True) for a in (displacement, force[:, row]))
-        fit = regress(
-            x,
-            y,
-            estimator='ordinary' if estimator == 'weighted' else estimator,
-            regressor_noise=np.full(len(columns), error / sqrt(len(chosen))),
-        )
+        fit = regress(x, y, estimator=kind, regressor_noise=spread)
         deviation, freedoms[row], left = _deviation(fit.residual, freedom, estimator)
         matrix[row, columns] = fit.values
         known[columns] &= fit.determined
@@ -179,24 +176,16 @@ def principal_estimates(
     differ = fit.known.all() and _differ(fit, np.array([half, shear]), stretch, slide)
     found = []
     for number, sign in ((1, 1.0), (2, -1.0)):
-        one = fit.derived(
-            f'principal_stiffness_{number}',
-            f'k_{number}',
-            'N/m',
-            mean + sign * radius,
-            np.eye(2) / 2.0 + sign * outward,
-        )
+        name, value = f'principal_stiffness_{number}', mean + sign * radius
+        gradient = np.eye(2) / 2.0 + sign * outward
+        one = fit.derived(name, f'k_{number}', 'N/m', value, gradient)
         if one.determined and not differ:
             ends = (*one.interval, *middle.interval)
             one = replace(one, interval=(min(ends), max(ends)))
         found.append(one)
-    angle = fit.derived(
-        'principal_angle',
-        'phi',
-        'rad',
-        atan2(shear, half) / 2.0 if differ else nan,
-        around / (2.0 * (radius or 1.0)),
-    )
+    direction, gradient = atan2(shear, half) / 2.0, around / (2.0 * (radius or 1.0))
+    direction = direction if differ else nan
+    angle = fit.derived('principal_angle', 'phi', 'rad', direction, gradient)
     return found[0], found[1], angle
 
 

@@ -68,14 +68,13 @@ class PressNoise(NamedTuple):
                 np.maximum(a, 0.1 * a.mean(axis=0)) for a in (force, displacement)
             )
         among = np.ix_(chosen, chosen)
-        return np.array(
-            [
-                np.diag(force[:, row] + displacement @ squares[row])
-                + self.force_zero[among]
-                + squares[row].sum() * self.displacement_zero[among]
-                for row in range(2)
-            ]
-        )
+        rows = [
+            np.diag(force[:, row] + displacement @ squares[row])
+            + self.force_zero[among]
+            + squares[row].sum() * self.displacement_zero[among]
+            for row in range(2)
+        ]
+        return np.array(rows)
 
 
 def find_presses(
@@ -93,12 +92,8 @@ def find_presses(
     change = np.empty((len(time), 5))
     covariances = []
     for channels in (slice(0, 2), slice(2, 4), slice(4, 5)):
-        zero, covariance = _follow_zero(
-            plateaus.time[rest],
-            plateaus.mean[rest, channels],
-            plateaus.variance[rest, channels].mean(axis=1),
-            time,
-        )
+        mean, variance = plateaus.mean[rest, channels], plateaus.variance[rest, channels]
+        zero, covariance = _follow_zero(plateaus.time[rest], mean, variance.mean(axis=1), time)
         change[:, channels] = plateaus.mean[hold, channels] - zero
         covariances.append(covariance)
     force, displacement = change[:, :2], change[:, 2:4]
