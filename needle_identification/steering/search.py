@@ -241,10 +241,8 @@ def interval(
     alike = [one for one in optima if one.deviance - optima[0].deviance <= rise]
     level = optima[0].deviance + rise
     alike.sort(key=lambda one: float(one.x[k]))
-    return (
-        _end(search, optima, alike[0], k, -1.0, level),
-        _end(search, optima, alike[-1], k, 1.0, level),
-    )
+    low = _end(search, optima, alike[0], k, -1.0, level)
+    return low, _end(search, optima, alike[-1], k, 1.0, level)
 
 
 def _end(

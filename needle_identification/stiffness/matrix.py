@@ -43,16 +43,17 @@ _CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])  # gradient of k_zx - k_xz by
 
 
 class MatrixFit(NamedTuple):
-    """Stiffness matrix with errors."""
+    """Stiffness matrix with errors; by default undetermined."""
 
-    matrix: FloatArray  # (2, 2) K [N/m]; undetermined columns are nan
-    known: BoolArray  # (2,) columns that the presses determine
-    factors: FloatArray  # (2, 2, 2) A; R_rs A_r A_s^T is the covariance of rows r, s of K
-    correlation: FloatArray  # (2, 2) R, of the residuals of the rows
-    degrees_of_freedom: float  # of each row
-    residual: FloatArray  # (m, 2) force minus K d [N]
-    scatter: float  # of the presses about the matrix over their noise [1]
-    condition: float  # of the displacements
+    matrix: FloatArray = np.full((2, 2), nan)  # K [N/m]; undetermined columns are nan
+    known: BoolArray = np.zeros(2, dtype=np.bool_)  # (2,) columns that the presses determine
+    #: R_rs A_r A_s^T is the covariance of rows r, s of K; R is that of the residuals of the rows.
+    factors: FloatArray = np.zeros((2, 2, 2))
+    correlation: FloatArray = np.eye(2)
+    degrees_of_freedom: float = 0.0  # of each row
+    residual: FloatArray = np.zeros((1, 2))  # (m, 2) force minus K d [N]
+    scatter: float = 0.0  # of the presses about the matrix over their noise [1]
+    condition: float = inf  # of the displacements
     systematic: float = 0.0  # relative error of the whole matrix by creep and hysteresis
 
     def derived(
@@ -80,29 +81,17 @@ class MatrixFit(NamedTuple):
         return variance, freedom * variance**2 / squares if squares > 0.0 else freedom
 
 
-_UNKNOWN: Final = MatrixFit(
-    matrix=np.full((2, 2), nan),
-    known=np.zeros(2, dtype=np.bool_),
-    factors=np.zeros((2, 2, 2)),
-    correlation=np.eye(2),
-    degrees_of_freedom=0.0,
-    residual=np.zeros((1, 2)),
-    scatter=0.0,
-    condition=inf,
-)
-
-
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """Solve F = K d over the presses ``chosen`` (m,), with errors from their scatter."""
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
     if len(chosen) < _FEWEST_PRESSES:
-        return _UNKNOWN
+        return MatrixFit()
     columns = np.flatnonzero(norm(displacement, axis=0) > _LARGEST_NOISE * error)
     singular = np.linalg.svd(displacement[:, columns], compute_uv=False)
     if not len(columns) or singular[-1] < _SMALLEST_SPREAD * error:
         condition = float(singular[0] / singular[-1]) if len(columns) else inf
-        return _UNKNOWN._replace(condition=condition)
+        return MatrixFit(condition=condition)
     displacement = displacement[:, columns]
     start = np.zeros((2, 2))
     start[:, columns] = np.linalg.lstsq(displacement, force, rcond=None)[0].T
