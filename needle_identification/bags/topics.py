@@ -49,7 +49,7 @@ def _stored(profile: Mapping[str, Any]) -> OfferedQos:
         for name, known in WORDS.items()
         if name in profile or name != 'liveliness'
     }
-    times = {name: _nanoseconds(profile.get(name)) for name in DURATIONS}
+    times: dict[str, Any] = {name: _nanoseconds(profile.get(name)) for name in DURATIONS}
     return OfferedQos(depth=int(profile['depth']), **words, **times)
 
 

@@ -333,7 +333,7 @@ def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArr
 def _window(length: int) -> FloatArray:
     """Return a triangular window that rises to at most one in the middle, shape (length,)."""
     whole = length + length % 2
-    return (whole - np.abs(2.0 * np.arange(length) - (length - 1.0))) / whole
+    return np.asarray((whole - np.abs(2.0 * np.arange(length) - (length - 1.0))) / whole)
 
 
 def independent_span(correlation: int) -> float:
