@@ -127,8 +127,7 @@ def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
     """Estimate the autocorrelation of noise from the residuals (n,); white with too few parts."""
-    # Influence (n, k): change of each parameter with the response of each sample. Regressors and
-    # influence are zero for unused samples.
+    # Influence (n, k): change of each parameter by each sample; zero for unused samples.
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
     x = x[:, strengths > _ROUNDING * strengths[0]]
@@ -144,8 +143,7 @@ def memory_of(
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Time 0: white noise with a ratio of
-    # differences, the first without.
+    # Time and ratio; log|V|; (x, r)' V^-1 (x, r). Time 0: white, with a ratio of differences.
     models, sizes, products = [], [], []
     for ratio in (0.0, *_DIFFERENCES.tolist()):
         d, e, _ = dpttrf(own + ratio, _shared(time[some], parts.length) * ratio)

@@ -206,8 +206,7 @@ def regress(
     residual = y - x @ solution.values
     # The fit uses one degree of freedom per parameter.
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
-    # Effective number of samples behind each parameter, from the share of each sample in its
-    # variance (Satterthwaite).
+    # Effective number of samples behind each parameter, from their shares (Satterthwaite).
     influence = solution.influence @ (back @ solution.inverse).T
     shares = influence**2
     total, spread = shares.sum(axis=0), np.diag(score_covariance(shares, correlation))
@@ -270,8 +269,7 @@ def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
     """Weight each sample by the inverse of the noise variance about the mean of its group."""
-    # The noise of all groups enters with the weight of a few correlation windows, because a group
-    # of few samples may have a small variance by chance.
+    # The noise of all groups enters: few samples may have a small variance by chance.
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
     residual = y - x @ _weighted(x, y, used.astype(np.float64)).values

@@ -29,12 +29,9 @@ class CandidateFit:
     terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
     criterion: str = 'BIC'  #: with the effective number of samples
     difference: float = nan  #: BIC minus BIC of the chosen set; nan: not determined
-    #: Of the Wald test that the differing terms are zero, with errors for autocorrelated noise,
-    #: corrected for the number of terms tried (Holm).
+    #: Of the Wald test that the differing terms are zero, for the number of terms tried (Holm).
     p_value: float = 1.0
-    #: Whether the data support the set; an additional term must also improve the prediction of
-    #: held-out samples.
-    supported: bool = False
+    supported: bool = False  #: by the data; an additional term must also predict better
     words: str  #: result as a sentence
 
 
@@ -92,8 +89,7 @@ class _Comparison(NamedTuple):
         if not trial.determined or trial.p_value >= SIGNIFICANCE:
             return trial
         which = list(range(design.terms, design.terms + len(trial.values)))
-        # Autocorrelated noise resembles many terms. The chosen terms remain valid if the samples
-        # do not suffice for an additional parameter.
+        # Autocorrelated noise resembles many terms. Too few samples determine no other term.
         with suppress(IdentificationError):
             other = design.solve((*settings.terms, *more), settings.estimator)
             if other.determined[which].all():

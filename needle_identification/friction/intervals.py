@@ -38,8 +38,7 @@ def parameter_estimates(
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:
-            # The stamps of force and motion differ by up to a period: the lag resembles a mass,
-            # uniform within +- ``largest`` [kg].
+            # Stamps differ by up to a period, which resembles a mass within +- largest [kg].
             largest = viscous.value * period
             error = hypot(mass.error, largest / sqrt(3.0))
             low, high = mass.interval

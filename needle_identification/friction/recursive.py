@@ -233,8 +233,7 @@ class _Information:
             total**2, (even**2).sum(axis=1), out=np.ones(len(total)), where=total > 0
         )
         effective = float(ages.sum() ** 2 / (ages @ ages))
-        # Correlation between blocks increases the errors (Newey and West), but does not reduce
-        # them.
+        # Correlation between blocks only increases the errors (Newey and West).
         changes = scores @ inverse
         plain = colored = (changes**2).sum(axis=0)
         for lag in range(1, min(_LAGS + 1, len(changes))):

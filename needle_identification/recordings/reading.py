@@ -29,7 +29,7 @@ from needle_identification.recordings.tables import is_table, read_friction_tabl
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
-from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
+from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import MessageError, ParameterError
 
 _FIRST: Final = 50  # number of messages that are read for joint names
@@ -48,6 +48,7 @@ class Wanted(NamedTuple):
 
 
 _WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
+TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
 _POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
 _USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
 _FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])

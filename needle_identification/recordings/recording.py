@@ -42,9 +42,7 @@ class BaseRecording(Displayed):
     force: FloatArray
     losses: tuple[str, ...] = ()  #: lost, discarded or repaired data, one sentence each
     configuration: str = ''  #: parameter file of the recorded plant; empty if not recorded
-    #: Clock of the force minus clock of the motion [s], estimated from the receive times and
-    #: already corrected; 0 if equal.
-    clock_offset: float = 0.0
+    clock_offset: float = 0.0  #: clock of the force minus that of the motion [s], corrected
 
     @property
     def truth(self) -> Mapping[str, Any] | None:

@@ -25,8 +25,7 @@ def binomial_interval(count: int, total: int) -> tuple[float, float]:
 
 def fit_losses(time: FloatArray) -> tuple[ParameterEstimate, ParameterEstimate]:
     """Return the fraction of lost samples and the duration of a burst, at times [s], (n,)."""
-    # A Markov process of two states. The fraction is nan without a regular period, the duration
-    # for independent losses.
+    # A Markov process; nan without a regular period, and no duration for independent losses.
     steps = np.diff(time)
     period = float(np.median(steps))
     # Drift of the clocks does not add up, since each step is rounded by itself.

@@ -8,7 +8,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import chosen_topic, read_samples, Wanted
+from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
 from needle_identification.recordings.tables import (
     column_values,
@@ -20,13 +20,12 @@ from needle_identification.recordings.tables import (
     TIME_NAMES,
 )
 from needle_identification.sensor.recording import SensorRecording
-from needle_ros import contract, wire
+from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
 _TRUTH: Final = Wanted('truth_topic', (wire.POINT, wire.POSE, wire.JOINT_STATE), ())
 
 #: Roles of the columns of a table; for a bag, axes or joints by role, without the time.
@@ -94,7 +93,7 @@ def read_sensor_recording(
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
         raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
     path = Path(path)
-    stamps, tip, losses = _positions(path, _TIP, tip_topic, axes, time, columns or {})
+    stamps, tip, losses = _positions(path, TIP, tip_topic, axes, time, columns or {})
     if isinstance(truth, (str, Path)):
         true_stamps, true_tip, others = _positions(
             Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}

@@ -18,6 +18,7 @@ from needle_identification.recordings.reading import (
     chosen_topic,
     first_names,
     read_samples,
+    TIP,
     Wanted,
 )
 from needle_identification.recordings.samples import EachJoint, source_of
@@ -34,7 +35,6 @@ from needle_ros import contract, wire
 from needle_ros.axes import signed, signed_axis
 import numpy as np
 
-_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
 _MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
 
 #: Joints by role.
@@ -102,7 +102,7 @@ def read_steering_recording(
         return _of_table(path, columns, medium)
     bag = Bag(path)
     topics = bag.topics()
-    tip = chosen_topic(bag, topics, _TIP, tip_topic)
+    tip = chosen_topic(bag, topics, TIP, tip_topic)
     motion = chosen_topic(bag, topics, _MOTION, motion_topic)
     present = {name for names in first_names(bag, motion) for name in names}
     joints = {role: signed(columns.get(role, name)) for role, name in JOINTS.items()}

@@ -136,8 +136,7 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
 def _deviation(
     residual: FloatArray, freedom: float, estimator: str
 ) -> tuple[float, float, FloatArray]:
-    # For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
-    # reduces the degrees of freedom by 1.
+    # P. J. Huber, "Robust Statistics", 1981, section 7.6; a clipped residual is not free.
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual
     limit = 1.345 * 1.4826 * float(np.median(np.abs(residual)))
