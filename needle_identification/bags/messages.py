@@ -10,21 +10,15 @@ from typing import Any
 from needle_identification.bags.compression import DAMAGED
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
+from rosbags import typesys
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import (
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-    Stores,
-    TypesysError,
-)
 from rosbags.typesys.store import Typestore
 
 
 @lru_cache(maxsize=1)
 def _jazzy() -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY)
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 
 
 def message_type(type_name: str) -> Any:
@@ -45,13 +39,13 @@ def _installed(type_name: str) -> Typestore:
         name = wanted.pop()
         if name in store.fielddefs or name in types:
             continue
-        found = get_types_from_msg(_message_file(name).read_text(encoding='utf-8'), name)
+        found = typesys.get_types_from_msg(_message_file(name).read_text(encoding='utf-8'), name)
         types.update(found)
         for _, fields in found.values():
             wanted += [part for _, kind in fields if (part := _message_in(kind))]
     if not types:
         return store
-    own = get_typestore(Stores.ROS2_JAZZY)
+    own = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     own.register(types)
     return own
 
@@ -81,7 +75,7 @@ def definition_of(type_name: str) -> tuple[str, str]:
         store = _installed(type_name)
         definition, _ = store.generate_msgdef(type_name, ros_version=2)
         return definition, store.hash_rihs01(type_name)
-    except (OSError, UnicodeDecodeError, TypesysError) as error:
+    except (OSError, UnicodeDecodeError, typesys.TypesysError) as error:
         raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
 
 
@@ -113,16 +107,16 @@ def _store(type_name: str, encoding: str, definition: str) -> Typestore:
     known = _jazzy().fielddefs
     if type_name in known:
         return _jazzy()
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     try:
         if encoding == 'ros2msg':
-            types = get_types_from_msg(definition, type_name)
+            types = typesys.get_types_from_msg(definition, type_name)
         else:
             types = {}
             for part in re.split(r'^=+\nIDL: .*\n', definition, flags=re.MULTILINE):
-                types.update(get_types_from_idl(part) if part.strip() else {})
+                types.update(typesys.get_types_from_idl(part) if part.strip() else {})
         store.register({name: fields for name, fields in types.items() if name not in known})
-    except TypesysError as error:
+    except typesys.TypesysError as error:
         raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
     if type_name not in store.fielddefs:
         raise RecordingError(f'the bag does not hold the definition of {type_name}')

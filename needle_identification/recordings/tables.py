@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 import re
 import struct
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray, IntArray
@@ -78,9 +78,6 @@ _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}  # ranges that are rarely in S
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
-
-
-Roles: TypeAlias = Mapping[str, str]  #: columns by role
 
 
 class Table(NamedTuple):

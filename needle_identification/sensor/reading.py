@@ -8,17 +8,9 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
+from needle_identification.recordings import Roles, tables
 from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
-from needle_identification.recordings.tables import (
-    column_values,
-    guessed,
-    is_table,
-    read_table,
-    Roles,
-    sorted_rows,
-    TIME_NAMES,
-)
 from needle_identification.sensor.recording import SensorRecording
 from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
@@ -33,7 +25,7 @@ SENSOR_ROLES: Final = ('time', 'tip_x', 'tip_y', 'tip_z')
 
 #: Usual column names by role, in lower case without separators.
 _USUAL: Final = {
-    'time': TIME_NAMES,
+    'time': tables.TIME_NAMES,
     'tip_x': ('tipx', 'x', 'px', 'pointx', 'positionx'),
     'tip_y': ('tipy', 'y', 'py', 'pointy', 'positiony'),
     'tip_z': ('tipz', 'z', 'pz', 'pointz', 'positionz'),
@@ -129,13 +121,13 @@ def _positions(
     path: Path, wanted: Wanted, topic: str | None, axes: Sequence[str], time: str, columns: Roles
 ) -> tuple[IntArray, FloatArray, list[str]]:
     """Return stamps [ns], (n,), positions on the axes [m], (n, k), and losses."""
-    if not is_table(path):
+    if not tables.is_table(path):
         return _of_bag(path, wanted, topic, axes, time, columns)
     if topic is not None:
         option = wanted.option.replace('_', '-')
         raise RecordingError(f'{path} is a table: name columns instead of --{option}')
-    table = read_table(path)
-    specs, losses = {**guessed(table.columns, _USUAL), **columns}, list(table.losses)
+    table = tables.read_table(path)
+    specs, losses = {**tables.guessed(table.columns, _USUAL), **columns}, list(table.losses)
     roles = ['time', *(f'tip_{axis}' for axis in axes)]
     if missing := [role for role in roles if role not in specs]:
         option = '--truth-columns' if wanted is _TRUTH else '--columns'
@@ -145,9 +137,9 @@ def _positions(
         )
     if words := ', '.join(f'{role}={specs[role]}' for role in roles if role not in columns):
         losses.append(f'columns by their names: {words}')
-    times, *tips = (column_values(table, role, specs[role], losses) for role in roles)
+    times, *tips = (tables.column_values(table, role, specs[role], losses) for role in roles)
     rows = np.column_stack(tips)
-    start, stamps, found = sorted_rows(path, times, rows, losses)
+    start, stamps, found = tables.sorted_rows(path, times, rows, losses)
     if not abs(start) < _LATEST:
         raise RecordingError(f'{path}: time starts at {start:.3g} s: is its unit right?')
     _check_means(losses, int(np.count_nonzero(np.isfinite(rows).all(axis=1))), len(stamps))

@@ -14,13 +14,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import (
-    chosen_topic,
-    first_names,
-    read_samples,
-    TIP,
-    Wanted,
-)
+from needle_identification.recordings import reading
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import column_values, is_table, read_table, Table
 from needle_identification.recordings.timebase import merge
@@ -35,7 +29,7 @@ from needle_ros import contract, wire
 from needle_ros.axes import signed, signed_axis
 import numpy as np
 
-_MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
+_MOTION: Final = reading.Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
 
 #: Joints by role.
 JOINTS: Final = {
@@ -102,9 +96,9 @@ def read_steering_recording(
         return _of_table(path, columns, medium)
     bag = Bag(path)
     topics = bag.topics()
-    tip = chosen_topic(bag, topics, TIP, tip_topic)
-    motion = chosen_topic(bag, topics, _MOTION, motion_topic)
-    present = {name for names in first_names(bag, motion) for name in names}
+    tip = reading.chosen_topic(bag, topics, reading.TIP, tip_topic)
+    motion = reading.chosen_topic(bag, topics, _MOTION, motion_topic)
+    present = {name for names in reading.first_names(bag, motion) for name in names}
     joints = {role: signed(columns.get(role, name)) for role, name in JOINTS.items()}
     if 'roll' not in columns and contract.ROLL not in present:
         del joints['roll']
@@ -119,7 +113,7 @@ def read_steering_recording(
         tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
         motion: EachJoint(*(name for _, name in joints.values()), *tilts),
     }
-    gathered, _ = read_samples(bag, sources, time)
+    gathered, _ = reading.read_samples(bag, sources, time)
     _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
     losses = list(bag.losses)
     for name, column in zip(tilts, moved[:, len(joints) :].T, strict=True):
