@@ -111,11 +111,8 @@ class PlayerNode(BaseNode):
         if not profiles:
             reasons = '; '.join(f'{name}: {reason}' for name, reason in self._left_out.items())
             raise RecordingError(f'{path} has nothing to play; {reasons or "no topic is left"}')
-        latched = {
-            name: qos.depth
-            for name, qos in profiles.items()
-            if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        }
+        kept = DurabilityPolicy.TRANSIENT_LOCAL
+        latched = {name: qos.depth for name, qos in profiles.items() if qos.durability == kept}
         self._playback = BagPlayback(bag, profiles.keys(), latched, settings)
         for name, qos in profiles.items():
             self._outputs[name] = self.create_publisher(kinds[name], name, qos)
@@ -168,10 +165,8 @@ class PlayerNode(BaseNode):
         self._reset_clock()
         self._played = 0
         # Timers must run while the recorded time is paused.
-        self._timers_of_play = [
-            steady_timer(self, _TICK, self._on_timer),
-            steady_timer(self, _CHECK, self._check_publishers),
-        ]
+        tasks = (_TICK, self._on_timer), (_CHECK, self._check_publishers)
+        self._timers_of_play = [steady_timer(self, period, act) for period, act in tasks]
 
     def about(self) -> str:
         return f'plays {", ".join(sorted(self._outputs))} of {self._playback.bag.path}'

@@ -44,10 +44,8 @@ class MessageBatch(NamedTuple):
         cls, topic: BagTopic, times: Sequence[Any], messages: Sequence[Any]
     ) -> MessageBatch:
         """Build a batch from values of a file; invalid times are 0, invalid messages empty."""
-        stamps = np.array(
-            [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times],
-            dtype=np.int64,
-        )
+        valid = [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times]
+        stamps = np.array(valid, dtype=np.int64)
         return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
 
     def messages(self) -> Iterator[tuple[int, bytes]]:

@@ -37,15 +37,13 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
             raise RecordingError(f'{path} is not a recording; {_VALID}')
         return [path], []
     # Sort part_10 after part_9.
-    found = sorted(
-        (file for file in (path.iterdir() if path.is_dir() else ()) if file.is_file()),
-        key=lambda file: [len(file.name), file.name],
-    )
+    inside = path.iterdir() if path.is_dir() else ()
+    found = sorted(filter(Path.is_file, inside), key=lambda file: [len(file.name), file.name])
     by_form = {form: [file for file in found if form_of(file) == form] for form in _FORMS}
     chosen = next(filter(None, by_form.values()), [])
     if not chosen:
-        inside = min(path.glob(f'*/{METADATA}'), default=None)
-        hint = _VALID if inside is None else f'name those inside, such as {inside.parent}'
+        other = min(path.glob(f'*/{METADATA}'), default=None)
+        hint = _VALID if other is None else f'name those inside, such as {other.parent}'
         raise RecordingError(f'{path} holds no recording; {hint}')
     names, losses = None, [f'no readable {METADATA}: the recording was not closed']
     try:

@@ -240,11 +240,8 @@ class _Information:
             weight = 2.0 * (1.0 - lag / (_LAGS + 1.0))
             colored = colored + weight * (changes[lag:] * changes[:-lag]).sum(axis=0)
         growth = np.divide(colored, plain, out=np.ones_like(plain), where=plain > 0.0)
-        return (
-            growth.max(initial=1.0) * (scores.T @ scores),
-            behind,
-            min(effective, now / self._length),
-        )
+        covariance = growth.max(initial=1.0) * (scores.T @ scores)
+        return covariance, behind, min(effective, now / self._length)
 
 
 class LiveFriction:

@@ -90,18 +90,12 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     duration, count = float(time[-1] - time[0]), int(np.count_nonzero(far))
     fraction, error = count / len(far), sqrt(count) / len(far)
     between = binomial_interval(count, len(far))
-    parameters = (
-        *_noise(fit),
-        *_biases(one, fit),
-        _delay(one, fit, delay),
-        estimated('outliers', 'p_o', '1', fraction, error, between),
-        dropout,
-        dropout_time,
-    )
+    outliers = estimated('outliers', 'p_o', '1', fraction, error, between)
+    noise = (*_noise(fit), *_biases(one, fit), _delay(one, fit, delay))
     return SensorEstimate(
         name=one.name,
         axes=one.axes,
-        parameters=parameters,
+        parameters=(*noise, outliers, dropout, dropout_time),
         rate=1.0 / float(np.median(np.diff(one.time))),
         samples=len(one.time),
         duration=duration,

@@ -7,6 +7,7 @@ each force level the stiffness matrix K of F = K d is fitted to the presses.
 """
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from math import hypot, nan, sqrt
 from typing import Final
@@ -76,18 +77,16 @@ def identify_stiffness(
         plateaus = find_plateaus(recording, settings)
         presses, noise, warnings = find_presses(recording, plateaus, settings)
         members = [presses.level == index for index in range(int(presses.level.max()) + 1)]
-        fits = [
-            matrix.fit_matrix(presses, noise, np.flatnonzero(chosen), settings.estimator)
-            for chosen in members
-        ]
+        fit = partial(matrix.fit_matrix, presses, noise, estimator=settings.estimator)
+        fits = [fit(np.flatnonzero(chosen)) for chosen in members]
     except IdentificationError as error:
         raise IdentificationError(f'{recording.name}: {error}') from None
     levels = []
     by_doubt: dict[str, list[str]] = {}
-    for chosen, fit in zip(members, fits, strict=True):
-        level = _level(presses, chosen, fit, settings)
+    for chosen, found in zip(members, fits, strict=True):
+        level = _level(presses, chosen, found, settings)
         levels.append(level)
-        for doubt, detail in _doubts(level, fit):
+        for doubt, detail in _doubts(level, found):
             by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')
     warnings += [f'{doubt} ({"; ".join(details)})' for doubt, details in by_doubt.items()]
     size = np.maximum(np.hypot(*presses.displacement.T), 1e-15)

@@ -97,14 +97,9 @@ def find_presses(
         change[:, channels] = plateaus.mean[hold, channels] - zero
         covariances.append(covariance)
     force, displacement = change[:, :2], change[:, 2:4]
-    noise = PressNoise(
-        plateaus.variance[hold, :2],
-        plateaus.variance[hold, 2:4],
-        covariances[0],
-        covariances[1],
-        _fraction(plateaus.trend[hold, 2:4], displacement),
-        _remaining(plateaus, displacement),
-    )
+    variance, creep = plateaus.variance[hold], _fraction(plateaus.trend[hold, 2:4], displacement)
+    left = _remaining(plateaus, displacement)
+    noise = PressNoise(variance[:, :2], variance[:, 2:4], *covariances[:2], creep, left)
     presses = Presses(
         time=time,
         displacement=displacement,
