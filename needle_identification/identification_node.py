@@ -291,7 +291,9 @@ class IdentificationNode(BaseNode):
         if self._live is not None and found:
             if any(one.count for one in found):
                 self._found = found
-            self._publish(self._friction, _live_statuses(found, self._live.samples))
+            samples = self._live.samples
+            statuses = [_of_statistic(one, samples=samples, source='live') for one in found]
+            self._publish(self._friction, statuses)
 
     # Parameters of running nodes.
 
@@ -344,10 +346,6 @@ def _answer_later(service: Service) -> None:
             send(response, header)
 
     service.send_response = send_later  # type: ignore[method-assign]
-
-
-def _live_statuses(found: Sequence[Statistic], samples: int) -> list[DiagnosticStatus]:
-    return [_of_statistic(one, samples=samples, source='live') for one in found]
 
 
 def _summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[DiagnosticStatus]:

@@ -243,15 +243,12 @@ class RecorderNode(BaseNode):
 
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():
-            if self._bag is not None and self._is_wanted(topic):
+            wanted = topic in self._names or (self._all and not is_hidden(topic))
+            if self._bag is not None and wanted and topic not in self._left_out:
                 publishers = self.get_publishers_info_by_topic(topic)
                 if publishers:
                     with self._writing(self._bag):
                         self._subscribe(self._bag, topic, types, publishers)
-
-    def _is_wanted(self, topic: str) -> bool:
-        wanted = topic in self._names or (self._all and not is_hidden(topic))
-        return wanted and topic not in self._left_out
 
     def _subscribe(
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]

@@ -99,7 +99,9 @@ def find_presses(
     force, displacement = change[:, :2], change[:, 2:4]
     variance, creep = plateaus.variance[hold], _fraction(plateaus.trend[hold, 2:4], displacement)
     left = _remaining(plateaus, displacement)
-    noise = PressNoise(variance[:, :2], variance[:, 2:4], *covariances[:2], creep, left)
+    noise = PressNoise(
+        variance[:, :2], variance[:, 2:4], covariances[0], covariances[1], creep, left
+    )
     presses = Presses(
         time=time,
         displacement=displacement,
