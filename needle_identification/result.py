@@ -151,12 +151,9 @@ def steering_yaml(found: SteeringEstimate) -> str:
 
 
 def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool) -> str:
-    """
-    Return a ROS parameter file for the tip sensor of the plant, and the priors of steering.
-
-    ``measurement_time`` is the duration of an averaged measurement [s]; ``delayed``, whether the
-    times of the samples are of their messages, so that the delay is of the messages, too.
-    """
+    """Return a ROS parameter file for the tip sensor of the plant, and the priors of steering."""
+    # `measurement_time`: duration of an averaged measurement [s]; `delayed`: the times of samples
+    # are those of their messages, and so is the delay.
     lines = []
     for one in found.parameters:
         text = f'{one.value:.6g}{suffix(one.unit)}, {between(one.interval)}'

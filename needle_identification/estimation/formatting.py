@@ -9,15 +9,7 @@ _SMALLEST_ERROR: Final = 1e-9  # smallest error that limits the digits
 
 
 def measured(value: float, error: float, unit: str = '') -> str:
-    """
-    Format a value with its error; `UNKNOWN` for a value that is not finite.
-
-    Examples
-    --------
-    >>> measured(0.56043, 0.00051, 'N')
-    '0.56043 ± 0.00051 N'
-
-    """
+    """Format a value with its error, such as ``0.56043 ± 0.00051 N``; else `UNKNOWN`."""
     if not isfinite(value):
         return UNKNOWN
     form = _format(error)

@@ -245,12 +245,10 @@ class _Information:
 
 
 class LiveFriction:
-    """
-    Estimate friction from messages as they arrive, with the motion at the stamps of the force.
+    """Estimate friction from messages as they arrive, with the motion at the force stamps."""
 
-    Samples that are not finite, out of order, or in a gap of the motion are discarded and counted.
-    A clock that is set back restarts the estimation.
-    """
+    # Samples that are not finite, out of order, or in a gap of the motion are discarded and
+    # counted. A clock that is set back restarts the estimation.
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:
         # Checks the arguments except the sampling rate, which is determined later.

@@ -13,12 +13,10 @@ _GATHERED: Final = 2**16  # smallest number of added samples that is sorted
 
 
 class Series:
-    """
-    Samples in order of stamp; up to date after `compact`.
+    """Samples in order of stamp, after `compact`; ``late``, ``repeated`` count their stamps."""
 
-    More than two samples per bin of ``width`` [ns] are averaged, stamps and values alike; above
-    `LARGEST` samples, neighbors are. ``late`` and ``repeated`` count samples by their stamps.
-    """
+    # More than two samples per bin of ``width`` [ns] are averaged, stamps and values alike; above
+    # `LARGEST` samples, neighbors are.
 
     def __init__(self, columns: int) -> None:
         self.stamps = np.empty(0, dtype=np.int64)

@@ -9,15 +9,13 @@ times, the inverse covariance matrix Q of this process is tridiagonal [Rue2005]_
 .. math:: (I + g Q^{-1})^{-1} = I - g (Q + g I)^{-1}, \qquad
    \log |I + g Q^{-1}| = \log |Q + g I| - \log |Q|
 
-take a time that is proportional to the number of samples. The likelihood is restricted
-[Patterson1971]_: bias and delay are integrated out. The variance of the white noise has its most
-probable value for each g and tau.
+take a time that is proportional to the number of samples. The likelihood is restricted, as in
+`needle_identification.estimation.memory`: bias and delay are integrated out. The variance of the
+white noise has its most probable value for each g and tau.
 
 References
 ----------
 .. [Rue2005] H. Rue, L. Held, "Gaussian Markov Random Fields", Chapman & Hall, 2005.
-.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
-   sizes are unequal", Biometrika 58(3), 1971, doi:10.1093/biomet/58.3.545.
 
 """
 
