@@ -100,11 +100,11 @@ class RecorderNode(BaseNode):
 
     def cleanup(self) -> None:
         """Complete the bag after an error; otherwise it is complete already."""
-        self.deactivate()
-
-    def deactivate(self) -> None:
         if self._bag is not None:
             self._end(self._bag)
+
+    def deactivate(self) -> None:
+        self.cleanup()
 
     def diagnose(self) -> Diagnosis[RecorderStatus]:
         if self._bag is None:
