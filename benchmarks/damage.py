@@ -21,13 +21,12 @@ from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray
 from needle_identification import (
     BagWriter,
-    encode,
     FrictionEstimate,
     identify_friction,
-    message_type,
     read_friction_recording,
     Recording,
 )
+from needle_identification.bags.messages import encode, message_type
 from needle_ros.errors import NeedleError
 import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer

@@ -24,12 +24,11 @@ from benchmarks.measure import Bar, NOT_INSTALLED, number, optional, peak_memory
 from benchmarks.page import Answer, PageSection, Tick
 from needle_identification import (
     BagWriter,
-    encode,
     FrictionEstimate,
     identify_friction,
-    message_type,
     read_friction_recording,
 )
+from needle_identification.bags.messages import encode, message_type
 from needle_identification.recordings.series import LARGEST
 import numpy as np
 from rosbags.highlevel import AnyReader

@@ -16,16 +16,9 @@ from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
     from needle_identification.bags.bag import Bag as Bag
-    from needle_identification.bags.bag import message_counts as message_counts
     from needle_identification.bags.bag import read_topic as read_topic
-    from needle_identification.bags.bag import Recorded as Recorded
-    from needle_identification.bags.messages import deserialize as deserialize
-    from needle_identification.bags.messages import encode as encode
-    from needle_identification.bags.messages import message_type as message_type
     from needle_identification.bags.table import read_bag as read_bag
     from needle_identification.bags.table import TopicTable as TopicTable
-    from needle_identification.bags.topics import BagTopic as BagTopic
-    from needle_identification.bags.topics import OfferedQos as OfferedQos
     from needle_identification.bags.writer import BagWriter as BagWriter
     from needle_identification.errors import IdentificationError as IdentificationError
     from needle_identification.errors import RecordingError as RecordingError
@@ -71,8 +64,6 @@ if TYPE_CHECKING:
     from needle_identification.stiffness.estimate import StiffnessSummary as StiffnessSummary
     from needle_identification.stiffness.estimate import summarize_stiffness as summarize_stiffness
     from needle_identification.stiffness.identify import identify_stiffness as identify_stiffness
-    from needle_identification.stiffness.matrix import asymmetry as asymmetry
-    from needle_identification.stiffness.presses import Presses as Presses
     from needle_identification.stiffness.settings import StiffnessSettings as StiffnessSettings
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -5,11 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import sys
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.friction.estimate import summarize
+from needle_identification.estimation.formatting import measured
+from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary, summarize
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
@@ -19,8 +20,11 @@ from needle_identification.recordings.reading import (
     read_indentation_recording,
 )
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.status_node import live_statuses, sentence, summary_statuses
-from needle_identification.stiffness.estimate import summarize_stiffness
+from needle_identification.stiffness.estimate import (
+    StiffnessEstimate,
+    StiffnessSummary,
+    summarize_stiffness,
+)
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_ros import contract
@@ -61,41 +65,22 @@ class IdentificationSettings(CheckedSettings):
     )
 
 
-class _Application(NamedTuple):
-    """Parameters sent to other nodes, and futures of the responses (None: no such node)."""
-
-    values: Mapping[str, float | str]
-    answers: Mapping[str, Future | None]
-    response: Trigger.Response
-    later: Future  # of the response
-
-    def is_over(self) -> bool:
-        """Whether all calls are answered or have failed."""
-        return all(answer is None or answer.done() for answer in self.answers.values())
-
-    def outcome(self) -> Trigger.Response:
-        """Return whether each existing node set all that it can, and a message by node."""
-        outcomes = [self._of_node(name, answer) for name, answer in self.answers.items()]
-        verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
-        self.response.success = bool(verdicts) and all(verdicts)
-        self.response.message = '; '.join(words for _, words in outcomes)
-        return self.response
-
-    def _of_node(self, node: str, answer: Future | None) -> tuple[bool | None, str]:
-        if answer is None:
-            return None, f'{node}: no such node'
-        response = answer.result()
-        if response is None:
-            return False, no_answer(f'{node}/set_parameters')
-        results = dict(zip(self.values, response.results, strict=True))
-        taken = [name for name, result in results.items() if result.successful]
-        values = {k: v if isinstance(v, str) else f'{v:.6g}' for k, v in self.values.items()}
-        words = [f'{name} = {values[name]}' for name in taken]
-        words += [
-            f'not {name}: {one.reason}' for name, one in results.items() if name not in taken
-        ]
-        needed = [name for name in _COEFFICIENTS if name in self.values] or list(self.values)
-        return all(name in taken for name in needed), f'{node}: {", ".join(words)}'
+def _outcome(
+    node: str, values: Mapping[str, float | str], answer: Future | None
+) -> tuple[bool | None, str]:
+    """Return whether a node set all that it can (None: there is no such node), and a message."""
+    if answer is None:
+        return None, f'{node}: no such node'
+    response = answer.result()
+    if response is None:
+        return False, no_answer(f'{node}/set_parameters')
+    results = dict(zip(values, response.results, strict=True))
+    taken = [name for name, result in results.items() if result.successful]
+    shown = {k: v if isinstance(v, str) else f'{v:.6g}' for k, v in values.items()}
+    words = [f'{name} = {shown[name]}' for name in taken]
+    words += [f'not {name}: {one.reason}' for name, one in results.items() if name not in taken]
+    needed = [name for name in _COEFFICIENTS if name in values] or list(values)
+    return all(name in taken for name in needed), f'{node}: {", ".join(words)}'
 
 
 class IdentificationNode(BaseNode):
@@ -139,7 +124,6 @@ class IdentificationNode(BaseNode):
         self._found: Sequence[Statistic] = ()
         self._words = ''
         self._live: LiveFriction | None = None
-        self._applications: list[_Application] = []
         self._setters: dict[str, Client] = {}
         self._calls = Calls(self)
 
@@ -168,7 +152,6 @@ class IdentificationNode(BaseNode):
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
 
     def cleanup(self) -> None:
-        """Disconnect from the nodes of ``apply_to``."""
         self._calls.abandon()
         self._setters.clear()
 
@@ -207,7 +190,7 @@ class IdentificationNode(BaseNode):
             if not samples:
                 message = f'no joint_states of {self._joint[1]} paired with base_wrench'
                 return Diagnosis(Severity.WARNING, message, status)
-            return Diagnosis(Severity.INFO, sentence(self._live_statistics()), status)
+            return Diagnosis(Severity.INFO, _sentence(self._live_statistics()), status)
         message = self._words if self._found else 'nothing identified yet'
         return Diagnosis(Severity.INFO, message, status)
 
@@ -231,40 +214,33 @@ class IdentificationNode(BaseNode):
             'motion_topic': self.text('motion_topic') or None,
             'time': self.text('time'),
         }
-        output = self.text('output')
+        summary: FrictionSummary | StiffnessSummary
+        found: Sequence[Statistic]
         if self.text('what') == 'friction':
             reading['force_axis'] = self.text('force_axis')
             reading['motion_axis'] = self.text('motion_axis') or None
-            friction = summarize(
-                self._estimates(
-                    partial(read_friction_recording, **reading),
-                    partial(
-                        identify_friction,
-                        settings=self.settings('friction.', FrictionSettings),
-                        among=len(self._bags),
-                    ),
-                )
-            )
-            if output:
-                write_result(output, friction)
-            self._found, count = friction.statistics, len(friction.estimates)
-            self._publish(self._friction, summary_statuses(friction))
+            read: Callable[[str], Any] = partial(read_friction_recording, **reading)
+            terms = self.settings('friction.', FrictionSettings)
+            identify = partial(identify_friction, settings=terms, among=len(self._bags))
+            summary = friction = summarize(self._estimates(read, identify))
+            found, publisher = friction.statistics, self._friction
+            write = partial(write_result, friction=friction)
         else:
             reading['axes'] = tuple(self.get_parameter('axes').value)
+            read = partial(read_indentation_recording, **reading)
             settings = self.settings('stiffness.', StiffnessSettings)
-            stiffness = summarize_stiffness(
-                self._estimates(
-                    partial(read_indentation_recording, **reading),
-                    partial(identify_stiffness, settings=settings),
-                ),
+            summary = stiffness = summarize_stiffness(
+                self._estimates(read, partial(identify_stiffness, settings=settings)),
                 force=self.settings('', IdentificationSettings).level or None,
                 level_tolerance=settings.level_tolerance,
             )
-            if output:
-                write_result(output, None, stiffness)
-            self._found, count = (stiffness.tissue_stiffness,), len(stiffness.estimates)
-            self._publish(self._stiffness, summary_statuses(stiffness))
-        self._words = f'{sentence(self._found)} from {count} recordings'
+            found, publisher = (stiffness.tissue_stiffness,), self._stiffness
+            write = partial(write_result, friction=None, stiffness=stiffness)
+        if output := self.text('output'):
+            write(output)
+        self._found = found
+        self._publish(publisher, _summary_statuses(summary))
+        self._words = f'{_sentence(found)} from {len(summary.estimates)} recordings'
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
@@ -315,7 +291,9 @@ class IdentificationNode(BaseNode):
         if self._live is not None and found:
             if any(one.count for one in found):
                 self._found = found
-            self._publish(self._friction, live_statuses(found, self._live.samples))
+            samples = self._live.samples
+            statuses = [_of_statistic(one, samples=samples, source='live') for one in found]
+            self._publish(self._friction, statuses)
 
     # Parameters of running nodes.
 
@@ -327,34 +305,33 @@ class IdentificationNode(BaseNode):
         if not values:
             response.message = 'nothing identified yet that plant and controller can use'
             return response
-        request = SetParameters.Request(
-            parameters=[
-                Parameter(name, value=one).to_parameter_msg() for name, one in values.items()
-            ]
-        )
+        parameters = [Parameter(name, value=one) for name, one in values.items()]
+        request = SetParameters.Request(parameters=[one.to_parameter_msg() for one in parameters])
         answers = {
             name: self._calls.call(client, request) if client.service_is_ready() else None
             for name, client in self._setters.items()
         }
-        application = _Application(values, answers, response, Future())
-        self._applications.append(application)
-        for answer in answers.values():
-            if answer is not None:
-                answer.add_done_callback(lambda _answer: self._answer_applications())
-        self._answer_applications()
-        return application.later
+        later = Future()
 
-    def _answer_applications(self) -> None:
-        """Send the responses of those calls of ``~/apply`` that are complete."""
-        for application in [one for one in self._applications if one.is_over()]:
-            self._applications.remove(application)
-            response = application.outcome()
-            application.later.set_result(response)
+        def answer_all(_answer: Future | None = None) -> None:
+            """Respond when all calls are answered or have failed."""
+            if later.done() or not all(one is None or one.done() for one in answers.values()):
+                return
+            outcomes = [_outcome(name, values, answer) for name, answer in answers.items()]
+            verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
+            response.success = bool(verdicts) and all(verdicts)
+            response.message = '; '.join(words for _, words in outcomes)
+            later.set_result(response)
             # Two statements: rclpy rejects a second severity from the same source line.
             if response.success:
                 self.get_logger().info(response.message)
             else:
                 self.get_logger().error(response.message)
+
+        for answer in filter(None, answers.values()):
+            answer.add_done_callback(answer_all)
+        answer_all()
+        return later
 
 
 def _answer_later(service: Service) -> None:
@@ -369,6 +346,75 @@ def _answer_later(service: Service) -> None:
             send(response, header)
 
     service.send_response = send_later  # type: ignore[method-assign]
+
+
+def _summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[DiagnosticStatus]:
+    """Return one status per parameter and force level, then one per recording."""
+    if isinstance(summary, FrictionSummary):
+        samples = sum(one.samples for one in summary.estimates)
+        statuses = [_of_statistic(one, samples=samples) for one in summary.statistics]
+        return [*statuses, *map(_of_friction, summary.estimates)]
+    statuses = [_of_statistic(summary.tissue_stiffness)]
+    for level in summary.levels:
+        at = f' at {level.force:.2f} N'
+        statuses += [_of_statistic(one, level=at) for one in level.statistics]
+    return [*statuses, *map(_of_stiffness, summary.estimates)]
+
+
+def _of_statistic(
+    one: Statistic, *, level: str = '', samples: int | None = None, source: str = 'recordings'
+) -> DiagnosticStatus:
+    values = {
+        'estimate': one.mean,
+        'interval_low': one.interval[0],
+        'interval_high': one.interval[1],
+        'unit': one.unit,
+        'standard_error': one.error,
+        'standard_deviation': one.deviation,
+        'recordings': one.count,
+        'samples': samples,
+    }
+    message = measured(one.mean, one.error, one.unit)
+    status = _status(f'{one.name}{level}', message, values, source)
+    status.level = DiagnosticStatus.OK if one.count else DiagnosticStatus.WARN
+    return status
+
+
+def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
+    parameters = (*estimate.parameters, estimate.breakaway, estimate.lag)
+    values = {
+        **{p.name: measured(p.value, p.error, p.unit) for p in parameters if p is not None},
+        'samples': estimate.samples,
+        'residual': estimate.residual,
+        'determination': estimate.determination,
+        'condition': estimate.condition,
+    }
+    return _status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
+
+
+def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:
+    worst = min(level.determination for level in estimate.levels)
+    values = {
+        'presses': sum(level.presses for level in estimate.levels),
+        'determination': worst,
+        'condition': max(level.condition for level in estimate.levels),
+        'off_plane': estimate.off_plane,
+        **{f'at {level.force:.2f} N': level.words for level in estimate.levels},
+    }
+    return _status(estimate.name, f'R^2 >= {worst:.4f}', values)
+
+
+def _status(
+    name: str, message: str, values: Mapping[str, object], source: str = ''
+) -> DiagnosticStatus:
+    """Return a status, without values that are None."""
+    pairs = [KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None]
+    return DiagnosticStatus(name=name, message=message, hardware_id=source, values=pairs)
+
+
+def _sentence(found: Sequence[Statistic]) -> str:
+    """Format parameters in one line, such as ``mu_s = 0.5600 ± 0.0083 N, mu_v = ...``."""
+    return ', '.join(f'{one.symbol} = {measured(one.mean, one.error, one.unit)}' for one in found)
 
 
 if __name__ == '__main__':

@@ -11,7 +11,7 @@ from typing import Any, Final
 from builtin_interfaces.msg import Time
 from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.playback import BagPlayback, PlaybackSettings
-from needle_identification.bags.topics import BagTopic, OfferedQos, UNLIMITED
+from needle_identification.bags.topics import BagTopic, DURATIONS, OfferedQos, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class, steady_timer
@@ -43,19 +43,14 @@ _STATES: Final = {
 
 _DEPTH: Final = 1000  # queue length of a topic that is not latched
 _CLOCK_PERIOD: Final = 1_000_000  # shortest time between two messages on /clock [ns]
-
-#: Delay that is reported on /diagnostics [s]; smaller delays are normal on a busy machine.
-_LATE: Final = 0.1
-
+_LATE: Final = 0.1  # delay that is reported [s]; less is normal on a busy machine
 _FAREWELL: Final = 2.0  # timeout of the acknowledgment of the last messages [s]
+
+#: Last parts of the names of topics with requests of a user to the whole system.
+_REQUESTS: Final = (SYSTEM_STATE.name, EMERGENCY_STOP.name)
 
 #: QoS of the subscription of rclpy to /clock.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-def _requests(topic: str) -> bool:
-    """Return whether a topic has requests of a user to the whole system."""
-    return topic.rpartition('/')[2] in (SYSTEM_STATE.name, EMERGENCY_STOP.name)
 
 
 class PlayerNode(BaseNode):
@@ -116,11 +111,8 @@ class PlayerNode(BaseNode):
         if not profiles:
             reasons = '; '.join(f'{name}: {reason}' for name, reason in self._left_out.items())
             raise RecordingError(f'{path} has nothing to play; {reasons or "no topic is left"}')
-        latched = {
-            name: qos.depth
-            for name, qos in profiles.items()
-            if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        }
+        kept = DurabilityPolicy.TRANSIENT_LOCAL
+        latched = {name: qos.depth for name, qos in profiles.items() if qos.durability == kept}
         self._playback = BagPlayback(bag, profiles.keys(), latched, settings)
         for name, qos in profiles.items():
             self._outputs[name] = self.create_publisher(kinds[name], name, qos)
@@ -140,7 +132,8 @@ class PlayerNode(BaseNode):
             listing = ', '.join(map(str, topics))
             raise RecordingError(f'{path} has no topic {", ".join(missing)}; it has {listing}')
         if '*' in words:
-            named |= {name for name in there if not (is_hidden(name) or _requests(name))}
+            requests = {name for name in there if name.rpartition('/')[2] in _REQUESTS}
+            named |= {name for name in there - requests if not is_hidden(name)}
         # This node publishes its own configuration.
         named.discard(self.resolve_topic_name('~/configuration'))
         if publishes:
@@ -168,15 +161,12 @@ class PlayerNode(BaseNode):
         self._playback.change(self.settings('', PlaybackSettings, changes))
 
     def activate(self) -> None:
-        """Play from the start."""
         self._playback.start(paused=bool(self.get_parameter('paused').value))
         self._reset_clock()
         self._played = 0
         # Timers must run while the recorded time is paused.
-        self._timers_of_play = [
-            steady_timer(self, _TICK, self._on_timer),
-            steady_timer(self, _CHECK, self._check_publishers),
-        ]
+        tasks = (_TICK, self._on_timer), (_CHECK, self._check_publishers)
+        self._timers_of_play = [steady_timer(self, period, act) for period, act in tasks]
 
     def about(self) -> str:
         return f'plays {", ".join(sorted(self._outputs))} of {self._playback.bag.path}'
@@ -207,7 +197,6 @@ class PlayerNode(BaseNode):
             self.publish_diagnostics()
 
     def _play(self) -> None:
-        """Publish the messages that are due."""
         deadline = time.monotonic() + _LONGEST_BURST
         while self._playback.has_next:
             if not self._playback.is_due():
@@ -314,13 +303,13 @@ class PlayerNode(BaseNode):
             left_out=', '.join(sorted(self._left_out)),
             duplicate_publishers=', '.join(sorted(self._contested)),
         )
-        complaints = [*playback.bag.losses] if playback.is_ended else []
+        warnings = [*playback.bag.losses] if playback.is_ended else []
         if self._contested:
-            complaints.append(f'other publishers of {status.duplicate_publishers}')
+            warnings.append(f'other publishers of {status.duplicate_publishers}')
         if playback.late > _LATE and playback.is_running:
-            complaints.append(f'{playback.late:.2f} s late: the machine is too slow for this rate')
-        if complaints:
-            return Diagnosis(Severity.WARNING, '; '.join(complaints), status)
+            warnings.append(f'{playback.late:.2f} s late: the machine is too slow for this rate')
+        if warnings:
+            return Diagnosis(Severity.WARNING, '; '.join(warnings), status)
         return Diagnosis(Severity.INFO, f'{_STATES[status.phase]} {playback.bag.path}', status)
 
 
@@ -329,17 +318,12 @@ def _profile(topics: list[BagTopic]) -> QoSProfile:
     offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)
     reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-    times = {
-        name: Duration(nanoseconds=at)
-        for name, found in (
-            ('deadline', {qos.deadline for qos in offered}),
-            ('lifespan', {qos.lifespan for qos in offered}),
-            ('liveliness_lease_duration', {qos.lease for qos in offered}),
-        )
+    times = {}
+    for name in DURATIONS:
         # Durations that differ between publishers are left unlimited.
-        for at in found
-        if len(found) == 1 and at != UNLIMITED
-    }
+        found = {getattr(qos, name) for qos in offered}
+        if len(found) == 1 and UNLIMITED not in found:
+            times[name] = Duration(nanoseconds=found.pop())
     if not any(qos.durability == 'transient_local' for qos in offered):
         return QoSProfile(depth=_DEPTH, reliability=reliability, **times)
     # The middleware may not report the depth to a recorder: then one message per publisher.

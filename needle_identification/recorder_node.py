@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node that records topics to an MCAP bag with the QoS that their publishers offer."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 import sys
 import time
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.topics import OfferedQos
+from needle_identification.bags.topics import DURATIONS, OfferedQos, WORDS
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class, steady_timer
@@ -26,21 +27,17 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-#: Periods of topic discovery, of flushes to the disk, and of taking received messages [s].
-_DISCOVERY_PERIOD: Final = 0.1
-_FLUSH_PERIOD: Final = 0.5
-_TAKE_PERIOD: Final = 0.005
-
-#: Queue length of a topic, and largest number of its messages that are taken at once.
-_DEPTH: Final = 5000
-_AT_ONCE: Final = 1000
+_DISCOVERY_PERIOD: Final = 0.1  # period of topic discovery [s]
+_FLUSH_PERIOD: Final = 0.5  # period of flushes to the disk [s]
+_TAKE_PERIOD: Final = 0.005  # period of taking received messages [s]
+_DEPTH: Final = 5000  # queue length of a topic
+_AT_ONCE: Final = 1000  # largest number of its messages that are taken at once
 
 #: Last parts of the names of topics that are recorded best effort: retransmission would increase
 #: the CPU load of the plant by a third.
 _LOSSY: Final = {topic.name.rpartition('/')[2] for topic in TOPICS if topic.qos.lossy}
 
-#: Topics of the middleware that * does not include.
-_NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
+_NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')  # not included in *
 
 
 class _Recorded(NamedTuple):
@@ -106,24 +103,16 @@ class RecorderNode(BaseNode):
         if self._bag is not None:
             self._end(self._bag)
 
-    def activate(self) -> None:
-        self._begin()
-
     def deactivate(self) -> None:
-        if self._bag is not None:
-            self._end(self._bag)
+        self.cleanup()
 
     def diagnose(self) -> Diagnosis[RecorderStatus]:
         if self._bag is None:
             return Diagnosis(Severity.INFO, 'not recording', RecorderStatus())
+        path, size = str(self._bag.path), self._bag.size
         counts, lost = dict(self._bag.counts), dict(self._bag.lost)
-        status = RecorderStatus(
-            path=str(self._bag.path),
-            messages=sum(counts.values()),
-            size=self._bag.size,
-            recorded=counts,
-            lost=lost,
-        )
+        number = sum(counts.values())
+        status = RecorderStatus(path=path, messages=number, size=size, recorded=counts, lost=lost)
         what = f'recording to {self._bag.path}'
         if lost:
             return Diagnosis(Severity.WARNING, f'{what}; lost {described(lost)}', status)
@@ -137,7 +126,7 @@ class RecorderNode(BaseNode):
             if not self.is_active:
                 raise RecordingError('not active')
             if self._bag is None:
-                self._begin()
+                self.activate()
             response.success, response.message = True, self.diagnose().message
         except RecordingError as error:
             response.message = str(error)
@@ -153,7 +142,8 @@ class RecorderNode(BaseNode):
 
     # Recording.
 
-    def _begin(self) -> None:
+    def activate(self) -> None:
+        """Start a recording."""
         number = self._recordings + 1
         path = self._path.with_name(f'{self._path.name}_{number}') if number > 1 else self._path
         self._bag = BagWriter(path, self._compression)
@@ -170,10 +160,10 @@ class RecorderNode(BaseNode):
         if self._bag is None:
             return self.failure or 'not recording'
         self._release()
-        try:
+        with self._writing(bag):
             bag.close()
-        except OSError as error:
-            return self._give_up(bag, error)
+        if self.failure:
+            return self.failure
         counts = bag.counts
         result = f'recorded {sum(counts.values())} messages to {bag.path}'
         lines = [f'{count:8d} {topic}' for topic, count in sorted(counts.items())]
@@ -192,33 +182,30 @@ class RecorderNode(BaseNode):
         self._report_recorded(0)
         self._bag = None
 
-    def _give_up(self, bag: BagWriter, error: OSError) -> str:
+    @contextmanager
+    def _writing(self, bag: BagWriter) -> Iterator[None]:
         """Stop the recording after a disk error; the bag remains readable up to this point."""
-        self._release()
-        bag.abort()
-        self.failed = True
-        self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
-        self.get_logger().error(self.failure)
-        self.publish_diagnostics()
-        return self.failure
+        try:
+            yield
+        except OSError as error:
+            self._release()
+            bag.abort()
+            self.failed = True
+            self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
+            self.get_logger().error(self.failure)
+            self.publish_diagnostics()
 
     def _flush(self) -> None:
         if self._bag is not None:
-            try:
+            with self._writing(self._bag):
                 self._bag.flush()
-            except OSError as error:
-                self._give_up(self._bag, error)
 
     def _take(self, most: int) -> None:
         """Write the received messages with their time of reception by the middleware."""
-        for topic, recorded in self._recorded.items():
-            if self._bag is None:
-                return
-            try:
-                self._take_from(self._bag, topic, recorded, most)
-            except OSError as error:
-                self._give_up(self._bag, error)
-                return
+        for topic, recorded in list(self._recorded.items()):
+            if self._bag is not None:
+                with self._writing(self._bag):
+                    self._take_from(self._bag, topic, recorded, most)
         if self._bag is not None and self._bag.lost:
             self.report_change()
         if self._sampled.keys() & self._recorded.keys():
@@ -256,14 +243,12 @@ class RecorderNode(BaseNode):
 
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():
-            if self._bag is not None and self._is_wanted(topic):
+            wanted = topic in self._names or (self._all and not is_hidden(topic))
+            if self._bag is not None and wanted and topic not in self._left_out:
                 publishers = self.get_publishers_info_by_topic(topic)
                 if publishers:
-                    self._subscribe(self._bag, topic, types, publishers)
-
-    def _is_wanted(self, topic: str) -> bool:
-        wanted = topic in self._names or (self._all and not is_hidden(topic))
-        return wanted and topic not in self._left_out
+                    with self._writing(self._bag):
+                        self._subscribe(self._bag, topic, types, publishers)
 
     def _subscribe(
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
@@ -285,9 +270,6 @@ class RecorderNode(BaseNode):
         except (MessageError, RecordingError) as error:
             self._left_out.add(topic)
             self.get_logger().warning(f'{topic} left out: {error}')
-            return
-        except OSError as error:
-            self._give_up(bag, error)
             return
         if before and before.best_effort >= best_effort and before.latched <= latched:
             self._recorded[topic] = before._replace(offered=offered)
@@ -317,16 +299,9 @@ def is_hidden(topic: str) -> bool:
 
 
 def _offer(qos: QoSProfile) -> OfferedQos:
-    return OfferedQos(
-        reliability=qos.reliability.name.lower(),
-        durability=qos.durability.name.lower(),
-        history=qos.history.name.lower(),
-        depth=qos.depth,
-        deadline=qos.deadline.nanoseconds,
-        lifespan=qos.lifespan.nanoseconds,
-        liveliness=qos.liveliness.name.lower(),
-        lease=qos.liveliness_lease_duration.nanoseconds,
-    )
+    words = {name: getattr(qos, name).name.lower() for name in WORDS}
+    times = {name: getattr(qos, name).nanoseconds for name in DURATIONS}
+    return OfferedQos(depth=qos.depth, **words, **times)
 
 
 if __name__ == '__main__':

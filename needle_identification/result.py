@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from math import atan2, hypot, isfinite, sqrt
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Final
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
-from needle_identification.estimation.formatting import between, UNKNOWN
+from needle_identification.estimation.formatting import between, suffix, UNKNOWN
 from needle_identification.friction.estimate import FrictionSummary
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.steering.estimate import SteeringEstimate
@@ -51,16 +51,18 @@ def result_yaml(
         *([stiffness.tissue_stiffness] if stiffness else ()),
     ]
     names = [e.name for summary in (friction, stiffness) if summary for e in summary.estimates]
-    lines = [
-        '# Needle and tissue, identified by needle_identification.',
-        *(f'# {_described(statistic)}' for statistic in found),
-        *(f'# from {" ".join(name.split())}' for name in names),
-    ]
     values = model_parameters(found)
     if not values:
         raise IdentificationError('the data determine no parameter of the model')
-    sections = {f'/**/{node}': {'ros__parameters': dict(values)} for node in NODES}
-    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+    lines = [*map(_described, found), *(f'from {" ".join(name.split())}' for name in names)]
+    return _file('Needle and tissue', lines, dict.fromkeys(NODES, values))
+
+
+def _file(title: str, lines: Sequence[str], nodes: Mapping[str, Mapping[str, object]]) -> str:
+    """Return a ROS parameter file with comments, from the parameters of each node."""
+    head = [f'# {line}' for line in (f'{title}, identified by needle_identification.', *lines)]
+    sections = {f'/**/{node}': {'ros__parameters': {**own}} for node, own in nodes.items() if own}
+    return '\n'.join([*head, yaml.safe_dump(sections, sort_keys=False)])
 
 
 def _described(statistic: Statistic) -> str:
@@ -68,17 +70,15 @@ def _described(statistic: Statistic) -> str:
     if not isfinite(statistic.mean):
         return f'{what} is {UNKNOWN}'
     scatter = '' if statistic.deviation is None else f', STD over bags {statistic.deviation:.4g}'
-    unit = '' if statistic.unit == '1' else f' {statistic.unit}'
-    return f'{what} = {statistic.mean:.6g}{unit}, SE {statistic.error:.2g}{scatter}'
+    value = f'{statistic.mean:.6g}{suffix(statistic.unit)}'
+    return f'{what} = {value}, SE {statistic.error:.2g}{scatter}'
 
 
 def write_result(
     path: Path | str, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> None:
     """
-    Write the parameters to a ROS parameter file, with errors and recordings in comments.
-
-    The parameters apply to nodes named plant and controller in any namespace.
+    Write a ROS parameter file for plant and controller, with errors and recordings in comments.
 
     Parameters
     ----------
@@ -93,8 +93,6 @@ def write_result(
     ------
     IdentificationError
         If the data determine no parameter.
-    ParameterError
-        If the file cannot be written.
 
     """
     write_whole(path, result_yaml(friction, stiffness).encode())
@@ -102,7 +100,6 @@ def write_result(
 
 def steering_yaml(found: SteeringEstimate) -> str:
     """Return a ROS parameter file for plant, controller and steering node, errors as comments."""
-    # The data determine lengths, not forces: the bending stiffness is the default.
     # Imported here for the same reason.
     from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE
     from needle_dynamics.steering.parameters import tissue_of
@@ -116,55 +113,52 @@ def steering_yaml(found: SteeringEstimate) -> str:
     length = medium['bending_length']
     if not length.determined:
         raise IdentificationError('the data do not determine the bending length')
+    # The data determine lengths, not forces: the bending stiffness is the default.
     stiffness = NeedleParameters.preset(PAPER_NEEDLE).bending_stiffness
     tissue = tissue_of(stiffness, length.value)
-    lines = ['# Steered needle, identified by needle_identification.']
+    lines = []
     for one in (found.free_length, *medium.parameters):
-        unit = '' if one.unit == '1' else f' {one.unit}'
         known = f'SE {one.error:.2g}' if one.determined else UNKNOWN
-        lines.append(f'# {one.symbol} ({one.name}) = {one.value:.6g}{unit}, {known}')
-    lines.append(f'# E I = {stiffness:g} N m^2 of the needle {PAPER_NEEDLE}')
+        lines.append(f'{one.symbol} ({one.name}) = {one.value:.6g}{suffix(one.unit)}, {known}')
+    lines.append(f'E I = {stiffness:g} N m^2 of the needle {PAPER_NEEDLE}')
     if medium.held_out is not None:
         lines.append(
-            f'# error of predicted recordings {medium.held_out.rms:.3g} m, '
+            f'error of predicted recordings {medium.held_out.rms:.3g} m, '
             f'{between(medium.held_out.interval)}'
         )
     lines.append(
-        f'# path noise {medium.path_noise:.3g} rad^2/m, noise of a reading {medium.noise:.3g} m'
+        f'path noise {medium.path_noise:.3g} rad^2/m, noise of a reading {medium.noise:.3g} m'
     )
     low, high = _PATH_NOISE
     prior = {'prior.path_noise': _short(min(max(medium.path_noise, low), high))}
-    lengths: dict[str, object] = {}
     # Also if they are not determined: the bending length is for these values.
-    lengths['steering.free_length'] = _short(found.free_length.value)
-    lengths['steering.skin_stiffness'] = _short(medium['skin'].value * tissue)
+    lengths: dict[str, object] = {
+        'steering.free_length': _short(found.free_length.value),
+        'steering.skin_stiffness': _short(medium['skin'].value * tissue),
+    }
     steering = {'steered': True, **lengths}
     if 'bevel' in found.terms:
         z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
         steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
-        lines.append(f'# the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
+        lines.append(f'the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
     model = {'needle': PAPER_NEEDLE, 'model.tissue_stiffness': _short(tissue)}
-    sections = {
-        '/**/plant': {'ros__parameters': {**model, **steering}},
-        '/**/controller': {'ros__parameters': model},
-        '/**/steering': {'ros__parameters': {**model, **lengths, **prior}},
+    nodes = {
+        'plant': {**model, **steering},
+        'controller': model,
+        'steering': {**model, **lengths, **prior},
     }
-    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+    return _file('Steered needle', lines, nodes)
 
 
 def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool) -> str:
-    """
-    Return a ROS parameter file for the tip sensor of the plant, and the priors of steering.
-
-    ``measurement_time`` is the duration of an averaged measurement [s]; ``delayed``, whether the
-    times of the samples are of their messages, so that the delay is of the messages, too.
-    """
-    lines = ['# Tip sensor, identified by needle_identification.']
+    """Return a ROS parameter file for the tip sensor of the plant, and the priors of steering."""
+    # `measurement_time`: duration of an averaged measurement [s]; `delayed`: the times of samples
+    # are those of their messages, and so is the delay.
+    lines = []
     for one in found.parameters:
-        unit = '' if one.unit == '1' else f' {one.unit}'
-        text = f'{one.value:.6g}{unit}, {between(one.interval)}' if one.determined else UNKNOWN
-        lines.append(f'# {one.symbol} ({one.name}) = {text}')
-    lines.append(f'# from {" ".join(found.name.split())}, {found.samples} samples')
+        text = f'{one.value:.6g}{suffix(one.unit)}, {between(one.interval)}'
+        lines.append(f'{one.symbol} ({one.name}) = {text if one.determined else UNKNOWN}')
+    lines.append(f'from {" ".join(found.name.split())}, {found.samples} samples')
     noise, slow = found['noise'], found['slow_noise']
     plant: dict[str, float | list[float]] = {'tip.rate': float(f'{found.rate:.4g}')}
     names = ['slow_noise', 'slow_time', 'dropout', 'dropout_time']
@@ -183,10 +177,7 @@ def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool
         prior['prior.noise'] = _short(noise.value / sqrt(readings))
     if slow.determined:
         prior['prior.drift'] = _short(slow.value)
-    sections = {'/**/plant': {'ros__parameters': plant}}
-    if prior:
-        sections['/**/steering'] = {'ros__parameters': dict(prior)}
-    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+    return _file('Tip sensor', lines, {'plant': plant, 'steering': prior})
 
 
 def _short(value: float) -> float:

@@ -57,11 +57,6 @@ class Bag:
     losses : list of str
         Missing or damaged parts, up to the present position of `batches`.
 
-    Raises
-    ------
-    RecordingError
-        If the path is not a recording.
-
     Examples
     --------
     >>> bag = Bag('bags/friction_01')
@@ -86,20 +81,7 @@ class Bag:
         return f'<Bag {self.path}>'
 
     def topics(self) -> tuple[BagTopic, ...]:
-        """
-        List the topics that have messages.
-
-        Returns
-        -------
-        tuple of Topic
-            Sorted by name.
-
-        Raises
-        ------
-        RecordingError
-            If the bag has no messages.
-
-        """
+        """Return the topics with messages, by name; raise a `RecordingError` if there are none."""
         found: set[BagTopic] = set()
         for file in self._files:
             indexed = indexed_topics(file) if file.suffix == '.mcap' else None
@@ -118,39 +100,15 @@ class Bag:
         return self.counts
 
     def batches(self, wanted: Callable[[BagTopic], bool]) -> Iterator[MessageBatch]:
-        """
-        Iterate over the bag in batches of messages, from its start.
-
-        Parameters
-        ----------
-        wanted : callable
-            Selects topics: returns whether to read the messages of a topic.
-
-        Yields
-        ------
-        MessageBatch
-            Messages of one topic.
-
-        """
+        """Yield batches of messages of the selected topics, from the start of the bag."""
         for _, batch in self._pieces(wanted):
             yield batch
 
     def messages(self, wanted: Callable[[BagTopic], bool]) -> Iterator[Recorded]:
         """
-        Iterate over the messages in the order of receive time.
+        Yield messages of the selected topics in the order of receive time.
 
         A message stored more than 4 MB after its place in this order is yielded when it is read.
-
-        Parameters
-        ----------
-        wanted : callable
-            Selects topics: returns whether to read the messages of a topic.
-
-        Yields
-        ------
-        Recorded
-            A message.
-
         """
         waiting: list[tuple[int, int, BagTopic, bytes]] = []
         size = order = 0
@@ -195,25 +153,7 @@ class Bag:
 
 
 def message_counts(path: Path | str) -> dict[str, int]:
-    """
-    Count the messages of a bag.
-
-    Parameters
-    ----------
-    path : Path or str
-        As in `Bag`.
-
-    Returns
-    -------
-    dict
-        Number of messages by topic name, sorted by name.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or empty.
-
-    """
+    """Return the number of messages of a bag by topic name, sorted by name."""
     bag = Bag(path)
     counts = Counter[str]()
     for topic, number in sorted(bag._count().items(), key=lambda item: item[0].name):
@@ -246,7 +186,7 @@ def read_topic(path: Path | str, topic: str) -> list[tuple[int, Any]]:
     Raises
     ------
     RecordingError
-        If the bag is not readable, has no such topic, or a message is invalid.
+        If the bag lacks the topic, or a message is invalid.
 
     Examples
     --------

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_BATCH: Final = 2**14  #: largest number of messages in a batch
-
-#: Upper limit of receive times, so that their differences fit in 64 bits [ns].
-LATEST: Final = 2**62
+LATEST: Final = 2**62  #: upper limit of receive times: differences fit in 64 bits [ns]
 
 #: Magic bytes of compressed messages; others begin with 0.
 _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
@@ -46,10 +44,8 @@ class MessageBatch(NamedTuple):
         cls, topic: BagTopic, times: Sequence[Any], messages: Sequence[Any]
     ) -> MessageBatch:
         """Build a batch from values of a file; invalid times are 0, invalid messages empty."""
-        stamps = np.array(
-            [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times],
-            dtype=np.int64,
-        )
+        valid = [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times]
+        stamps = np.array(valid, dtype=np.int64)
         return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
 
     def messages(self) -> Iterator[tuple[int, bytes]]:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from math import isfinite
 import os
 from pathlib import Path
@@ -31,29 +32,28 @@ DAMAGED: Final = (
 )
 
 FACTOR: Final = 'NEEDLE_BAG_FACTOR'  #: environment variable: factor of all limits of this module
-
-#: Largest record or chunk, and largest message that was compressed individually [bytes].
-LARGEST_RECORD: Final = 2**27
-LARGEST_MESSAGE: Final = 2**26
-
-#: Decompressed size allowed for any file [bytes], and per byte of the file.
-_AT_LEAST: Final = 2**28
-_RATIO: Final = 50
-
-#: Records allowed for any file, else one per byte: a message at rest takes 2 or 3 bytes.
-_RECORDS: Final = 2**20
+LARGEST_RECORD: Final = 2**27  #: largest record or chunk [bytes]
+LARGEST_MESSAGE: Final = 2**26  #: largest message that was compressed individually [bytes]
+_AT_LEAST: Final = 2**28  # decompressed size allowed for any file [bytes]
+_RATIO: Final = 50  # decompressed size allowed per byte of a file
+_RECORDS: Final = 2**20  # records allowed for any file, else one per byte
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
 
-def open_file(file: Path, budget: Budget) -> Any:
+@contextmanager
+def open_file(file: Path, budget: Budget) -> Iterator[Any]:
     """Open the decompressed content of a file as a binary stream; count each byte read."""
+    stream: Any
     if file.suffix == '.lz4':
-        archive = lz4.frame.LZ4FrameFile(file)
+        stream = lz4.frame.LZ4FrameFile(file)
         # `read` would discard the last data of a truncated file.
-        archive.read = archive.read1
-        return _Metered(archive, budget)
-    stream = file.open('rb')
-    return _Metered(_zstd_stream(stream) if file.suffix in COMPRESSED else stream, budget)
+        stream.read = stream.read1
+    else:
+        stream = file.open('rb')
+        if file.suffix in COMPRESSED:
+            stream = _zstd_stream(stream)
+    with closing(stream):
+        yield _Metered(stream, budget)
 
 
 def read_up_to(stream: Any, length: int) -> bytes:
@@ -127,12 +127,6 @@ class Budget:
 class _Metered:
     def __init__(self, stream: Any, budget: Budget) -> None:
         self._stream, self._budget = stream, budget
-
-    def __enter__(self) -> _Metered:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._stream.close()
 
     def read(self, size: int) -> bytes:
         part: bytes = self._stream.read(size)

@@ -10,9 +10,7 @@ from needle_identification.errors import RecordingError
 from needle_ros.documents import DocumentError, LARGEST, read_document
 from needle_ros.errors import printable
 
-#: File of a rosbag2 folder that lists its other files; written when the bag is closed.
-METADATA: Final = 'metadata.yaml'
-
+METADATA: Final = 'metadata.yaml'  #: lists the other files, written at the end
 LOST: Final = 'messages lost'  #: key of the metadata for the messages that the recorder lost
 
 _FORMS: Final = ('.mcap', '.db3', '.bag')
@@ -39,15 +37,13 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
             raise RecordingError(f'{path} is not a recording; {_VALID}')
         return [path], []
     # Sort part_10 after part_9.
-    found = sorted(
-        (file for file in (path.iterdir() if path.is_dir() else ()) if file.is_file()),
-        key=lambda file: [len(file.name), file.name],
-    )
+    inside = path.iterdir() if path.is_dir() else ()
+    found = sorted(filter(Path.is_file, inside), key=lambda file: [len(file.name), file.name])
     by_form = {form: [file for file in found if form_of(file) == form] for form in _FORMS}
     chosen = next(filter(None, by_form.values()), [])
     if not chosen:
-        inside = min(path.glob(f'*/{METADATA}'), default=None)
-        hint = _VALID if inside is None else f'name those inside, such as {inside.parent}'
+        other = min(path.glob(f'*/{METADATA}'), default=None)
+        hint = _VALID if other is None else f'name those inside, such as {other.parent}'
         raise RecordingError(f'{path} holds no recording; {hint}')
     names, losses = None, [f'no readable {METADATA}: the recording was not closed']
     try:

@@ -14,15 +14,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
+from needle_identification.bags import compression
 from needle_identification.bags.batch import LARGEST_BATCH, LATEST, MessageBatch, Tally
-from needle_identification.bags.compression import (
-    BLOCK,
-    COSTLY,
-    DAMAGED,
-    decompress,
-    open_file,
-    read_up_to,
-)
 from needle_identification.bags.topics import BagTopic, make_topic
 from needle_identification.errors import RecordingError
 import numpy as np
@@ -32,10 +25,7 @@ from numpy.typing import NDArray
 _MAGIC: Final = b'\x89MCAP0\r\n'
 
 _HEAD: Final = struct.Struct('<BQ')  # opcode and length of a record
-
-#: Start, end, size, checksum and length of the name of the compression of a chunk.
-_CHUNK: Final = struct.Struct('<QQQII')
-
+_CHUNK: Final = struct.Struct('<QQQII')  # start, end, size, checksum, length of compression
 _TAIL: Final = struct.Struct('<BQQQI8s')  # the end of a file: a footer record and the magic bytes
 
 #: Header of a message record.
@@ -45,7 +35,7 @@ _MESSAGE: Final = np.dtype(
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
 _SUMMARY: Final = 2**24  #: largest index that is read, of 80,000 chunks or more [bytes]
-DAMAGED_MCAP: Final = (*DAMAGED, McapError)  #: exceptions for damaged bytes
+DAMAGED_MCAP: Final = (*compression.DAMAGED, McapError)  #: exceptions for damaged bytes
 
 
 class _Channels:
@@ -57,7 +47,6 @@ class _Channels:
         self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
 
     def define(self, opcode: int, record: bytes) -> None:
-        """Add a schema, channel or statistics record; ignore other records."""
         stream = ReadDataStream(BytesIO(record))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
@@ -65,14 +54,10 @@ class _Channels:
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
             schema = self._schemas[channel.schema_id]
-            self.topics[channel.id] = make_topic(
-                channel.topic,
-                schema.name,
-                channel.message_encoding,
-                schema.encoding,
-                schema.data.decode(errors='replace'),
-                channel.metadata.get('offered_qos_profiles', ''),
-            )
+            definition = schema.data.decode(errors='replace')
+            profiles = channel.metadata.get('offered_qos_profiles', '')
+            own = channel.topic, schema.name, channel.message_encoding
+            self.topics[channel.id] = make_topic(*own, schema.encoding, definition, profiles)
         elif opcode == Opcode.STATISTICS:
             self.counts = Statistics.read(stream).channel_message_counts
 
@@ -107,28 +92,28 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     channels = _Channels()
     loose = bytearray()
     is_complete = False
-    with open_file(file, tally.budget) as stream:
-        magic = read_up_to(stream, len(_MAGIC))
+    with compression.open_file(file, tally.budget) as stream:
+        magic = compression.read_up_to(stream, len(_MAGIC))
         if magic != _MAGIC:
             begin = repr(magic) if magic else 'nothing'
             raise RecordingError(f'{file.name} is not an MCAP file: begins with {begin}')
-        while len(head := read_up_to(stream, _HEAD.size)) == _HEAD.size:
+        while len(head := compression.read_up_to(stream, _HEAD.size)) == _HEAD.size:
             opcode, length = _HEAD.unpack(head)
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
                 if length > tally.budget.largest:
                     tally.faults.append(f'is damaged: {tally.budget.too_large("record", length)}')
                     break
-                body = read_up_to(stream, length)
+                body = compression.read_up_to(stream, length)
                 if opcode != Opcode.CHUNK:
                     loose += head + body
-                if opcode == Opcode.CHUNK or len(loose) > BLOCK:
+                if opcode == Opcode.CHUNK or len(loose) > compression.BLOCK:
                     yield from _batches(bytes(loose), channels, tally)
                     loose.clear()
                 if opcode == Opcode.CHUNK:
                     yield from _batches(_chunk_content(body, length, tally), channels, tally)
             else:
-                tally.budget.spend(0, COSTLY)
-                first = read_up_to(stream, min(length, 8))
+                tally.budget.spend(0, compression.COSTLY)
+                first = compression.read_up_to(stream, min(length, 8))
                 if opcode == Opcode.STATISTICS:
                     tally.written = int.from_bytes(first, 'little')
                 _skip(stream, length - len(first))
@@ -143,7 +128,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
 
 
 def _skip(stream: Any, length: int) -> None:
-    while length > 0 and (part := read_up_to(stream, min(length, BLOCK))):
+    while length > 0 and (part := compression.read_up_to(stream, min(length, compression.BLOCK))):
         length -= len(part)
 
 
@@ -154,7 +139,7 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
         begin = _CHUNK.size + name_length + 8
         if size > tally.budget.largest:
             raise ValueError(tally.budget.too_large('chunk', size))
-        data = decompress(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
+        data = compression.decompress(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
         tally.budget.spend(len(data))
         if len(chunk) == length:
             if len(data) != size:
@@ -191,7 +176,7 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Mess
     for begin, end in _records(content):
         opcodes = data[begin - _HEAD.size]
         definitions = np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL))
-        tally.budget.spend(0, len(begin) + COSTLY * (1 + len(definitions)))
+        tally.budget.spend(0, len(begin) + compression.COSTLY * (1 + len(definitions)))
         for k in definitions:
             # Messages of an unreadable channel are counted as of an unknown topic.
             with suppress(*DAMAGED_MCAP):

@@ -10,43 +10,19 @@ from typing import Any
 from needle_identification.bags.compression import DAMAGED
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
+from rosbags import typesys
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import (
-    get_types_from_idl,
-    get_types_from_msg,
-    get_typestore,
-    Stores,
-    TypesysError,
-)
 from rosbags.typesys.store import Typestore
 
 
 @lru_cache(maxsize=1)
 def _jazzy() -> Typestore:
-    return get_typestore(Stores.ROS2_JAZZY)
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
 
 
 def message_type(type_name: str) -> Any:
-    """
-    Return the class of a standard message, for `encode`.
-
-    Parameters
-    ----------
-    type_name : str
-        Type, such as ``sensor_msgs/msg/JointState``.
-
-    Returns
-    -------
-    type
-        Message class.
-
-    Raises
-    ------
-    RecordingError
-        If the type is not in ROS 2 Jazzy.
-
-    """
+    """Return the class of a message type of ROS 2 Jazzy, for `encode`."""
     try:
         return _jazzy().types[type_name]
     except KeyError:
@@ -63,13 +39,13 @@ def _installed(type_name: str) -> Typestore:
         name = wanted.pop()
         if name in store.fielddefs or name in types:
             continue
-        found = get_types_from_msg(_message_file(name).read_text(encoding='utf-8'), name)
+        found = typesys.get_types_from_msg(_message_file(name).read_text(encoding='utf-8'), name)
         types.update(found)
         for _, fields in found.values():
             wanted += [part for _, kind in fields if (part := _message_in(kind))]
     if not types:
         return store
-    own = get_typestore(Stores.ROS2_JAZZY)
+    own = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     own.register(types)
     return own
 
@@ -99,50 +75,17 @@ def definition_of(type_name: str) -> tuple[str, str]:
         store = _installed(type_name)
         definition, _ = store.generate_msgdef(type_name, ros_version=2)
         return definition, store.hash_rihs01(type_name)
-    except (OSError, UnicodeDecodeError, TypesysError) as error:
+    except (OSError, UnicodeDecodeError, typesys.TypesysError) as error:
         raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
 
 
 def encode(message: Any) -> bytes:
-    """
-    Serialize a message.
-
-    Parameters
-    ----------
-    message : object
-        Message of a class of `message_type`.
-
-    Returns
-    -------
-    bytes
-        Serialized message (CDR).
-
-    """
+    """Serialize a message of a class of `message_type` (CDR)."""
     return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
 
 
 def deserialize(topic: BagTopic, data: bytes) -> Any:
-    """
-    Deserialize a message of a topic.
-
-    Parameters
-    ----------
-    topic : BagTopic
-        Topic of a bag; a type outside ROS 2 Jazzy is defined in the bag.
-    data : bytes
-        Serialized message (CDR).
-
-    Returns
-    -------
-    object
-        The message.
-
-    Raises
-    ------
-    RecordingError
-        If the type is unknown, or the bytes are not a message of this type.
-
-    """
+    """Deserialize a message (CDR) of a topic; the bag defines types outside ROS 2 Jazzy."""
     store = _store(topic.type_name, topic.encoding, topic.definition)
     try:
         if data[:2] not in (b'\0\0', b'\0\1'):
@@ -164,16 +107,16 @@ def _store(type_name: str, encoding: str, definition: str) -> Typestore:
     known = _jazzy().fielddefs
     if type_name in known:
         return _jazzy()
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     try:
         if encoding == 'ros2msg':
-            types = get_types_from_msg(definition, type_name)
+            types = typesys.get_types_from_msg(definition, type_name)
         else:
             types = {}
             for part in re.split(r'^=+\nIDL: .*\n', definition, flags=re.MULTILINE):
-                types.update(get_types_from_idl(part) if part.strip() else {})
+                types.update(typesys.get_types_from_idl(part) if part.strip() else {})
         store.register({name: fields for name, fields in types.items() if name not in known})
-    except TypesysError as error:
+    except typesys.TypesysError as error:
         raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
     if type_name not in store.fielddefs:
         raise RecordingError(f'the bag does not hold the definition of {type_name}')

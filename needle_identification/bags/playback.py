@@ -14,8 +14,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 
-#: Longest plausible pause between two messages: a day [ns].
-_LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS
+_LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS  # longest plausible pause: a day [ns]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +66,6 @@ class BagPlayback:
         return self._origin + round(self.settings.start * NANOSECONDS)
 
     def change(self, settings: PlaybackSettings) -> None:
-        """Change the rate during playback."""
         self._set_position(self.position)
         self.settings = settings
 

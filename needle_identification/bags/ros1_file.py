@@ -19,12 +19,9 @@ from rosbags.rosbag1.reader import decompressors
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 
-#: Size of an entry of the index; number of bytes in a chunk that count as a record.
-_ENTRY: Final = 12
-_RECORD: Final = 128
-
-#: Exceptions of the library for damaged bytes.
-_DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)
+_ENTRY: Final = 12  # size of an entry of the index [bytes]
+_RECORD: Final = 128  # number of bytes in a chunk that count as a record
+_DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)  # for damaged bytes
 
 #: Decompressors of the library, and replacements with a size limit.
 _BOUNDED: Final[dict[Any, Callable[[bytes, int], bytes]]] = {
@@ -97,7 +94,6 @@ def _messages(reader: Reader, budget: Budget) -> Iterator[tuple[int, int, bytes]
 
 
 def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:
-    """Convert a message to ROS 2; return b'' if it is not readable."""
     try:
         return bytes(convert(data))
     except _DAMAGED:

@@ -19,12 +19,9 @@ from needle_identification.errors import RecordingError
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
 _ROW: Final = 16  # size of a row in addition to its data [bytes]
-
-#: Limit of SQLite steps (constant, and per byte of the file), and steps between two checks.
-#: A message takes 20 to 40 steps and 40 bytes.
-_STEPS: Final = 10**8
-_STEPS_PER_BYTE: Final = 20
-_STEPS_PER_CALL: Final = 10**5
+_STEPS: Final = 10**8  # limit of SQLite steps; a message of 40 bytes takes 20 to 40
+_STEPS_PER_BYTE: Final = 20  # additional steps per byte of the file
+_STEPS_PER_CALL: Final = 10**5  # steps between two checks
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
@@ -76,23 +73,18 @@ def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
 
 
 def _topics(database: sqlite3.Connection) -> dict[int, BagTopic]:
-    definitions: dict[Any, tuple[Any, Any]] = {}
+    definitions: dict[Any, list[Any]] = {}
     with suppress(sqlite3.Error):
         # Older recordings lack this table.
-        definitions = {
-            name: (encoding, definition)
-            for name, encoding, definition in database.execute(
-                'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
-            )
-        }
+        query = 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+        definitions = {name: own for name, *own in database.execute(query)}
     profiles: dict[Any, Any] = {}
     with suppress(sqlite3.Error):
         # The oldest recordings lack this column.
         profiles.update(database.execute('SELECT id, offered_qos_profiles FROM topics'))
     topics = {}
-    for key, name, kind, form in database.execute(
-        'SELECT id, name, type, serialization_format FROM topics'
-    ):
+    query = 'SELECT id, name, type, serialization_format FROM topics'
+    for key, name, kind, form in database.execute(query):
         encoding, definition = definitions.get(kind, ('', ''))
         words = map(_text, (name, kind, form, encoding, definition, profiles.get(key, '')))
         if isinstance(key, int):

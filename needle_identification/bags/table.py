@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MOST: Final = 64  #: largest number of elements of a sequence that are columns of their own
-
-#: Fields with the names of the elements of the other sequences in a message.
-_LABELS: Final = ('name', 'names', 'joint_names')
+_LABELS: Final = ('name', 'names', 'joint_names')  # names of elements of other fields
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -60,11 +58,6 @@ def read_bag(path: Path | str, topic: str) -> TopicTable:
     -------
     TopicTable
         Columns, with `to_dataframe` and `plot`.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable, has no such topic, or a message is invalid.
 
     Examples
     --------

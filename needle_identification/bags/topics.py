@@ -10,14 +10,15 @@ from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import shown
 from needle_ros.timing import NANOSECONDS
 
-#: Names of rosbag2 for the numbers in older recordings.
-_WORDS: Final = {
+#: Policies of a QoS, with the names of rosbag2 for the numbers in older recordings.
+WORDS: Final[Mapping[str, Mapping[Any, str]]] = {
     'reliability': {1: 'reliable', 2: 'best_effort'},
     'durability': {1: 'transient_local', 2: 'volatile'},
     'history': {1: 'keep_last', 2: 'keep_all'},
     'liveliness': {1: 'automatic', 3: 'manual_by_topic'},
 }
 
+DURATIONS: Final = ('deadline', 'lifespan', 'liveliness_lease_duration')  #: times of a QoS
 UNLIMITED: Final = 2**63 - 1  #: value of the middleware for no limit [ns]
 
 
@@ -31,26 +32,25 @@ class OfferedQos(NamedTuple):
     deadline: int = UNLIMITED  # longest time between messages
     lifespan: int = UNLIMITED  # longest lifetime of a message
     liveliness: str = 'automatic'  # or manual_by_topic
-    lease: int = UNLIMITED  # longest time without a liveliness signal of the publisher
+    liveliness_lease_duration: int = UNLIMITED  # longest time without a signal of the publisher
 
     def as_mapping(self) -> dict[str, Any]:
-        """Return the profile in the storage format of rosbag2."""
-        return {
-            'history': self.history,
-            'depth': self.depth,
-            'reliability': self.reliability,
-            'durability': self.durability,
-            'deadline': _time(self.deadline),
-            'lifespan': _time(self.lifespan),
-            'liveliness': self.liveliness,
-            'liveliness_lease_duration': _time(self.lease),
-            'avoid_ros_namespace_conventions': False,
-        }
+        times = {}
+        for name in DURATIONS:
+            sec, nsec = divmod(getattr(self, name), NANOSECONDS)
+            times[name] = {'sec': sec, 'nsec': nsec}
+        return {**self._asdict(), **times, 'avoid_ros_namespace_conventions': False}
 
 
-def _time(nanoseconds: int) -> dict[str, int]:
-    sec, nsec = divmod(nanoseconds, NANOSECONDS)
-    return {'sec': sec, 'nsec': nsec}
+def _stored(profile: Mapping[str, Any]) -> OfferedQos:
+    """Return a profile in the storage format of rosbag2; older ones have no liveliness."""
+    words = {
+        name: known.get(profile[name], profile[name])
+        for name, known in WORDS.items()
+        if name in profile or name != 'liveliness'
+    }
+    times: dict[str, Any] = {name: _nanoseconds(profile.get(name)) for name in DURATIONS}
+    return OfferedQos(depth=int(profile['depth']), **words, **times)
 
 
 def _nanoseconds(time: Mapping[str, int] | None) -> int:
@@ -81,21 +81,7 @@ class BagTopic:
     def offered_qos(self) -> tuple[OfferedQos, ...]:
         """Return the QoS that each publisher offered; empty if missing or not readable."""
         try:
-            profiles = read_document(self.profiles) or []
-            return tuple(
-                OfferedQos(
-                    **{
-                        name: words.get(stored[name], stored[name])
-                        for name, words in _WORDS.items()
-                        if name in stored or name != 'liveliness'
-                    },
-                    depth=int(stored['depth']),
-                    deadline=_nanoseconds(stored.get('deadline')),
-                    lifespan=_nanoseconds(stored.get('lifespan')),
-                    lease=_nanoseconds(stored.get('liveliness_lease_duration')),
-                )
-                for stored in profiles
-            )
+            return tuple(map(_stored, read_document(self.profiles) or []))
         except (DocumentError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
             return ()
 

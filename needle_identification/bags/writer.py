@@ -51,14 +51,13 @@ class BagWriter:
 
     Raises
     ------
-    ParameterError
-        If the compression is unknown.
     RecordingError
         If the folder exists or cannot be created.
 
     Examples
     --------
-    >>> from needle_identification import BagWriter, encode, message_type, read_topic
+    >>> from needle_identification import BagWriter, read_topic
+    >>> from needle_identification.bags.messages import encode, message_type
     >>> from tempfile import TemporaryDirectory
     >>> folder = TemporaryDirectory()
     >>> text = message_type('std_msgs/msg/String')
@@ -100,36 +99,16 @@ class BagWriter:
     def add_topic(
         self, topic: str, type_name: str, offered: Sequence[OfferedQos] = (OfferedQos(),)
     ) -> None:
-        """
-        Announce a topic, or update the QoS of its publishers.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-        type_name : str
-            Message type, such as ``geometry_msgs/msg/WrenchStamped``.
-        offered : sequence of OfferedQos
-            QoS of all of its publishers.
-
-        Raises
-        ------
-        RecordingError
-            If the definition of the type is not available.
-
-        """
+        """Announce a topic by its full name, or update the QoS of all of its publishers."""
         definition, type_hash = definition_of(type_name)
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
                 type_name, 'ros2msg', definition.encode()
             )
         profiles = [qos.as_mapping() for qos in offered]
-        self._channels[topic] = self._writer.register_channel(
-            topic,
-            'cdr',
-            self._schemas[type_name],
-            {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash},
-        )
+        about = {'offered_qos_profiles': yaml.safe_dump(profiles), 'topic_type_hash': type_hash}
+        schema = self._schemas[type_name]
+        self._channels[topic] = self._writer.register_channel(topic, 'cdr', schema, about)
         self.counts.setdefault(topic, 0)
         self._topics[topic] = {
             'name': topic,
@@ -140,19 +119,7 @@ class BagWriter:
         }
 
     def write(self, topic: str, data: bytes, receive_ns: int) -> None:
-        """
-        Write one serialized message of an announced topic.
-
-        Parameters
-        ----------
-        topic : str
-            Full name.
-        data : bytes
-            Serialized message (CDR).
-        receive_ns : int
-            Receive time, since the epoch [ns].
-
-        """
+        """Write a serialized message (CDR) of an announced topic, with its receive time [ns]."""
         self._writer.add_message(self._channels[topic], receive_ns, data, receive_ns)
         self.counts[topic] += 1
         self._start = min(self._start, receive_ns)

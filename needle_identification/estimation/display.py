@@ -58,20 +58,7 @@ class DisplayedEstimate(Displayed):
         return f'<{type(self).__name__}{of}: {", ".join(found + more)}>'
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
-        """
-        Draw each determined parameter with its 95 % interval.
-
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure, optional
-            Figure to draw in; by default a new one of ``matplotlib.pyplot``.
-
-        Returns
-        -------
-        list of matplotlib.axes.Axes
-            Axes of each parameter.
-
-        """
+        """Draw each determined parameter with its 95 % interval; return the axes of each."""
         panels: dict[str, list[tuple[str, ParameterEstimate | Statistic]]] = {}
         for of, one in self.rows():
             if np.isfinite(_value(one)):

@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import TypeVar
 
 from needle_identification.errors import IdentificationError
@@ -46,6 +46,17 @@ class Statistic:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
 
 
+def estimated(
+    name: str, symbol: str, unit: str, value: float, error: float, interval: tuple[float, float]
+) -> ParameterEstimate:
+    """Return an estimate, determined if its value and its interval are finite."""
+    known = isfinite(value) and all(map(isfinite, interval))
+    return ParameterEstimate(
+        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=interval,
+        determined=known,
+    )  # fmt: skip
+
+
 def with_half_width(
     unknown: ParameterEstimate, value: float, error: float, half_width: float
 ) -> ParameterEstimate:
@@ -66,16 +77,10 @@ def named(items: Sequence[_Named], name: str) -> _Named:
 
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
-    """
-    Compute the mean of one parameter over several recordings, as in Tables 1 and 2.
-
-    The standard error of the mean is the standard deviation over the recordings divided by the
-    square root of their number. Its lower limit results from the errors within the recordings,
-    because a few recordings may agree by chance. If the recordings differ by more than their own
-    errors, the interval is from Student's t, since a standard deviation from few recordings is
-    uncertain. Otherwise it is the mean plus and minus two standard errors. Undetermined estimates
-    are ignored.
-    """
+    """Return the mean of one parameter over the recordings that determine it."""
+    # As in Tables 1 and 2, the error is the standard deviation over the root of the number; at
+    # least that of the errors within the recordings, because a few may agree by chance. If the
+    # recordings differ by more than their errors, the interval is from Student's t.
     if not parameters:
         raise IdentificationError('no recordings to identify from')
     first = parameters[0]
@@ -91,11 +96,7 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     error = sqrt(max(within, between) / count)
     half_width = error * (float(stdtrit(count - 1, 0.975)) if between > within else 2.0)
     mean = float(values.mean())
+    ends = mean - half_width, mean + half_width
     return replace(
-        unknown,
-        mean=mean,
-        deviation=deviation,
-        error=error,
-        interval=(mean - half_width, mean + half_width),
-        count=count,
+        unknown, mean=mean, deviation=deviation, error=error, interval=ends, count=count
     )

@@ -4,32 +4,22 @@
 from math import floor, inf, isfinite, log10
 from typing import Final
 
-#: Text for a parameter that the data do not determine.
-UNKNOWN: Final = 'not determined by the data'
-
+UNKNOWN: Final = 'not determined by the data'  #: text for a parameter
 _SMALLEST_ERROR: Final = 1e-9  # smallest error that limits the digits
 
 
 def measured(value: float, error: float, unit: str = '') -> str:
-    """
-    Format a value with its error; `UNKNOWN` for a value that is not finite.
-
-    Examples
-    --------
-    >>> measured(0.56043, 0.00051, 'N')
-    '0.56043 ± 0.00051 N'
-
-    """
+    """Format a value with its error, such as ``0.56043 ± 0.00051 N``; else `UNKNOWN`."""
     if not isfinite(value):
         return UNKNOWN
     form = _format(error)
     text = f' ± {error:{form if form.endswith("f") else ".2g"}}' if isfinite(error) else ''
-    return f'{value:{form}}{text}{_suffix(unit)}'
+    return f'{value:{form}}{text}{suffix(unit)}'
 
 
 def rounded(value: float, error: float, unit: str = '') -> str:
     """Format a value without its error, rounded to significant digits; or `UNKNOWN`."""
-    return f'{value:{_format(error)}}{_suffix(unit)}' if isfinite(value) else UNKNOWN
+    return f'{value:{_format(error)}}{suffix(unit)}' if isfinite(value) else UNKNOWN
 
 
 def spread(deviation: float) -> str:
@@ -47,11 +37,11 @@ def between(interval: tuple[float, float]) -> str:
 
 
 def _format(error: float) -> str:
-    """Return the format specification for two digits of the error."""
     if not _SMALLEST_ERROR < error < inf:
         return '.6g'
     return f'.{max(1 - floor(log10(error)), 0)}f'
 
 
-def _suffix(unit: str) -> str:
+def suffix(unit: str) -> str:
+    """Return a unit for the end of a number; none of a pure number."""
     return '' if unit in ('', '1') else f' {unit}'

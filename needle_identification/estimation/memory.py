@@ -34,17 +34,10 @@ import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import ndtr, ndtri
 
-#: Variances of correlated noise relative to white noise in a part.
-_RATIOS: Final = np.geomspace(0.02, 2e6, 10)
-
-#: Number of correlation times, and the longest relative to the recording; the shortest is half a
-#: part.
-_TIMES: Final = 24
-_LONGEST: Final = 10.0
-
-#: Variances of differences relative to white noise in a part.
-_DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)
-
+_RATIOS: Final = np.geomspace(0.02, 2e6, 10)  # correlated over white variance
+_TIMES: Final = 24  # number of correlation times, from half a part
+_LONGEST: Final = 10.0  # longest correlation time, relative to the recording
+_DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)  # variances over white noise
 _DIFFERENCED: Final = 0.1  # prior probability of differences
 
 #: Prior probability of white noise. 0.5 is too large: a correlation time of a fifth of a part was
@@ -54,10 +47,8 @@ _WHITE: Final = 0.2
 _NEGLIGIBLE: Final = 1e-6  # smallest probability of a model that is included
 _BISECTIONS: Final = 30  # bisection steps, for an accuracy of an interval of 1/1000 of the widest
 _ROUNDING: Final = 1e-9  # relative size of rounding errors
-
-#: Largest number of parts for the comparison of models, and parts per run.
-_MOST_PARTS: Final = 1000
-_RUN: Final = 50
+_MOST_PARTS: Final = 1000  # largest number of parts for the comparison of models
+_RUN: Final = 50  # parts per run, of a larger number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,8 +127,7 @@ def memory_of(
     residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
 ) -> Memory:
     """Estimate the autocorrelation of noise from the residuals (n,); white with too few parts."""
-    # Influence (n, k): change of each parameter with the response of each sample. Regressors and
-    # influence are zero for unused samples.
+    # Influence (n, k): change of each parameter by each sample; zero for unused samples.
     r, a = parts.means(residual), parts.sums(influence)
     x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
     x = x[:, strengths > _ROUNDING * strengths[0]]
@@ -153,8 +143,7 @@ def memory_of(
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Time 0: white noise with a ratio of
-    # differences, the first without.
+    # Time and ratio; log|V|; (x, r)' V^-1 (x, r). Time 0: white, with a ratio of differences.
     models, sizes, products = [], [], []
     for ratio in (0.0, *_DIFFERENCES.tolist()):
         d, e, _ = dpttrf(own + ratio, _shared(time[some], parts.length) * ratio)
@@ -163,7 +152,7 @@ def memory_of(
         products.append(both.T @ dpttrs(d, e, both)[0])
     longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
     for length in np.geomspace(0.5 * parts.length, longest, _TIMES):
-        diagonal, beside, log_chain = _precision(time[some], length)
+        diagonal, beside, log_chain = precision(np.diff(time[some]), length)
         for ratio in _RATIOS.tolist():
             d, e, _ = dpttrf(diagonal / ratio + 1.0 / own, beside / ratio)
             models.append((float(length), ratio))
@@ -187,17 +176,13 @@ def memory_of(
     for k in counts:
         length, ratio = models[k]
         if length not in spreads:
-            d, e, _ = dpttrf(*_precision(time, length)[:2])
+            d, e, _ = dpttrf(*precision(np.diff(time), length)[:2])
             spreads[length] = (a * dpttrs(d, e, a)[0]).sum(axis=0)
         deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
     white, found = np.sqrt(left[0] / free * plain), np.array(deviations)
-    return Memory(
-        inflation=_growth(weights[counts], found, white, 0.05),
-        far=_growth(weights[counts], found, white, 0.004),
-        length=length,
-        ratio=ratio,
-    )
+    usual, far = (_growth(weights[counts], found, white, outside) for outside in (0.05, 0.004))
+    return Memory(inflation=usual, far=far, length=length, ratio=ratio)
 
 
 def _spread_out(count: int) -> IntArray:
@@ -213,11 +198,10 @@ def _shared(time: FloatArray, length: float) -> FloatArray:
     return np.where(np.diff(time) < 1.5 * length, -0.5, 0.0)
 
 
-def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
+def precision(gaps: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
     """Return diagonal, off-diagonal and log determinant of the inverse covariance of a chain."""
-    gaps = np.diff(time)
     kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
-    diagonal = np.ones(len(time))
+    diagonal = np.ones(len(gaps) + 1)
     diagonal[:-1] += kept**2 / new
     diagonal[1:] += kept**2 / new
     return diagonal, np.asarray(-kept / new), float(np.log(new).sum())

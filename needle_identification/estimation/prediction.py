@@ -16,8 +16,7 @@ from needle_dynamics.arrays import FloatArray
 import numpy as np
 from scipy.special import chdtri
 
-#: Ratio of the error of predicted recordings to the residuals above which a warning is given.
-WORSE: Final = 1.5
+WORSE: Final = 1.5  #: error of predicted recordings over the residuals for a warning
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,12 +50,8 @@ class Moments(NamedTuple):
 def moments(regressors: FloatArray, residual: FloatArray, values: FloatArray) -> Moments:
     """Return the moments of a fit from regressors (n, k), residuals (n,) and coefficients (k,)."""
     n = len(residual)
-    return Moments(
-        values,
-        np.asarray(regressors.T @ regressors / n),
-        np.asarray(regressors.T @ residual / n),
-        float(residual @ residual) / n,
-    )
+    gram, cross = (np.asarray(regressors.T @ one / n) for one in (regressors, residual))
+    return Moments(values, gram, cross, float(residual @ residual) / n)
 
 
 def predicted(recordings: Sequence[Moments]) -> RecordingPrediction | None:

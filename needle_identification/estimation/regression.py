@@ -32,9 +32,10 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation import check_estimator
+from needle_identification.estimation import ESTIMATORS
 from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import check_choice
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import convolve1d
@@ -44,21 +45,11 @@ from scipy.special import fdtrc, stdtrit
 #: determined: an error of 1 % in the response would change a parameter by a fifth.
 LARGEST_CONDITION: Final = 20.0
 
-#: Largest component of a determined parameter in such a direction; its error includes it.
-_LARGEST_SHARE: Final = 0.1
-
+_LARGEST_SHARE: Final = 0.1  # largest share of such a direction in a determined parameter
 _ROUNDING: Final = 1e-9  # relative size of rounding errors
-
-#: Weight of the noise of all groups in the variance of each group [correlation windows].
-_PRIOR: Final = 5.0
-
-#: Residual beyond which Huber's weight falls [standard deviations]. It makes the estimator 95 %
-#: efficient for normal noise.
-_HUBER_LIMIT: Final = 1.345
-
-#: Standard deviation of normal noise over its median absolute deviation.
-DEVIATION_OVER_MEDIAN: Final = 1.4826
-
+_PRIOR: Final = 5.0  # weight of the noise of all groups in each group [correlation windows]
+_HUBER_LIMIT: Final = 1.345  # residual over its deviation of falling weight; 95 % efficient
+DEVIATION_OVER_MEDIAN: Final = 1.4826  #: standard over median deviation, normal
 _MAX_ITERATIONS: Final = 100
 
 
@@ -75,10 +66,8 @@ class Regression:
     determination: float  #: coefficient of determination R^2
     samples: int  #: number of samples used
     effective_samples: float  #: number of independent samples with the same information
-    #: (k,) degrees of freedom of the errors; few where few samples determine a parameter.
-    degrees_of_freedom: FloatArray
-    #: Autocorrelation of the noise, included in the errors; None if not requested.
-    memory: Memory | None = None
+    degrees_of_freedom: FloatArray  #: (k,) of the errors, by the samples behind each
+    memory: Memory | None = None  #: autocorrelation in the errors, if requested
 
     def __repr__(self) -> str:
         pairs = zip(self.values.tolist(), self.errors.tolist(), strict=True)
@@ -174,10 +163,6 @@ def regress(
     ------
     IdentificationError
         If there are too few samples, or the noise of the regressors exceeds their variation.
-    ParameterError
-        If the estimator is unknown or lacks an argument.
-    ShapeError
-        If the shapes do not match, or a used value is not finite.
 
     Examples
     --------
@@ -190,7 +175,7 @@ def regress(
     [True, True]
 
     """
-    check_estimator(estimator)
+    check_choice('estimator', estimator, ESTIMATORS)
     x, y, used = _checked(regressors, response, used)
     samples, k = int(np.count_nonzero(used)), x.shape[1]
     span = independent_span(correlation)
@@ -221,17 +206,11 @@ def regress(
     residual = y - x @ solution.values
     # The fit uses one degree of freedom per parameter.
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
-    # Effective number of samples behind each parameter, from the share of each sample in its
-    # variance (Satterthwaite).
+    # Effective number of samples behind each parameter, from their shares (Satterthwaite).
     influence = solution.influence @ (back @ solution.inverse).T
     shares = influence**2
-    variance_of_shares = np.diag(score_covariance(shares, correlation))
-    behind = np.divide(
-        shares.sum(axis=0) ** 2,
-        variance_of_shares,
-        out=np.ones_like(variance_of_shares),
-        where=variance_of_shares > 0,
-    )
+    total, spread = shares.sum(axis=0), np.diag(score_covariance(shares, correlation))
+    behind = np.divide(total**2, spread, out=np.ones_like(spread), where=spread > 0)
     values = back @ solution.values
     covariance = back @ (solution.inverse @ middle @ solution.inverse.T) @ back.T
     memory = None
@@ -290,8 +269,7 @@ def _group_weights(
     x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
     """Weight each sample by the inverse of the noise variance about the mean of its group."""
-    # The noise of all groups enters with the weight of a few correlation windows, because a group
-    # of few samples may have a small variance by chance.
+    # The noise of all groups enters: few samples may have a small variance by chance.
     if groups is None or np.shape(groups) != y.shape:
         raise ParameterError('weighted needs the group of each sample')
     residual = y - x @ _weighted(x, y, used.astype(np.float64)).values
@@ -352,12 +330,8 @@ def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArr
 
 def _window(length: int) -> FloatArray:
     """Return a triangular window that rises to at most one in the middle, shape (length,)."""
-    rising = np.arange(1, (length + 1) // 2 + 1)
-    if length % 2:
-        half = 2.0 * rising / (length + 1.0)
-        return np.concatenate([half, half[-2::-1]])
-    half = (2.0 * rising - 1.0) / length
-    return np.concatenate([half, half[::-1]])
+    whole = length + length % 2
+    return np.asarray((whole - np.abs(2.0 * np.arange(length) - (length - 1.0))) / whole)
 
 
 def independent_span(correlation: int) -> float:

@@ -5,18 +5,14 @@ from dataclasses import dataclass
 from typing import Final
 import warnings
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.memory import Memory, Parts
 import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 _FEWEST_PARTS: Final = 10  # smallest number of parts for any test
-
-#: Smallest number of parts for the test of d'Agostino and Pearson; below, Shapiro and Wilk.
-_FEWEST_FOR_MOMENTS: Final = 20
-
-#: p-value below which a test fails: 1 % of the recordings fail any of the four by chance.
-_SIGNIFICANCE: Final = 0.0025
+_FEWEST_FOR_MOMENTS: Final = 20  # smallest number of parts, else Shapiro and Wilk
+_SIGNIFICANCE: Final = 0.0025  # 1 % of the recordings fail any of the four by chance
 
 #: Result of each test in words, if failed and if passed.
 _WORDS: Final = {
@@ -71,8 +67,11 @@ def residual_tests(
     with np.errstate(invalid='ignore', divide='ignore'):
         found = {'normality': _normality(means), 'trend': _trend(times, means)}
         if len(groups) > parameters:
-            found['speed'] = _lack_of_fit(means, groups, parameters)
-            found['spread'] = _equal_spread([means[group] for group in groups])
+            by_speed = [means[group] for group in groups]
+            found['speed'] = _f_test(by_speed, 0.0, parameters)
+            # Levene's test about the median.
+            off = [np.abs(group - np.median(group)) for group in by_speed]
+            found['spread'] = _f_test(off, float(np.concatenate(off).mean()), 1)
     # Equal residuals give nan.
     return tuple(
         ResidualTest(name=name, statistic=statistic, p_value=p_value, words=_words(name, p_value))
@@ -96,11 +95,8 @@ def _normality(values: FloatArray) -> tuple[float, float]:
             warnings.simplefilter('ignore')
             found = shapiro(values)
         return float(found.statistic), float(found.pvalue)
-    n = float(len(values))
-    squares = (values - values.mean()) ** 2
-    variance = squares.mean()
-    skewness = (squares * (values - values.mean())).mean() / variance**1.5
-    kurtosis = (squares**2).mean() / variance**2.0
+    n, normalized = float(len(values)), (values - values.mean()) / values.std()
+    skewness, kurtosis = (float((normalized**power).mean()) for power in (3, 4))
     found = float(_skewness_score(skewness, n) ** 2 + _kurtosis_score(kurtosis, n) ** 2)
     return found, float(chdtrc(2.0, found))
 
@@ -112,8 +108,7 @@ def _skewness_score(skewness: float, n: float) -> float:
         (n - 2.0) * (n + 5) * (n + 7) * (n + 9)
     )
     w = -1 + np.sqrt(2 * (kurtosis - 1))
-    scale = np.sqrt(2.0 / (w - 1))
-    return float(1 / np.sqrt(0.5 * np.log(w)) * np.log(y / scale + np.sqrt((y / scale) ** 2 + 1)))
+    return float(np.arcsinh(y / np.sqrt(2.0 / (w - 1))) / np.sqrt(0.5 * np.log(w)))
 
 
 def _kurtosis_score(kurtosis: float, n: float) -> float:
@@ -145,24 +140,10 @@ def _ranks(values: FloatArray) -> FloatArray:
     return np.asarray((np.cumsum(counts) - (counts - 1) / 2.0)[places])
 
 
-def _lack_of_fit(
-    residual: FloatArray, groups: list[IntArray], parameters: int
-) -> tuple[float, float]:
-    """Compare the misfit between groups with the noise within groups (F test)."""
-    between = sum(len(g) * residual[g].mean() ** 2 for g in groups)
-    within = sum(((residual[g] - residual[g].mean()) ** 2).sum() for g in groups)
-    free = len(groups) - parameters, len(residual) - len(groups)
+def _f_test(groups: list[FloatArray], center: float, lost: int) -> tuple[float, float]:
+    """Compare the means of groups about a center with the noise; lost: degrees of freedom."""
+    between = sum(len(group) * (group.mean() - center) ** 2 for group in groups)
+    within = sum(((group - group.mean()) ** 2).sum() for group in groups)
+    free = len(groups) - lost, sum(map(len, groups)) - len(groups)
     found = float((between / free[0]) / (within / free[1]))
-    return found, float(fdtrc(*free, found))
-
-
-def _equal_spread(groups: list[FloatArray]) -> tuple[float, float]:
-    """Test for equal variances (Levene's test about the median)."""
-    off = [np.abs(group - np.median(group)) for group in groups]
-    count = sum(len(group) for group in groups)
-    mean = sum(len(group) * group.mean() for group in off) / count
-    free = len(groups) - 1.0, count - len(groups)
-    between = free[1] * sum(len(group) * (group.mean() - mean) ** 2 for group in off)
-    within = free[0] * sum(((group - group.mean()) ** 2).sum() for group in off)
-    found = float(between / within)
     return found, float(fdtrc(*free, found))

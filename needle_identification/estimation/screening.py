@@ -75,16 +75,10 @@ class Screening:
             wald = float(values @ np.linalg.solve(covariance, values)) / q
         else:
             wald = np.inf
-        return Trial(
-            values / norms,
-            np.sqrt(np.diag(covariance)) / norms,
-            True,
-            misfit,
-            float(fdtrc(q, free, wald)),
-        )
+        errors = np.sqrt(np.diag(covariance)) / norms
+        return Trial(values / norms, errors, True, misfit, float(fdtrc(q, free, wald)))
 
     def _scores(self, x: FloatArray, left: FloatArray) -> FloatArray:
-        """Return the sums of scores over each part."""
         return np.asarray(np.add.reduceat(x * left[:, np.newaxis], self._starts, axis=0))
 
     def _unknown(self, both: FloatArray, z: FloatArray) -> BoolArray:

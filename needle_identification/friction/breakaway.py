@@ -20,15 +20,9 @@ import numpy as np
 from scipy.special import stdtrit
 
 _RISING: Final = 0.3  # time before the motion in which the rise of the force is measured [s]
-
-#: Smallest rise of the force in that time, as a fraction of the force and of mu_s.
-_SMALLEST_RISE: Final = 0.05
-
+_SMALLEST_RISE: Final = 0.05  # smallest rise, as a fraction of the force and of mu_s
 _CLEAR_RISE: Final = 5.0  # smallest slope of the rise [standard errors]
-
-#: Fraction of the usual correlation length used here, because the rise of the force is short.
-_WINDOW_PART: Final = 0.4
-
+_WINDOW_PART: Final = 0.4  # part of the usual correlation length, for a short rise
 _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='N')
 
 
@@ -38,7 +32,7 @@ def breakaway_force(
     """Return the mean force [N] at which the needle left a rest with a rising force, if any."""
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
-    found, signs = [], []
+    found = []
     coulomb = [p.value for p in parameters if p.name == 'coulomb_friction' and p.determined]
     least = _SMALLEST_RISE * max(coulomb, default=0.0)
     for start in starts:
@@ -47,12 +41,11 @@ def breakaway_force(
         end = int(after[0]) if len(after) else len(design.velocity)
         push = _push(design, (rest, int(start), end), least)
         if push is not None:
-            found.append(push)
-            signs.append(design.regime[start])
+            found.append((*push, design.regime[start]))
     if not found:
         return None
-    values, errors, half_widths = np.array(found).T
-    value, count, bias = float(values.mean()), len(found), float(np.mean(signs))
+    values, errors, half_widths, signs = np.array(found).T
+    value, count, bias = float(values.mean()), len(found), float(signs.mean())
     error = sqrt(float(errors @ errors)) / count
     half_width = sqrt(float(half_widths @ half_widths)) / count
     for parameter in parameters:
@@ -86,12 +79,9 @@ def _push(
     if last - first < correlation:
         return None
     elapsed = signals.time[first:last] - onset
+    columns = np.column_stack([np.ones_like(elapsed), elapsed])
     try:
-        line = regress(
-            np.column_stack([np.ones_like(elapsed), elapsed]),
-            signals.force[first:last],
-            correlation=correlation,
-        )
+        line = regress(columns, signals.force[first:last], correlation=correlation)
     except IdentificationError:
         return None
     value, slope = sign * line.values

@@ -13,13 +13,8 @@ from needle_identification.friction.terms import columns_of
 import numpy as np
 
 _UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
-
-#: Growth of the standard errors by autocorrelated noise above which a warning is given.
-_MUCH_LARGER: Final = 1.5
-
-#: Noise correlated over more than this fraction of the recording has no finite correlation time.
-_WANDERS: Final = 0.25
-
+_MUCH_LARGER: Final = 1.5  # growth of the errors by autocorrelated noise for a warning
+_WANDERS: Final = 0.25  # part of the recording: longer correlation is not finite
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 
 
@@ -91,9 +86,9 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
     """Warn of a lag that exceeds usual filters, or that indicates a mass."""
     if not lag.determined:
         if coarse:
-            way = 'behind' if coarse > 0.0 else 'ahead of'
+            order = 'behind' if coarse > 0.0 else 'ahead of'
             size = f'{1e3 * abs(coarse):.2g} ms'
-            yield f'the force is about {size} {way} the motion (from steady strokes); corrected'
+            yield f'the force is about {size} {order} the motion (from steady strokes); corrected'
     elif not lag.interval[0] <= 0.0 <= lag.interval[1]:
         size = f'{1e3 * abs(lag.value):.3g} ± {1e3 * lag.error:.2g} ms'
         if lag.value > max(_UNUSUAL_LAG, period):
@@ -118,7 +113,6 @@ def noise_bias(design: Design, fit: Regression) -> float:
 
 
 def noise_words(design: Design, bias: float) -> str:
-    """Describe the bias of mu_v [N s/m] by velocity noise."""
     noise = design.signals.velocity_noise
     return f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
 

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 from math import log, nan
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance, wald_test
@@ -17,11 +17,7 @@ from needle_identification.friction.terms import columns_of
 import numpy as np
 
 SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
-
-
-#: Growth of the standard errors by autocorrelation that two missing terms may explain.
-_LIKE_MEMORY: Final = 1.5
-
+_LIKE_MEMORY: Final = 1.5  # growth of the errors that two missing terms may explain
 _FOLDS: Final = 5  # folds of the cross-validation over strokes
 _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
@@ -32,35 +28,28 @@ class CandidateFit:
 
     terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
     criterion: str = 'BIC'  #: with the effective number of samples
-    #: BIC of the alternative set minus BIC of the chosen set; nan if it is not determined.
-    difference: float = nan
-    #: Of the Wald test that the differing terms are zero, with errors for autocorrelated noise,
-    #: corrected for the number of terms tried (Holm).
+    difference: float = nan  #: BIC minus BIC of the chosen set; nan: not determined
+    #: Of the Wald test that the differing terms are zero, for the number of terms tried (Holm).
     p_value: float = 1.0
-    #: Whether the data support the set; an additional term must also improve the prediction of
-    #: held-out samples.
-    supported: bool = False
+    supported: bool = False  #: by the data; an additional term must also predict better
     words: str  #: result as a sentence
 
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
     """Add each unused term, leave out each chosen term; among: number of recordings."""
-    settings = design.signals.settings
-    chosen = settings.terms
+    chosen = design.signals.settings.terms
     samples = _independent_samples(design, fit)
-    level = SIGNIFICANCE / among
-    screening = design.screening()
+    comparison = _Comparison(design, fit, design.screening(), samples, SIGNIFICANCE / among)
     singles = [(term,) for term in _candidates(design)]
-    found = _added(design, screening, singles, samples, level)
+    found = comparison.added(singles)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
     if growth > _LIKE_MEMORY and not any(one.supported for one in found):
         # Two missing terms leave residuals that resemble autocorrelated noise.
         pairs = [(first, second) for (first,), (second,) in combinations(singles, 2)]
-        both = _added(design, screening, pairs, samples, level)
-        found += [one for one in both if one.supported]
+        found += [one for one in comparison.added(pairs) if one.supported]
     for term in chosen:
         if len(chosen) > 1 and not ('direction' in chosen and term in ('coulomb', 'viscous')):
-            found.append(_removed(design, fit, screening, term, samples))
+            found.append(comparison.removed(term))
     return tuple(found)
 
 
@@ -78,91 +67,89 @@ def _candidates(design: Design) -> list[str]:
     return [term for term in TERMS if term not in excluded and design.reaches(term)]
 
 
-def _added(
-    design: Design,
-    screening: Screening,
-    candidates: Sequence[tuple[str, ...]],
-    samples: float,
-    level: float,
-) -> list[CandidateFit]:
-    """Fit additional terms; a supported term must also improve the prediction."""
-    tried = [_tried(design, screening, more) for more in candidates]
-    p_values = _holm([trial.p_value for trial in tried])
-    return [
-        _judged(design, more, trial, screening.misfit, p_value, samples, level)
-        for more, trial, p_value in zip(candidates, tried, p_values, strict=True)
-    ]
+class _Comparison(NamedTuple):
+    """A fit, its screening, its number of independent samples, and the level of the tests."""
 
+    design: Design
+    fit: Regression
+    screening: Screening
+    samples: float
+    level: float
 
-def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial:
-    """Fit additional terms, with errors for autocorrelated noise if they are significant."""
-    settings = design.signals.settings
-    trial = screening.tried(design.columns(more)[design.used])
-    if not trial.determined or trial.p_value >= SIGNIFICANCE:
-        return trial
-    start = len(columns_of(settings.terms, settings))
-    which = list(range(start, start + len(trial.values)))
-    # Autocorrelated noise resembles many terms. The chosen terms remain valid if the samples do
-    # not suffice for an additional parameter.
-    with suppress(IdentificationError):
-        other = design.solve((*settings.terms, *more), settings.estimator)
-        if other.determined[which].all():
-            return trial._replace(
-                values=other.values[which], errors=other.errors[which],
-                p_value=wald_test(other, which),
-            )  # fmt: skip
-    return trial._replace(determined=False, p_value=1.0)
+    def added(self, candidates: Sequence[tuple[str, ...]]) -> list[CandidateFit]:
+        """Fit additional terms; a supported term must also improve the prediction."""
+        tried = [self._tried(more) for more in candidates]
+        p_values = _holm([trial.p_value for trial in tried])
+        return list(map(self._judged, candidates, tried, p_values))
 
+    def _tried(self, more: tuple[str, ...]) -> Trial:
+        """Fit additional terms, with errors for autocorrelated noise if they are significant."""
+        design, settings = self.design, self.design.signals.settings
+        trial = self.screening.tried(design.columns(more)[design.used])
+        if not trial.determined or trial.p_value >= SIGNIFICANCE:
+            return trial
+        which = list(range(design.terms, design.terms + len(trial.values)))
+        # Autocorrelated noise resembles many terms. Too few samples determine no other term.
+        with suppress(IdentificationError):
+            other = design.solve((*settings.terms, *more), settings.estimator)
+            if other.determined[which].all():
+                values, errors = other.values[which], other.errors[which]
+                p_value = wald_test(other, which)
+                return trial._replace(values=values, errors=errors, p_value=p_value)
+        return trial._replace(determined=False, p_value=1.0)
 
-def _judged(
-    design: Design,
-    more: tuple[str, ...],
-    trial: Trial,
-    misfit: float,
-    p_value: float,
-    samples: float,
-    level: float,
-) -> CandidateFit:
-    settings = design.signals.settings
-    terms, name = (*settings.terms, *more), ' and '.join(more)
-    if not trial.determined:
-        words = f'the data do not distinguish the term {name} from the others'
-        return CandidateFit(terms=terms, words=words)
-    columns = columns_of(more, settings)
-    difference = samples * log(trial.misfit / misfit) + len(columns) * log(samples)
-    firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
-    # A mass, breakaway friction or cutting force cannot be negative.
-    impossible = any(
-        column.name in firsts and value < 0.0
-        for value, column in zip(trial.values, columns, strict=True)
-    )
-    supported = p_value < level and difference < 0.0 and not impossible
-    better = not supported or _predicts_better(design, more)
-    verdict = 'support' if supported and better else 'do not support'
-    sizes = ' and '.join(
-        f'{column.name} = {value:.3g} ± {error:.2g} {column.unit}'
-        for value, error, column in zip(trial.values, trial.errors, columns, strict=True)
-    )
-    words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
-    if not better:
-        words += ', which does not predict better'
-    return CandidateFit(
-        terms=terms,
-        difference=difference,
-        p_value=p_value,
-        supported=supported and better,
-        words=words,
-    )
+    def _judged(self, more: tuple[str, ...], trial: Trial, p_value: float) -> CandidateFit:
+        settings = self.design.signals.settings
+        terms, name = (*settings.terms, *more), ' and '.join(more)
+        if not trial.determined:
+            words = f'the data do not distinguish the term {name} from the others'
+            return CandidateFit(terms=terms, words=words)
+        columns = columns_of(more, settings)
+        difference = self.samples * log(trial.misfit / self.screening.misfit)
+        difference += len(columns) * log(self.samples)
+        firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
+        found = list(zip(columns, trial.values, trial.errors, strict=True))
+        # A mass, breakaway friction or cutting force cannot be negative.
+        impossible = any(column.name in firsts and value < 0.0 for column, value, _ in found)
+        supported = p_value < self.level and difference < 0.0 and not impossible
+        better = not supported or _predicts_better(self.design, more)
+        verdict = 'support' if supported and better else 'do not support'
+        sizes = ' and '.join(
+            f'{column.name} = {value:.3g} ± {error:.2g} {column.unit}'
+            for column, value, error in found
+        )
+        words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
+        if not better:
+            words += ', which does not predict better'
+        supported &= better
+        return CandidateFit(
+            terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
+        )
+
+    def removed(self, term: str) -> CandidateFit:
+        fit, settings = self.fit, self.design.signals.settings
+        terms = tuple(other for other in settings.terms if other != term)
+        names = [column.name for column in columns_of(settings.terms, settings)]
+        which = [names.index(column.name) for column in columns_of([term], settings)]
+        if not fit.determined[which].all():
+            words = f'the data do not distinguish the term {term} from the others: leave one out'
+            return CandidateFit(terms=terms, words=words)
+        p_value = wald_test(fit, which)
+        misfit = self.screening.misfit_without(which) / self.screening.misfit
+        difference = self.samples * log(misfit) - len(which) * log(self.samples)
+        supported = p_value >= SIGNIFICANCE and difference < 0.0
+        words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
+        return CandidateFit(
+            terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
+        )
 
 
 def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     """Test whether additional terms lower the prediction error of held-out samples."""
-    used = design.used
-    settings = design.signals.settings
+    used, settings = design.used, design.signals.settings
     x, y = design.regressors((*settings.terms, *more))[used], design.signals.force[used]
     without = np.ones(x.shape[1], dtype=np.bool_)
-    start = len(columns_of(settings.terms, settings))
-    without[start : start + len(columns_of(more, settings))] = False
+    without[design.terms : design.terms + len(columns_of(more, settings))] = False
     # Consecutive strokes in a fold: fitting autocorrelated noise is no advantage.
     fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
     misfits = np.zeros(2)
@@ -176,11 +163,10 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
 
 def _holm(p_values: Sequence[float]) -> list[float]:
     """Correct p-values for multiple tests (Holm): controls the probability of any false alarm."""
-    corrected = np.ones(len(p_values))
-    largest = 0.0
-    for rank, k in enumerate(np.argsort(p_values)):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[k]))
-        corrected[k] = largest
+    order, factors = np.argsort(p_values), np.arange(len(p_values), 0, -1)
+    corrected = np.empty(len(p_values))
+    smallest = np.minimum(factors * np.array(p_values)[order], 1.0)
+    corrected[order] = np.maximum.accumulate(smallest)
     return corrected.tolist()
 
 
@@ -192,24 +178,3 @@ def _independent_samples(design: Design, fit: Regression) -> float:
     if fit.memory is not None:
         number /= float(np.mean(fit.memory.inflation**2))
     return min(max(number, len(fit.values) + 1.0), float(fit.samples))
-
-
-def _removed(
-    design: Design, fit: Regression, screening: Screening, term: str, samples: float
-) -> CandidateFit:
-    """Compare with the fit without a term."""
-    settings = design.signals.settings
-    terms = tuple(other for other in settings.terms if other != term)
-    names = [column.name for column in columns_of(settings.terms, settings)]
-    which = [names.index(column.name) for column in columns_of([term], settings)]
-    if not fit.determined[which].all():
-        words = f'the data do not distinguish the term {term} from the others: leave one out'
-        return CandidateFit(terms=terms, words=words)
-    p_value = wald_test(fit, which)
-    misfit = screening.misfit_without(which) / screening.misfit
-    difference = samples * log(misfit) - len(which) * log(samples)
-    supported = p_value >= SIGNIFICANCE and difference < 0.0
-    words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
-    return CandidateFit(
-        terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
-    )

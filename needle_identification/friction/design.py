@@ -24,15 +24,9 @@ from needle_identification.friction.terms import columns_of, NeedleMotion, regre
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-#: Smallest number of independent samples in motion for a meaningful standard error.
-FEWEST_SAMPLES: Final = 10.0
-
+FEWEST_SAMPLES: Final = 10.0  #: smallest number of independent samples in motion
 _SETTLING: Final = 3.0  # settling time of the sensor filters after a change [lags of the force]
-
-#: Tolerance within which the needle is at its largest insertion depth [m]: encoder counts,
-#: noise, backlash.
-_SAME_DEPTH: Final = 5e-5
-
+_SAME_DEPTH: Final = 5e-5  # tolerance of the largest depth [m]: counts, noise, backlash
 _EFFECT: Final = 0.05  # smallest fraction of the full size of a term that counts as an effect
 _LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 
@@ -58,6 +52,11 @@ class Design:
         return self.lag_column.size > 0
 
     @property
+    def terms(self) -> int:
+        """Number of coefficients of the chosen terms."""
+        return len(columns_of(self.signals.settings.terms, self.signals.settings))
+
+    @property
     def is_enough(self) -> bool:
         needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
         return bool(np.count_nonzero(self.used) >= needed)
@@ -79,13 +78,10 @@ class Design:
     def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
         """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
-        motion = NeedleMotion(
-            self.velocity - later * self.acceleration,
-            self.acceleration,
-            signals.time - signals.time[0],
-            self.depth - later * self.velocity,
-            self.fresh,
-        )
+        velocity = self.velocity - later * self.acceleration
+        depth = self.depth - later * self.velocity
+        time = signals.time - signals.time[0]
+        motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh)
         return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
@@ -143,7 +139,6 @@ class Design:
         )
 
     def check(self) -> None:
-        """Raise `IdentificationError` if the motion is too short or the force is constant."""
         signals = self.signals
         if not self.is_enough:
             needed = FEWEST_SAMPLES * independent_span(signals.correlation) * signals.period

@@ -111,11 +111,6 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
     FrictionSummary
         One `statistic` per parameter, then breakaway force and lag if any recording has them.
 
-    Raises
-    ------
-    IdentificationError
-        If there are no estimates.
-
     """
     if not estimates:
         raise IdentificationError('no recordings to identify from')
@@ -144,13 +139,11 @@ def _together(estimates: Sequence[FrictionEstimate]) -> Iterator[str]:
                 tried.setdefault(one.terms[-1], []).append(one)
     if any(one.supported for ones in tried.values() for one in ones):
         return
-    found = {
-        term: float(
-            chdtrc(2.0 * len(ones), -2.0 * sum(log(max(o.p_value, float_info.min)) for o in ones))
-        )
-        for term, ones in tried.items()
-        if len(ones) > 1
-    }
+    found = {}
+    for term, ones in tried.items():
+        if len(ones) > 1:
+            logs = sum(log(max(one.p_value, float_info.min)) for one in ones)
+            found[term] = float(chdtrc(2.0 * len(ones), -2.0 * logs))
     term = min(found, key=lambda term: found[term], default='')
     if term and found[term] * len(found) < SIGNIFICANCE:
         yield (

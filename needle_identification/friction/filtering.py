@@ -10,7 +10,7 @@ near a start, a stop or a reversal are left out later; see `design`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, e, sqrt
+from math import ceil, sqrt
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -20,29 +20,19 @@ from needle_identification.recordings.recording import Recording
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.ndimage import maximum_filter1d
-from scipy.special import lambertw
 
 if TYPE_CHECKING:
     # Takes a fifth of a second to import; only filtering a recording needs it.
     from scipy.interpolate import BSpline
 
-#: Half the length of a Hann window that halves the power at its cutoff [periods of the cutoff].
-HALF_LENGTH: Final = 0.36
-
-#: Length over which filtered noise is correlated [periods of the cutoff].
-CORRELATION_LENGTH: Final = 3.0
-
+HALF_LENGTH: Final = 0.36  #: half of a Hann window [periods of its cutoff at half power]
+CORRELATION_LENGTH: Final = 3.0  #: of filtered noise [periods of the cutoff]
 GAP: Final = 3.5  #: longest step between samples that is not a gap [sampling periods]
 _CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations of the noise]
 _KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
-
-#: Ratio of the hold time at a limit of the sensor to the longest hold time at other values.
-_LONGER: Final = 3
-
+_LONGER: Final = 3  # hold time at a limit of the sensor over the longest at other values
 _MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
-
-#: Largest number of resampled points per sample; with more, most of the time base is gaps.
-_LARGEST_GRID: Final = 10.0
+_LARGEST_GRID: Final = 10.0  # resampled points per sample; more are mostly gaps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,19 +141,12 @@ def filter_taps(cutoff: float, period: float) -> FloatArray:
 
 
 def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
-    """Filter a signal by FFT of overlapping blocks, with constant extension at both ends."""
+    """Filter a signal by FFT, with constant extension at both ends."""
     padded = np.pad(signal, len(taps) // 2, mode='edge')
-    overlap = len(taps) - 1
-    # The size with the fewest operations per sample.
-    size = next_fast_len(ceil(-overlap * lambertw(-1.0 / (2.0 * e * overlap), k=-1).real))
-    step = size - overlap
-    if max(size, 2 * len(taps)) >= len(padded):
-        size, step = next_fast_len(len(padded) + overlap, real=True), len(padded)
-    count = ceil((len(padded) + overlap) / step)
-    blocks = np.pad(padded, (0, count * step - len(padded))).reshape(count, step)
-    parts = np.fft.irfft(np.fft.rfft(blocks, size) * np.fft.rfft(taps, size), size)
-    parts[1:, :overlap] += parts[:-1, step : step + overlap]
-    return np.asarray(parts[:, :step].ravel()[overlap : len(padded)])
+    size = next_fast_len(len(padded), real=True)
+    found = np.fft.irfft(np.fft.rfft(padded, size) * np.fft.rfft(taps, size), size)
+    # The first values contain the end of the signal.
+    return np.asarray(found[len(taps) - 1 : len(padded)])
 
 
 def _filtered_velocity(

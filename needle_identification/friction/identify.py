@@ -28,22 +28,14 @@ from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.lag import find_lag, lag_estimate
 from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
-from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
-
-#: Positions replace velocities if their velocity noise is below this fraction.
-_CLEANER: Final = 0.5
-
-#: Time after a change within which the force may deviate from the terms [s], and the p-value
-#: of the deviation below which these samples are left out.
-_TRANSITION: Final = 0.1
-_TRANSITIONS_DIFFER: Final = 0.001
-
-#: Largest difference of parameters that agree [standard errors for white noise].
-_CLOSE: Final = 3.0
+_CLEANER: Final = 0.5  # velocity noise of positions that replace velocities, at most
+_TRANSITION: Final = 0.1  # time of a possible deviation after a change [s]
+_TRANSITIONS_DIFFER: Final = 0.001  # p-value below which these samples are left out
+_CLOSE: Final = 3.0  # difference of parameters that agree [standard errors, white]
 
 
 def identify_friction(
@@ -180,7 +172,7 @@ def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
 def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Leave out more samples around each change if the force deviates from the terms there."""
     settings, whole = chosen.design.signals.settings, chosen.fit
-    count = len(columns_of(settings.terms, settings))
+    count = chosen.design.terms
     design = chosen.design.far_from_changes(_TRANSITION)
     if whole.is_exact or not design.is_enough:
         return None
@@ -208,7 +200,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     """Test the chosen fit, compare it with other terms, and assemble the result."""
     design, fit, signals = chosen.design, chosen.fit, chosen.design.signals
     settings, used = signals.settings, design.used
-    known = fit.values[: len(columns_of(settings.terms, settings))]
+    known = fit.values[: design.terms]
     mean_speed = float(np.mean(np.abs(design.velocity[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     checks.check_friction(parameters)

@@ -29,19 +29,16 @@ def parameter_estimates(
     for k, column in enumerate(columns):
         parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
         if fit.determined[k]:
+            value, error = float(fit.values[k]), float(fit.errors[k])
+            low, high = intervals[k].tolist()
             parameter = replace(
-                parameter,
-                value=float(fit.values[k]),
-                error=float(fit.errors[k]),
-                interval=(float(intervals[k, 0]), float(intervals[k, 1])),
-                determined=True,
+                parameter, value=value, error=error, interval=(low, high), determined=True
             )
         found.append(parameter)
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:
-            # The stamps of force and motion differ by up to a period: the lag resembles a mass,
-            # uniform within +- ``largest`` [kg].
+            # Stamps differ by up to a period, which resembles a mass within +- largest [kg].
             largest = viscous.value * period
             error = hypot(mass.error, largest / sqrt(3.0))
             low, high = mass.interval

@@ -23,9 +23,7 @@ _BETTER: Final = 0.5  # largest fraction of the misfit that remains with an acce
 _MAX_SAMPLES: Final = 1000  # largest number of samples for the coarse search
 
 _MAX_ITERATIONS: Final = 10
-
-#: Largest fraction of noise in the power of the acceleration for an estimate of the lag.
-_LARGEST_NOISE: Final = 0.1
+_LARGEST_NOISE: Final = 0.1  # largest share of noise in the power of the acceleration
 
 #: Smallest ratio of root mean square and largest acceleration at which the lag is reported.
 #: Filter and spline produce smaller accelerations from velocity steps.
@@ -88,13 +86,9 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
-    motion = NeedleMotion(
-        velocity[moving],
-        acceleration[moving],
-        time[moving] - time[0],
-        np.interp(then[moving], signals.time, signals.depth),
-        np.zeros(np.count_nonzero(moving), dtype=np.bool_),
-    )
+    depth = np.interp(then[moving], signals.time, signals.depth)
+    since, fresh = time[moving] - time[0], np.zeros(len(depth), dtype=np.bool_)
+    motion = NeedleMotion(velocity[moving], acceleration[moving], since, depth, fresh)
     x = regressors(motion, settings.terms, settings)
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))

@@ -19,9 +19,7 @@ from needle_identification.friction.design import Design
 import numpy as np
 from scipy.special import ndtri
 
-#: Smallest drop of a puncture [standard deviations of other changes of the force].
-_CLEAR: Final = 8.0
-
+_CLEAR: Final = 8.0  # smallest drop [standard deviations of other changes of the force]
 _UNKNOWN_FRICTION: Final = 0.5  # model error of a change of friction, as a fraction
 
 _DEPTH: Final = ParameterEstimate(name='puncture_depth', symbol='s_p', unit='m')

@@ -28,31 +28,16 @@ import numpy as np
 #: Terms that depend on the time since the start or on the insertion depth.
 _OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 
-#: Smallest number of independent blocks for a meaningful standard error.
-_FEWEST_PARTS: Final = 10.0
-
+_FEWEST_PARTS: Final = 10.0  # smallest number of independent blocks for an error
 _PART_LENGTH: Final = 2.0  # length of a block [correlation lengths of filtered noise]
-
-#: Age at which a block is discarded [forgetting times]; its weight is then below 4e-4.
-_REMEMBERED: Final = 8.0
-
-#: Relative threshold below which singular values of the information are rounding errors.
-_ROUNDING: Final = 1e-7
-
-#: Time for which a sensor with an unknown filter settles after a change of regime [s].
-_SETTLING: Final = 0.05
-
+_REMEMBERED: Final = 8.0  # largest age of a block [forgetting times]: weight 4e-4
+_ROUNDING: Final = 1e-7  # relative size of singular values that are rounding errors
+_SETTLING: Final = 0.05  # of a sensor with an unknown filter after a change [s]
 _LAGS: Final = 5  # number of blocks over which the noise may be correlated
 _FIRST: Final = 50  # number of pairs that determine the sampling rate
 _LARGEST_STEP: Final = 0.1  # largest step for interpolation of the motion [s]
-
-#: Backward step of a stamp above which the clock was set back [s]; after a smaller step, the
-#: message arrived late.
-_SET_BACK: Final = 1.0
-
-#: Largest plausible values: forces [N]; depths [m] or velocities [m/s].
-_LARGEST: Final = {'force': 1e4, 'motion': 100.0}
-
+_SET_BACK: Final = 1.0  # backward step of a clock set back, not of a late message [s]
+_LARGEST: Final = {'force': 1e4, 'motion': 100.0}  # [N], and [m] or [m/s]: implausible
 _MAX_WAITING: Final = 20_000  # largest number of samples that wait for the other topic
 
 
@@ -69,11 +54,6 @@ class RecursiveFriction:
     forgetting : float
         Time of steady motion after which the weight of a sample is 1 / e [s]. Samples at rest
         change neither the estimate nor the weights.
-
-    Raises
-    ------
-    ParameterError
-        If rate or forgetting time is not positive, or the estimator is not ordinary.
 
     Examples
     --------
@@ -109,12 +89,10 @@ class RecursiveFriction:
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
         length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
-        self._information = _Information(
-            len(columns_of(settings.terms, settings)) + self._estimates_lag,
-            exp(-self._period / forgetting),
-            length,
-            ceil(_REMEMBERED * forgetting * rate / length),
-        )
+        count = len(columns_of(settings.terms, settings)) + self._estimates_lag
+        blocks = ceil(_REMEMBERED * forgetting * rate / length)
+        decay = exp(-self._period / forgetting)
+        self._information = _Information(count, decay, length, blocks)
         self._speed_sum = self._weight = 0.0
         self._time = -inf
         self._regime = 0.0
@@ -122,16 +100,9 @@ class RecursiveFriction:
 
     def update(self, time: float, velocity: float, force: float) -> None:
         """
-        Add one sample.
+        Add a sample: time [s], insertion velocity [m/s] and force on the needle [N].
 
-        Parameters
-        ----------
-        time : float
-            Time [s]. After a gap or a backward step, the filter restarts.
-        velocity, force : float
-            Insertion velocity [m/s] and force of the base on the needle [N], positive into the
-            tissue. A sample that is not finite counts as a gap.
-
+        After a gap, a backward step or a sample that is not finite, the filter restarts.
         """
         if not abs(velocity) + abs(force) < inf:
             self._time = -inf
@@ -262,28 +233,22 @@ class _Information:
             total**2, (even**2).sum(axis=1), out=np.ones(len(total)), where=total > 0
         )
         effective = float(ages.sum() ** 2 / (ages @ ages))
-        # Correlation between blocks increases the errors (Newey and West), but does not reduce
-        # them.
+        # Correlation between blocks only increases the errors (Newey and West).
         changes = scores @ inverse
         plain = colored = (changes**2).sum(axis=0)
         for lag in range(1, min(_LAGS + 1, len(changes))):
             weight = 2.0 * (1.0 - lag / (_LAGS + 1.0))
             colored = colored + weight * (changes[lag:] * changes[:-lag]).sum(axis=0)
         growth = np.divide(colored, plain, out=np.ones_like(plain), where=plain > 0.0)
-        return (
-            growth.max(initial=1.0) * (scores.T @ scores),
-            behind,
-            min(effective, now / self._length),
-        )
+        covariance = growth.max(initial=1.0) * (scores.T @ scores)
+        return covariance, behind, min(effective, now / self._length)
 
 
 class LiveFriction:
-    """
-    Estimate friction from messages as they arrive, with the motion at the stamps of the force.
+    """Estimate friction from messages as they arrive, with the motion at the force stamps."""
 
-    Samples that are not finite, out of order, or in a gap of the motion are discarded and counted.
-    A clock that is set back restarts the estimation.
-    """
+    # Samples that are not finite, out of order, or in a gap of the motion are discarded and
+    # counted. A clock that is set back restarts the estimation.
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:
         # Checks the arguments except the sampling rate, which is determined later.
@@ -348,7 +313,6 @@ class LiveFriction:
         return time
 
     def _pair(self) -> None:
-        """Process force samples up to the latest motion sample."""
         motion = self._motion
         while self._force and motion and motion[-1][0] >= self._force[0][0]:
             time, force = self._force.popleft()

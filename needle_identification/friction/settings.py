@@ -6,9 +6,9 @@ from itertools import pairwise
 from math import isfinite
 from typing import Final
 
-from needle_identification.estimation import check_estimator, ESTIMATORS
+from needle_identification.estimation import ESTIMATORS
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, choice, constant
 
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
@@ -27,12 +27,6 @@ class FrictionSettings:
     The default terms are equation (15). The estimator ``weighted`` estimates the noise in each
     stroke, ``total`` accounts for velocity noise; ``auto`` is ``total`` if velocity noise is
     relevant, otherwise ``ordinary``.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is out of range, or a term is unknown or lacks another term.
-
     """
 
     cutoff: float = constant(
@@ -56,9 +50,7 @@ class FrictionSettings:
     terms: tuple[str, ...] = field(
         default=('coulomb', 'viscous'), metadata={'description': f'of {", ".join(TERMS)}'}
     )
-    estimator: str = field(
-        default=AUTO, metadata={'description': f'one of {AUTO}, {", ".join(ESTIMATORS)}'}
-    )
+    estimator: str = choice(AUTO, (AUTO, *ESTIMATORS))
 
     @property
     def allows_total(self) -> bool:
@@ -87,7 +79,6 @@ class FrictionSettings:
                 raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
         if 'direction' in self.terms and not {'coulomb', 'viscous'} <= set(self.terms):
             raise ParameterError('the term direction needs the terms coulomb and viscous')
-        check_estimator(self.estimator, AUTO)
         if self.estimator == 'total' and not self.allows_total:
             raise ParameterError(
                 'the estimator total needs the term viscous and does not work with direction: '

@@ -92,7 +92,6 @@ def _layers(boundaries: Sequence[float]) -> list[Regressor]:
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Regressor]:
-    """Return the columns of terms, in order."""
     return [
         column
         for term in terms

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings: force and motion of one experiment, as arrays on one time base."""
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Final, TypeAlias
 
-#: Sources of the stamps of a recording: message headers or receive times.
-TIMES: Final = ('header', 'receive')
+TIMES: Final = ('header', 'receive')  #: stamps: of messages or their receipt
+
+Roles: TypeAlias = Mapping[str, str]  #: columns of a table by role

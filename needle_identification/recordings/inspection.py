@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
+from math import nan
 from pathlib import Path
 import shlex
 from typing import Final, NamedTuple
@@ -13,15 +14,19 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import first_names, read_indentation_recording
+from needle_identification.recordings.reading import (
+    first_names,
+    MOTIONS,
+    read_indentation_recording,
+)
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES, with_unit
 from needle_identification.steering.columns import (
     check_depth,
     is_inverted,
     steering_columns,
-    steering_names,
     STEERING_ROLES,
+    USUAL,
 )
 from needle_identification.steering.reading import JOINTS, read_steering_recording
 from needle_identification.stiffness.identify import identify_stiffness
@@ -30,15 +35,10 @@ from needle_ros.axes import AXES
 from needle_ros.errors import NeedleError
 import numpy as np
 
-#: Message types of motions and of forces.
-_MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
-_FORCE: Final = (wire.WRENCH,)
-
+_FORCE: Final = (wire.WRENCH,)  # message types of forces
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
 _MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
-
-#: Smallest fraction of a force explained by sign and velocity of a motion, for friction.
-_EXPLAINED: Final = 0.3
+_EXPLAINED: Final = 0.3  # smallest part of a force that is like friction
 
 #: Least motion of a steered insertion, by role [m, rad].
 _STEERED: Final = {'guide_x': 2e-4, 'guide_z': 2e-4, 'roll': 0.1}
@@ -62,7 +62,7 @@ class Content:
     name: str  #: of the topic, or of the file
     type_name: str  #: of the messages, or ``table``
     count: int  #: number of messages or rows
-    rate: float = float('nan')  #: messages per second, from the median step; nan if not inspected
+    rate: float = nan  #: messages per second, from the median step; nan if not inspected
     gaps: int = 0  #: number of pauses of more than ten steps
     columns: tuple[ColumnSummary, ...] = ()  #: components; none if the type is not supported
 
@@ -93,11 +93,6 @@ def inspect_recording(path: Path | str) -> Inspection:
     Inspection
         Content and suggested command.
 
-    Raises
-    ------
-    RecordingError
-        If the recording is not readable.
-
     Examples
     --------
     >>> from needle_identification import inspect_recording
@@ -110,12 +105,13 @@ def inspect_recording(path: Path | str) -> Inspection:
 
 def _table(path: Path) -> Inspection:
     table = read_table(path)
-    roles = {role: with_unit(table, role, spec) for role, spec in guessed(table).items()}
+    roles = {
+        role: with_unit(role, spec, table.columns.get(spec, np.empty(0)))
+        for role, spec in guessed(table.columns).items()
+    }
     columns = tuple(_column(name, values) for name, values in table.columns.items())
-    content = Content(
-        name=path.name, type_name='table', count=len(next(iter(table.columns.values()))),
-        columns=columns,
-    )  # fmt: skip
+    count = len(next(iter(table.columns.values())))
+    content = Content(name=path.name, type_name='table', count=count, columns=columns)
     words = [f'{role} by its name: {spec}' for role, spec in roles.items()]
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
     lacking = [role for role in ('time', 'force') if role not in roles]
@@ -144,9 +140,8 @@ def _table(path: Path) -> Inspection:
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:
     finite = values[np.isfinite(values)]
-    if not len(finite):
-        return ColumnSummary(name, float('nan'), float('nan'))
-    return ColumnSummary(name, float(finite.min()), float(finite.max()))
+    low, high = (finite.min(), finite.max()) if len(finite) else (nan, nan)
+    return ColumnSummary(name, float(low), float(high))
 
 
 # Bags.
@@ -163,7 +158,7 @@ class _Signal(NamedTuple):
 
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
-    topics = [topic for topic in bag.topics() if topic.type_name in (*_MOTION, *_FORCE)]
+    topics = [topic for topic in bag.topics() if topic.type_name in (*MOTIONS, *_FORCE)]
     read: dict[BagTopic, list[str]] = {}
     gathered: dict[BagTopic, Gathering] = {}
     for topic in topics:
@@ -190,12 +185,9 @@ def _bag(path: Path) -> Inspection:
                 losses += bag.losses
                 columns = dict(zip(read[topic], samples.values.T, strict=True))
                 steps = np.diff(samples.stamps)
-                content = replace(
-                    content,
-                    rate=float(1e9 / np.median(steps)),
-                    gaps=int(np.count_nonzero(are_gaps(steps))),
-                    columns=tuple(_column(axis, values) for axis, values in columns.items()),
-                )
+                rate, gaps = 1e9 / np.median(steps), np.count_nonzero(are_gaps(steps))
+                found = tuple(_column(axis, values) for axis, values in columns.items())
+                content = replace(content, rate=float(rate), gaps=int(gaps), columns=found)
                 signals += [
                     _Signal(topic, axis, samples.stamps, values)
                     for axis, values in columns.items()
@@ -219,7 +211,7 @@ def _bag(path: Path) -> Inspection:
 def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Return words and command for an insertion with a moved guide or a rotated needle."""
     joints = {one.axis: one for one in signals if one.topic.type_name == wire.JOINT_STATE}
-    found = {role: name for role, name in steering_names(joints).items() if role in JOINTS}
+    found = {role: name for role, name in guessed(joints, USUAL).items() if role in JOINTS}
     moved = [
         role for role, least in _STEERED.items()
         if role in found and np.ptp(joints[found[role]].values) > least
@@ -245,13 +237,9 @@ def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Find the pair of force and motion that is most similar to friction."""
     forces = [one for one in signals if one.topic.type_name in _FORCE]
-    motions = [one for one in signals if one.topic.type_name in _MOTION]
-    best: tuple[float, float, _Signal, _Signal] | None = None
-    for force in forces:
-        for motion in motions:
-            explained, size = _friction(force, motion)
-            if best is None or explained > best[0]:
-                best = explained, size, force, motion
+    motions = [one for one in signals if one.topic.type_name in MOTIONS]
+    pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
+    best = max(pairs, key=lambda pair: pair[0], default=None)
     if best is None or best[0] < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
         why = 'no force depends on the direction of a motion'
@@ -270,11 +258,12 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
         options += ['--wrench-topic', force.topic.name]
     if len({one.topic for one in motions}) > 1:
         options += ['--motion-topic', motion.topic.name]
-    turned = '-' if size < 0.0 else ''
-    if turned:
+    axis = force.axis
+    if size < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
-    if turned or force.axis != 'y':
-        options += ['--force-axis', turned + force.axis]
+        axis = f'-{axis}'
+    if axis != 'y':
+        options += ['--force-axis', axis]
     is_joint = motion.topic.type_name == wire.JOINT_STATE
     others = [one for one in motions if one.topic == motion.topic]
     if (is_joint and len(others) > 1) or (not is_joint and motion.axis != 'y'):
@@ -305,8 +294,6 @@ def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     if not variance:
         return 0.0, 0.0
     # With motion in one direction, friction and an offset are not distinguishable.
-    along = float(np.var(x[:, :2] @ solution[:2]))
-    left = float(np.var(y - x @ solution))
-    return max(0.0, min(along, variance - left) / variance), float(
-        np.mean((x[:, :2] @ solution[:2]) * np.sign(velocity[moving]))
-    )
+    friction = x[:, :2] @ solution[:2]
+    along, left = float(np.var(friction)), float(np.var(y - x @ solution))
+    return max(0.0, min(along, variance - left) / variance), float(np.mean(friction * x[:, 0]))

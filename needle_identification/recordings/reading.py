@@ -17,22 +17,20 @@ from typing import Final, NamedTuple
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings import TIMES
+from needle_identification.recordings import samples, TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.samples import (
-    Gathering,
-    position_and_velocity,
-    SignalSource,
-    source_of,
-)
 from needle_identification.recordings.tables import is_table, read_friction_table, TABLES
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
-from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
+from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import MessageError, ParameterError
 
 _FIRST: Final = 50  # number of messages that are read for joint names
+
+
+#: Message types of the motion of a needle.
+MOTIONS: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
 
 
 class Wanted(NamedTuple):
@@ -44,16 +42,11 @@ class Wanted(NamedTuple):
 
 
 _WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
-_FRICTION_MOTION: Final = Wanted(
-    'motion_topic',
-    (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY),
-    (JOINT_STATES.name, END_EFFECTOR_POSE.name),
-)
-_INDENTATION_MOTION: Final = Wanted(
-    'motion_topic',
-    (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE),
-    (END_EFFECTOR_POSE.name, JOINT_STATES.name),
-)
+TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
+_POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
+_USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
+_FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])
+_INDENTATION_MOTION: Final = Wanted('motion_topic', _POSES, _USUAL)
 
 
 def read_friction_recording(
@@ -100,8 +93,6 @@ def read_friction_recording(
     ------
     RecordingError
         If the bag is not readable or lacks a topic.
-    ParameterError
-        If an axis is not valid.
 
     Examples
     --------
@@ -133,12 +124,12 @@ def read_friction_recording(
     wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
     motion = chosen_topic(bag, topics, _FRICTION_MOTION, motion_topic)
     source, direction = _motion_source(bag, motion, motion_axis)
-    force_source = source_of(wrench.type_name, [axis])
+    force_source = samples.source_of(wrench.type_name, [axis])
     gathered, configuration = read_samples(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
     moved = gathered[motion].samples(bag)
     if motion.type_name in (wire.TWIST, wire.JOINT_STATE, wire.ODOMETRY):
-        moved = position_and_velocity(moved, bag)
+        moved = samples.position_and_velocity(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
     moved = moved._replace(values=direction * moved.values)
@@ -182,13 +173,6 @@ def read_indentation_recording(
     IndentationRecording
         Force and position; ``losses`` lists discarded and repaired data.
 
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or lacks a topic.
-    ParameterError
-        If an axis is not valid.
-
     """
     signs, plane = zip(*(signed_axis(axis, 'axis of the plane') for axis in axes), strict=True)
     if len(set(plane)) != 2:
@@ -199,8 +183,8 @@ def read_indentation_recording(
     wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
     motion = chosen_topic(bag, topics, _INDENTATION_MOTION, motion_topic)
     sources = {
-        wrench: source_of(wrench.type_name, plane),
-        motion: source_of(motion.type_name, (*plane, across)),
+        wrench: samples.source_of(wrench.type_name, plane),
+        motion: samples.source_of(motion.type_name, (*plane, across)),
     }
     gathered, configuration = read_samples(bag, sources, time)
     times, forces, positions, clock_offset = merge(
@@ -218,13 +202,15 @@ def read_indentation_recording(
     )
 
 
-def _motion_source(bag: Bag, topic: BagTopic, axis: str | None) -> tuple[SignalSource, float]:
+def _motion_source(
+    bag: Bag, topic: BagTopic, axis: str | None
+) -> tuple[samples.SignalSource, float]:
     """Return the source of a motion along an axis or of a joint, and its sign."""
     if topic.type_name == wire.JOINT_STATE:
         sign, joint = signed(axis or '')
-        return source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
+        return samples.source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
-    return source_of(topic.type_name, [name]), sign
+    return samples.source_of(topic.type_name, [name]), sign
 
 
 def _only_joint(bag: Bag, topic: BagTopic) -> str | None:
@@ -276,13 +262,13 @@ def chosen_topic(
 
 
 def read_samples(
-    bag: Bag, sources: Mapping[BagTopic, SignalSource], time: str
-) -> tuple[Mapping[BagTopic, Gathering], str]:
+    bag: Bag, sources: Mapping[BagTopic, samples.SignalSource], time: str
+) -> tuple[Mapping[BagTopic, samples.Gathering], str]:
     """Gather topics from a bag by stamps of `time`; also return the configuration of the plant."""
     if time not in TIMES:
         raise RecordingError(f'time must be one of {", ".join(TIMES)}, got {time!r}')
     gathered = {
-        topic: Gathering(topic, source, by_header=time == 'header')
+        topic: samples.Gathering(topic, source, by_header=time == 'header')
         for topic, source in sources.items()
     }
     configuration = ''

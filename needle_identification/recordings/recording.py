@@ -42,9 +42,7 @@ class BaseRecording(Displayed):
     force: FloatArray
     losses: tuple[str, ...] = ()  #: lost, discarded or repaired data, one sentence each
     configuration: str = ''  #: parameter file of the recorded plant; empty if not recorded
-    #: Clock of the force minus clock of the motion [s], estimated from the receive times and
-    #: already corrected; 0 if equal.
-    clock_offset: float = 0.0
+    clock_offset: float = 0.0  #: clock of the force minus that of the motion [s], corrected
 
     @property
     def truth(self) -> Mapping[str, Any] | None:
@@ -80,12 +78,6 @@ class Recording(BaseRecording):
     """
     Force and motion of the needle base during one experiment.
 
-    Raises
-    ------
-    ShapeError
-        If the arrays differ in length or are not finite, time does not increase, or both
-        velocity and depth are missing.
-
     Examples
     --------
     >>> velocity = [0.0, 0.01, 0.01]
@@ -119,15 +111,7 @@ class Recording(BaseRecording):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class IndentationRecording(BaseRecording):
-    """
-    Force and motion of an end-effector that presses a tissue in the plane.
-
-    Raises
-    ------
-    ShapeError
-        If the arrays differ in length or are not finite, or time does not increase.
-
-    """
+    """Force and motion of an end-effector that presses a tissue in the plane."""
 
     force: FloatArray  #: (n, 2) force of the end-effector on the tissue, x and z [N]
     position: FloatArray  #: (n, 2) position of the end-effector in the plane, x and z [m]

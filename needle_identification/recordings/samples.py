@@ -3,6 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence, Set
+from math import inf
 from typing import Final, NamedTuple, NoReturn
 
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -35,15 +36,15 @@ class SignalSource(ABC):
     def __call__(self, template: wire.Template) -> Sequence[int] | None:
         """Return the positions of the numbers [bytes] by a template; None: message not needed."""
 
-    def _measured(self, numbers: FloatArray) -> FloatArray:
+    def values(self, numbers: FloatArray) -> FloatArray:
         """Compute the values from the numbers, (n, columns), nan where missing in a message."""
         return numbers
 
-    def _complaint(self) -> str:
+    def fault(self) -> str:
         """Return the fault of the topic as a whole, if any."""
         return ''
 
-    def _losses(self) -> list[str]:
+    def losses(self) -> list[str]:
         """Return the missing data of the topic."""
         return []
 
@@ -71,43 +72,56 @@ class _Odometry(SignalSource):
         # Position and orientation (7 numbers), their covariance (36), velocity (3).
         return [begin + 8 * k for k in (*range(7), *range(43, 46))]
 
-    def _measured(self, numbers: FloatArray) -> FloatArray:
+    def values(self, numbers: FloatArray) -> FloatArray:
         imaginary, real, body = numbers[:, 3:6], numbers[:, 6:7], numbers[:, 7:]
         twice = 2.0 * np.cross(imaginary, body)
         velocity = body + real * twice + np.cross(imaginary, twice)
         return _position_and_velocity(numbers[:, self._axis], velocity[:, self._axis])
 
 
-class _Joint(SignalSource):
-    """Position, velocity and its validity of a joint; default: the joint of the plant."""
+class EachJoint(SignalSource):
+    """Positions of joints by name; nan where missing in a message that has the first ones."""
 
-    columns, width = 2, 3
-
-    def __init__(self, joint: str | None) -> None:
-        self._joint = joint
+    def __init__(self, *joints: str, required: int = 0) -> None:
+        self.columns = self.width = len(joints)
+        self._joints, self._required = joints, required
         self._names: set[str] = set()
         self._is_used = False
-        self._has_position = self._has_velocity = False
 
     def __call__(self, template: wire.Template) -> list[int] | None:
+        names = template.names
         if len(self._names) < _MAX_NAMES:
-            self._names.update(template.names)
-        joint = self._joint or INSERTION
-        if joint not in template.names:
+            self._names.update(names)
+        if not {*self._joints[: self._required]} <= {*names}:
             return None
         self._is_used = True
-        index = template.names.index(joint)
-        position, velocity = (_element(array, index) for array in template.arrays[:2])
+        at = [names.index(joint) if joint in names else inf for joint in self._joints]
+        return self._positions(template, at)
+
+    def _positions(self, template: wire.Template, at: Sequence[float]) -> list[int]:
+        return [_element(template.arrays[0], index) for index in at]
+
+
+class _Joint(EachJoint):
+    """Position, velocity and its validity of a joint; default: the joint of the plant."""
+
+    def __init__(self, joint: str | None) -> None:
+        super().__init__(joint or INSERTION, required=1)
+        self.columns, self.width = 2, 3
+        self._has_position = self._has_velocity = False
+
+    def _positions(self, template: wire.Template, at: Sequence[float]) -> list[int]:
+        position, velocity = (_element(array, at[0]) for array in template.arrays[:2])
         self._has_position |= position >= 0
         self._has_velocity |= velocity >= 0
         return [position, velocity]
 
-    def _measured(self, numbers: FloatArray) -> FloatArray:
+    def values(self, numbers: FloatArray) -> FloatArray:
         position, velocity = numbers.T
         return _position_and_velocity(position if self._has_position else 0.0 * velocity, velocity)
 
-    def _complaint(self) -> str:
-        joint = self._joint or INSERTION
+    def fault(self) -> str:
+        (joint,) = self._joints
         if not self._is_used:
             names = f'motion_axis (--motion-axis) must name one of {_listing(self._names)}'
             return (
@@ -118,50 +132,28 @@ class _Joint(SignalSource):
         return ''
 
 
-class EachJoint(SignalSource):
-    """Positions of joints by name; nan where missing in a message."""
-
-    def __init__(self, *joints: str) -> None:
-        self.columns = self.width = len(joints)
-        self._joints = joints
-
-    def __call__(self, template: wire.Template) -> list[int] | None:
-        positions, names = template.arrays[0], template.names
-        return [
-            _element(positions, names.index(joint)) if joint in names else -1
-            for joint in self._joints
-        ]
-
-
 class _PlaneJoints(EachJoint):
     """Positions of two joints of an end-effector in a plane, and of the off-plane joint."""
 
     def __init__(self, *joints: str) -> None:
-        super().__init__(*joints)
-        self._names: set[str] = set()
-        self._is_used = self._is_flat = False
+        super().__init__(*joints, required=2)
+        self._is_flat = False
 
-    def __call__(self, template: wire.Template) -> list[int] | None:
-        if len(self._names) < _MAX_NAMES:
-            self._names.update(template.names)
-        if not set(self._joints[:2]) <= set(template.names):
-            return None
-        self._is_used = True
-        self._is_flat |= self._joints[2] not in template.names
-        return super().__call__(template)
+    def _positions(self, template: wire.Template, at: Sequence[float]) -> list[int]:
+        self._is_flat |= at[2] == inf
+        return super()._positions(template, at)
 
-    def _measured(self, numbers: FloatArray) -> FloatArray:
+    def values(self, numbers: FloatArray) -> FloatArray:
         if self._is_flat:
             numbers[:, 2] = np.nan_to_num(numbers[:, 2])
         return numbers
 
-    def _complaint(self) -> str:
-        if self._is_used:
-            return ''
+    def fault(self) -> str:
         wanted = ' and '.join(self._joints[:2])
-        return f'must have the joints {wanted}, has {_listing(self._names)}'
+        names = _listing(self._names)
+        return '' if self._is_used else f'must have the joints {wanted}, has {names}'
 
-    def _losses(self) -> list[str]:
+    def losses(self) -> list[str]:
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
 
 
@@ -170,9 +162,9 @@ def _listing(names: Set[str]) -> str:
     return ', '.join(shown) or 'none'
 
 
-def _element(array: tuple[int, int], index: int) -> int:
+def _element(array: tuple[int, int], index: float) -> int:
     begin, length = array
-    return begin + 8 * index if index < length else -1
+    return begin + 8 * int(index) if index < length else -1
 
 
 def _position_and_velocity(position: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -211,14 +203,8 @@ class Gathering:
         self._fault = ''
 
     def add(self, batch: MessageBatch) -> None:
-        decoded = wire.decode(
-            batch.data,
-            batch.begin,
-            batch.end,
-            self._topic.type_name,
-            self._source,
-            self._source.columns,
-        )
+        kind, source = self._topic.type_name, self._source
+        decoded = wire.decode(batch.data, batch.begin, batch.end, kind, source, source.columns)
         self._invalid += decoded.invalid
         self._messages += len(batch.begin)
         self._unwanted += len(batch.begin) - len(decoded.used) - decoded.invalid
@@ -229,7 +215,7 @@ class Gathering:
             self._unstamped += int(np.count_nonzero(~stamped))
             stamps = np.where(stamped, decoded.stamps, received)
         with np.errstate(all='ignore'):
-            values = self._source._measured(decoded.values)
+            values = source.values(decoded.values)
         usable = (np.abs(values) < _LARGEST).all(axis=1)
         self._unusable += int(np.count_nonzero(~usable))
         self._series.add(stamps[usable], values[usable])
@@ -241,8 +227,8 @@ class Gathering:
     def samples(self, bag: Bag) -> Samples:
         """Return the samples; add discarded data to the losses of the bag; raise on a fault."""
         name, series = self._topic.name, self._series
-        if complaint := self._source._complaint():
-            self._reject(bag, complaint)
+        if fault := self._source.fault():
+            self._reject(bag, fault)
         series.compact()
         for count, what in (
             (self._invalid, f'not readable, left out: the first one {self._fault}'),
@@ -261,19 +247,18 @@ class Gathering:
                 f'{name} is averaged over {1e-9 * series.width:g} s, because it is very long'
             )
         if len(series.stamps) < 2:
-            self._reject(
-                bag, f'must have >= 2 samples at different times, has {len(series.stamps)}'
-            )
+            fault = f'must have >= 2 samples at different times, has {len(series.stamps)}'
+            self._reject(bag, fault)
         steps = np.diff(series.stamps)
         gaps = steps[are_gaps(steps)]
         if len(gaps):
             places = '1 place' if len(gaps) == 1 else f'{len(gaps)} places'
             bag.losses.append(f'{name} pauses in {places}, {1e-9 * gaps.sum():.3g} s in all')
-        bag.losses += [f'{name} {loss}' for loss in self._source._losses()]
+        bag.losses += [f'{name} {loss}' for loss in self._source.losses()]
         return Samples(name, series.stamps, series.values, np.concatenate(self._latencies))
 
-    def _reject(self, bag: Bag, complaint: str) -> NoReturn:
-        what = f'{bag.path}: {self._topic.name} {complaint}'
+    def _reject(self, bag: Bag, fault: str) -> NoReturn:
+        what = f'{bag.path}: {self._topic.name} {fault}'
         raise RecordingError('; '.join([what, *bag.losses]))
 
 

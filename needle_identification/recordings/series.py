@@ -7,20 +7,16 @@ from needle_dynamics.arrays import FloatArray
 import numpy as np
 from numpy.typing import NDArray
 
-#: Finest bin [ns]: 400 Hz, well above the cutoff frequency of the friction filter.
-FINEST: Final = 2_500_000
-
+FINEST: Final = 2_500_000  #: finest bin [ns]: 400 Hz, above the cutoff of the friction filter
 LARGEST: Final = 2**20  #: largest number of samples that are kept
 _GATHERED: Final = 2**16  # smallest number of added samples that is sorted
 
 
 class Series:
-    """
-    Samples in order of stamp; up to date after `compact`.
+    """Samples in order of stamp, after `compact`; ``late``, ``repeated`` count their stamps."""
 
-    More than two samples per bin of ``width`` [ns] are averaged, stamps and values alike; above
-    `LARGEST` samples, neighbors are. ``late`` and ``repeated`` count samples by their stamps.
-    """
+    # More than two samples per bin of ``width`` [ns] are averaged, stamps and values alike; above
+    # `LARGEST` samples, neighbors are.
 
     def __init__(self, columns: int) -> None:
         self.stamps = np.empty(0, dtype=np.int64)

@@ -9,11 +9,11 @@ two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
-from math import pi
+from math import inf, pi
 import os
 from pathlib import Path
 import re
@@ -54,8 +54,7 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'tip_z': _LENGTHS,
 }
 
-#: Roles of the columns for friction; depth or speed is sufficient.
-ROLES: Final = ('time', 'depth', 'speed', 'force')
+ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
 
 #: Usual names of a column of time.
 TIME_NAMES: Final = ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec')
@@ -71,16 +70,11 @@ _USUAL: Final = {
 #: Exceptions of SciPy for damaged bytes.
 _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 
-#: Header length of a MATLAB file [bytes], and type code of its compressed variables.
-_MATLAB_HEAD: Final = 128
-_COMPRESSED: Final = 15
-
+_MATLAB_HEAD: Final = 128  # length of the header of a MATLAB file [bytes]
+_COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
-
-#: Ranges above which a depth or speed without unit is probably not in SI units.
-_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
-
+_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}  # ranges that are rarely in SI units
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
@@ -127,7 +121,7 @@ def read_table(path: Path) -> Table:
 def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     """Read force and motion from a table; roles missing in `columns` are found by usual names."""
     table = read_table(path)
-    specs = {**guessed(table), **columns}
+    specs = {**guessed(table.columns), **columns}
     missing = [role for role in ('time', 'force') if role not in specs]
     if not {'depth', 'speed'} & set(specs):
         missing.append('depth or speed')
@@ -140,24 +134,41 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
     values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
         losses.append(f'columns by their names: {words}')
-    return _recording(path, values, losses)
+    roles = [role for role in ('force', 'depth', 'speed') if role in values]
+    rows = np.column_stack([values[role] for role in roles])
+    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
+    found = dict(zip(roles, rows.T, strict=True))
+    times = 1e-9 * (stamps - stamps[0])
+    if 'depth' not in found:
+        losses.append('no depth: it is the integral of the speed from 0')
+        found['depth'] = integrated(times, found['speed'])
+    return Recording(
+        name=str(path),
+        time=times,
+        depth=found['depth'],
+        velocity=found.get('speed'),
+        force=found['force'],
+        losses=tuple(losses),
+    )
 
 
-def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
-    """Find columns by role from usual names, in order of preference, lower case without signs."""
-    plain = {name: plain_name(name) for name in table.columns}
+def guessed(
+    names: Iterable[str], usual_names: Mapping[str, Sequence[str]] = _USUAL
+) -> dict[str, str]:
+    """Find names by role from usual names, in order of preference, lower case without signs."""
+    plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
         for word in usual:
-            names = [name for name, short in plain.items() if short == word]
-            names += [name for name, short in plain.items() if name.lower().endswith('.' + word)]
-            if names:
-                found[role] = names[0]
+            alike = [name for name, short in plain.items() if short == word]
+            alike += [name for name in plain if name.lower().endswith('.' + word)]
+            if alike:
+                found[role] = alike[0]
                 break
     pairs = [
         (sec, nanosec)
-        for sec in table.columns
-        for nanosec in table.columns
+        for sec in plain
+        for nanosec in plain
         if re.search(r'(?i)n(ano)?sec', nanosec)
         and re.sub(r'(?i)n(ano)?secs?', 'sec', nanosec) == re.sub(r'(?i)secs?', 'sec', sec)
         and sec != nanosec
@@ -184,12 +195,10 @@ def unit_of(name: str, role: str) -> str | None:
     return word if word in UNITS[role] and word != name else None
 
 
-def with_unit(table: Table, role: str, name: str) -> str:
-    """Return a column for friction with mm or mm/s if it states no unit and is too large in m."""
-    if role not in _SUSPICIOUS or unit_of(name, role) is not None:
-        return name
-    finite = table.columns[name][np.isfinite(table.columns[name])]
-    if len(finite) and np.ptp(finite) > _SUSPICIOUS[role]:
+def with_unit(role: str, name: str, values: FloatArray) -> str:
+    """Return a column with mm or mm/s if its name states no unit and its values are large in m."""
+    finite = values[np.isfinite(values)]
+    if unit_of(name, role) is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, inf):
         return f'{name}[mm{"/s" if role == "speed" else ""}]'
     return name
 
@@ -221,11 +230,10 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
     if factor is not None:
         scale *= _factor(table, role, spec, factor)
     found = scale * column
-    finite = found[np.isfinite(found)]
-    if unit is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, np.inf):
+    if unit is None and (other := with_unit(role, name, found)) != name:
         losses.append(
-            f'{name} has no unit and spans {np.ptp(finite):.3g}, taken in SI units: perhaps '
-            f'{role}={name}[mm{"/s" if role == "speed" else ""}]'
+            f'{name} has no unit and spans {np.ptp(found[np.isfinite(found)]):.3g}, taken in SI '
+            f'units: perhaps {role}={other}'
         )
     return np.asarray(found)
 
@@ -254,26 +262,6 @@ def _factor(table: Table, role: str, spec: str, factor: str) -> float:
     raise RecordingError(
         f'--columns {role}={spec}: the factor must be a number or the name of one, got '
         f'{factor!r}; {table.path} has {has}'
-    )
-
-
-def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) -> Recording:
-    """Build a recording from columns in SI units: sort samples, discard invalid rows."""
-    roles = [role for role in ('force', 'depth', 'speed') if role in values]
-    rows = np.column_stack([values[role] for role in roles])
-    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
-    found = dict(zip(roles, rows.T, strict=True))
-    times = 1e-9 * (stamps - stamps[0])
-    if 'depth' not in found:
-        losses.append('no depth: it is the integral of the speed from 0')
-        found['depth'] = integrated(times, found['speed'])
-    return Recording(
-        name=str(path),
-        time=times,
-        depth=found['depth'],
-        velocity=found.get('speed'),
-        force=found['force'],
-        losses=tuple(losses),
     )
 
 
@@ -340,7 +328,6 @@ def _text(path: Path) -> Table:
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
-    """Parse line by line; a non-numeric word is nan."""
     found, lost = array('d'), 0
     for line in islice(_lines(path), first, None):
         words = _split(line, separator)
@@ -363,7 +350,6 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _separator(line: str) -> str | None:
-    """Return the separator of columns; None for blanks."""
     return next((mark for mark in (';', '\t', ',') if mark in line), None)
 
 

@@ -13,8 +13,7 @@ class SensorEstimate(DisplayedEstimate):
 
     name: str  #: name of the recording
     axes: tuple[str, ...]  #: axes of the biases
-    #: Deviations on each axis, times, bias by axis, delay, and fractions of samples.
-    parameters: tuple[ParameterEstimate, ...]
+    parameters: tuple[ParameterEstimate, ...]  #: noise, biases, delay, losses
     rate: float  #: samples per second, from the median interval [Hz]
     samples: int  #: number of samples
     duration: float  #: time from the first to the last sample [s]

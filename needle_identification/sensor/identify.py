@@ -15,7 +15,7 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import estimated, ParameterEstimate
 from needle_identification.recordings.samples import are_gaps
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.losses import binomial_interval, fit_losses
@@ -41,11 +41,8 @@ _SETTLED: Final = 1e-7  # change of the delay in the last round [s]
 #: Factors of wrong units, and the largest difference of decimal logarithms.
 _UNITS: Final = {1e3: '[mm]', 1e2: '[cm]', 1e-3: '[m], with the true position in mm'}
 _SIMILAR: Final = 0.3
-
-#: Ratio of residuals above which axes are exchanged, and smallest residual [m].
-_EXCHANGED: Final = 5.0
-_BIASED: Final = 2e-3
-
+_EXCHANGED: Final = 5.0  # ratio of residuals above which axes are exchanged
+_BIASED: Final = 2e-3  # smallest residual of exchanged axes [m]
 _LONG: Final = 20.0  #: Duration of a recording over a correlation time that it determines well.
 
 
@@ -89,30 +86,20 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     _check_count(one, int(np.count_nonzero(kept)))
     time, tip = time[kept], one.tip[usable][kept]
     fit, delay = _fit(one, time, tip, delay)
-    losses = fit_losses(one.time)
-    period = float(np.median(np.diff(one.time)))
-    duration = float(time[-1] - time[0])
-    count = int(np.count_nonzero(far))
-    outliers = count / len(far)
-    low, high = binomial_interval(count, len(far))
-    parameters = (
-        *_noise(fit),
-        *_biases(one, fit),
-        _delay(one, fit, delay),
-        _known('outliers', 'p_o', '1', outliers, sqrt(outliers / len(far)), (low, high)),
-        _known('dropout', 'p', '1', losses.fraction, losses.error, losses.fraction_interval),
-        _known(
-            'dropout_time', 'T', 's', losses.time, losses.time_error, losses.time_interval
-        ),
-    )  # fmt: skip
+    dropout, dropout_time = fit_losses(one.time)
+    duration, count = float(time[-1] - time[0]), int(np.count_nonzero(far))
+    fraction, error = count / len(far), sqrt(count) / len(far)
+    between = binomial_interval(count, len(far))
+    outliers = estimated('outliers', 'p_o', '1', fraction, error, between)
+    noise = (*_noise(fit), *_biases(one, fit), _delay(one, fit, delay))
     return SensorEstimate(
         name=one.name,
         axes=one.axes,
-        parameters=parameters,
-        rate=1.0 / period,
+        parameters=(*noise, outliers, dropout, dropout_time),
+        rate=1.0 / float(np.median(np.diff(one.time))),
         samples=len(one.time),
         duration=duration,
-        warnings=tuple(_warnings(fit, duration, isfinite(losses.fraction))),
+        warnings=tuple(_warnings(fit, duration, isfinite(dropout.value))),
     )
 
 
@@ -125,7 +112,6 @@ def _check_count(one: SensorRecording, count: int) -> None:
 
 
 def _true(one: SensorRecording, time: FloatArray) -> FloatArray:
-    """Return the true position at times [s], (n, k)."""
     columns = [np.interp(time, one.true_time, column) for column in one.true_tip.T]
     return np.column_stack(columns)
 
@@ -143,12 +129,7 @@ def _covered(one: SensorRecording) -> BoolArray:
 
 
 def _aligned(one: SensorRecording, usable: BoolArray) -> float:
-    """
-    Return the delay with the smallest errors [s]; 0 for a constant position.
-
-    Reject positions in another unit, and exchanged or reversed axes: with these, other errors are
-    much smaller.
-    """
+    """Return the delay of least errors [s]; reject other units, exchanged or reversed axes."""
     every = -(-int(np.count_nonzero(usable)) // _ALIGNED)
     time, tip, k = one.time[usable][::every], one.tip[usable][::every], len(one.axes)
     delays = np.arange(*_DELAYS, _GRID) if one.moves else np.zeros(1)
@@ -228,15 +209,6 @@ def _fit(
     return linearized(delay).best(), delay
 
 
-def _known(
-    name: str, symbol: str, unit: str, value: float, error: float, interval: tuple[float, float]
-) -> ParameterEstimate:
-    return ParameterEstimate(
-        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=interval,
-        determined=isfinite(value) and all(map(isfinite, interval)),
-    )  # fmt: skip
-
-
 def _noise(fit: NoiseFit) -> Iterator[ParameterEstimate]:
     """Return the deviations of white and slow noise, and the correlation time."""
     spread, is_slow = fit.spread, fit.log_ratio > -inf
@@ -250,7 +222,7 @@ def _noise(fit: NoiseFit) -> Iterator[ParameterEstimate]:
     for name, symbol, unit, logarithm, variance in values:
         value, known = exp(logarithm), isfinite(variance) and variance < 1.0
         interval = log_interval(logarithm, variance) if known else (-inf, inf)
-        yield _known(name, symbol, unit, value, value * sqrt(variance), interval)
+        yield estimated(name, symbol, unit, value, value * sqrt(variance), interval)
     if not is_slow:
         yield ParameterEstimate(name='slow_noise', symbol='s_s', unit='m')
         yield ParameterEstimate(name='slow_time', symbol='tau', unit='s')
@@ -265,7 +237,7 @@ def _biases(one: SensorRecording, fit: NoiseFit) -> Iterator[ParameterEstimate]:
     ):
         error = sqrt(variance)
         interval = value - quantile * error, value + quantile * error
-        yield _known(f'bias_{axis}', f'b_{axis}', 'm', value, error, interval)
+        yield estimated(f'bias_{axis}', f'b_{axis}', 'm', value, error, interval)
 
 
 def _delay(one: SensorRecording, fit: NoiseFit, delay: float) -> ParameterEstimate:
@@ -275,7 +247,7 @@ def _delay(one: SensorRecording, fit: NoiseFit, delay: float) -> ParameterEstima
         noise = exp(fit.log_noise) * sqrt(1.0 + exp(fit.log_ratio))
         clear = sqrt(float(one.true_tip.var(axis=0).mean())) > _CLEAR * noise
         if clear and error < _VAGUE and _DELAYS[0] < low < high < _DELAYS[1]:
-            return _known('delay', 'D', 's', delay, error, (low, high))
+            return estimated('delay', 'D', 's', delay, error, (low, high))
     return ParameterEstimate(name='delay', symbol='D', unit='s')
 
 

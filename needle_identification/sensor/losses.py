@@ -1,31 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fraction of lost samples and duration of bursts, from the gaps between samples."""
 
+from dataclasses import replace
 from math import exp, inf, log, log1p, nan, sqrt
-from typing import Final, NamedTuple
+from typing import Final
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.estimation.estimate import estimated, ParameterEstimate
 import numpy as np
 from scipy.special import betaincinv
 
 _REGULAR: Final = 0.25  # largest deviation of a step from a multiple of the period [periods]
 _IRREGULAR: Final = 0.05  # largest fraction of steps beyond it
-
-#: Number of standard errors by which the memory of losses exceeds that of independent losses.
-_BURSTS: Final = 2.6
-
-_UNKNOWN: Final = (-inf, inf)
-
-
-class LossFit(NamedTuple):
-    """Lost samples with 95 % intervals; the fraction is nan without a regular period."""
-
-    fraction: float
-    fraction_interval: tuple[float, float]
-    time: float  #: mean duration of a burst [s]; nan for independent losses
-    time_interval: tuple[float, float]
-    error: float  #: standard error of the fraction
-    time_error: float  #: standard error of the duration [s]
+_BURSTS: Final = 2.6  # memory of losses that are not independent [standard errors]
+_NO_BURSTS: Final = ParameterEstimate(name='dropout_time', symbol='T', unit='s')
 
 
 def binomial_interval(count: int, total: int) -> tuple[float, float]:
@@ -35,18 +23,19 @@ def binomial_interval(count: int, total: int) -> tuple[float, float]:
     return low, high
 
 
-def fit_losses(time: FloatArray) -> LossFit:
-    """Fit a Markov process of two states to the gaps between samples at times [s], (n,)."""
+def fit_losses(time: FloatArray) -> tuple[ParameterEstimate, ParameterEstimate]:
+    """Return the fraction of lost samples and the duration of a burst, at times [s], (n,)."""
+    # A Markov process; nan without a regular period, and no duration for independent losses.
     steps = np.diff(time)
     period = float(np.median(steps))
     # Drift of the clocks does not add up, since each step is rounded by itself.
     each = np.maximum(np.rint(steps / period), 1.0)
     if np.mean(np.abs(steps / period - each) > _REGULAR) > _IRREGULAR:
-        return LossFit(nan, _UNKNOWN, nan, _UNKNOWN, inf, inf)
+        return _dropout(nan, inf, (-inf, inf)), _NO_BURSTS
     bursts, lost = int(np.count_nonzero(each > 1.0)), int(each.sum()) - len(steps)
     total = len(time) + lost
     if not bursts:
-        return LossFit(0.0, binomial_interval(0, total), nan, _UNKNOWN, 1.0 / total, inf)
+        return _dropout(0.0, 1.0 / total, binomial_interval(0, total)), _NO_BURSTS
     # Transitions from received and from lost samples: a burst ends once.
     begin, end = bursts / len(steps), bursts / lost
     fraction, kept = begin / (begin + end), 1.0 - begin - end
@@ -56,9 +45,8 @@ def fit_losses(time: FloatArray) -> LossFit:
     )
     if kept <= _BURSTS * sqrt(sum(variance)):
         fraction = lost / total
-        low, high = binomial_interval(lost, total)
         error = sqrt(fraction * (1.0 - fraction) / total)
-        return LossFit(fraction, (low, high), nan, _UNKNOWN, error, inf)
+        return _dropout(fraction, error, binomial_interval(lost, total)), _NO_BURSTS
     # The logit of a fraction is nearly normal.
     logit, half = log(fraction) - log1p(-fraction), 1.96 * error / (fraction * (1.0 - fraction))
     low, high = (1.0 / (1.0 + exp(-at)) for at in (logit - half, logit + half))
@@ -69,4 +57,11 @@ def fit_losses(time: FloatArray) -> LossFit:
     by_end = -begin / whole / (1.0 - fraction) + 1.0 / (kept * log(kept))
     log_error = sqrt(by_begin**2 * variance[0] + by_end**2 * variance[1])
     ends = duration * exp(-1.96 * log_error), duration * exp(1.96 * log_error)
-    return LossFit(fraction, (low, high), duration, ends, error, duration * log_error)
+    burst = replace(
+        _NO_BURSTS, value=duration, error=duration * log_error, interval=ends, determined=True
+    )
+    return _dropout(fraction, error, (low, high)), burst
+
+
+def _dropout(value: float, error: float, interval: tuple[float, float]) -> ParameterEstimate:
+    return estimated('dropout', 'p', '1', value, error, interval)

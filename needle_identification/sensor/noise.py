@@ -9,15 +9,13 @@ times, the inverse covariance matrix Q of this process is tridiagonal [Rue2005]_
 .. math:: (I + g Q^{-1})^{-1} = I - g (Q + g I)^{-1}, \qquad
    \log |I + g Q^{-1}| = \log |Q + g I| - \log |Q|
 
-take a time that is proportional to the number of samples. The likelihood is restricted
-[Patterson1971]_: bias and delay are integrated out. The variance of the white noise has its most
-probable value for each g and tau.
+take a time that is proportional to the number of samples. The likelihood is restricted, as in
+`needle_identification.estimation.memory`: bias and delay are integrated out. The variance of the
+white noise has its most probable value for each g and tau.
 
 References
 ----------
 .. [Rue2005] H. Rue, L. Held, "Gaussian Markov Random Fields", Chapman & Hall, 2005.
-.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
-   sizes are unequal", Biometrika 58(3), 1971, doi:10.1093/biomet/58.3.545.
 
 """
 
@@ -26,6 +24,7 @@ from math import exp, inf, log, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.estimation.memory import precision
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.optimize import minimize
@@ -53,19 +52,14 @@ class NoiseFit(NamedTuple):
     deviance: float  #: -2 log restricted likelihood
     freedom: int  #: values less constants
     information: float  #: number of independent samples with the same information on the bias
-    #: Covariance of the logarithms of white deviation, ratio and time, (3, 3).
-    spread: FloatArray = np.full((3, 3), np.nan)
+    spread: FloatArray = np.full((3, 3), np.nan)  #: covariance of the logarithms
 
 
 class NoiseLikelihood:
-    """
-    Likelihood of the errors of a sensor.
-
-    ``errors`` (n, k) [m] are at ``time`` (n,) [s]; ``slopes`` (n, k) are the change of the errors
-    per change of the delay [m/s], or None without a delay.
-    """
+    """Likelihood of errors (n, k) [m] of a sensor at times (n,) [s]."""
 
     def __init__(self, time: FloatArray, errors: FloatArray, slopes: FloatArray | None) -> None:
+        """Slopes (n, k) are the change of the errors by the delay [m/s]; None without a delay."""
         self._steps, self._axes = np.diff(time), errors.shape[1]
         ones = np.ones((len(time), 1))
         parts = [ones, errors] if slopes is None else [ones, errors, slopes]
@@ -148,14 +142,10 @@ class NoiseLikelihood:
         columns = self._columns
         if not ratio:
             return columns.T @ columns, 0.0
-        kept = np.exp(-self._steps / time)
-        lost = -np.expm1(-2.0 * self._steps / time)
-        diagonal = np.ones(len(columns))
-        diagonal[:-1] += kept**2 / lost
-        diagonal[1:] += kept**2 / lost
-        d, e, _ = dpttrf(diagonal + ratio, -kept / lost)
+        diagonal, beside, log_chain = precision(self._steps, time)
+        d, e, _ = dpttrf(diagonal + ratio, beside)
         solved, _ = dpttrs(d, e, columns)
-        logarithm = float(np.log(d).sum() + np.log(lost).sum())
+        logarithm = float(np.log(d).sum()) + log_chain
         return columns.T @ (columns - ratio * solved), logarithm
 
 

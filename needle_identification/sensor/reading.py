@@ -8,24 +8,16 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import chosen_topic, read_samples, Wanted
+from needle_identification.recordings import Roles, tables
+from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
-from needle_identification.recordings.tables import (
-    column_values,
-    guessed,
-    is_table,
-    read_table,
-    sorted_rows,
-    TIME_NAMES,
-)
 from needle_identification.sensor.recording import SensorRecording
-from needle_ros import contract, wire
+from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
 _TRUTH: Final = Wanted('truth_topic', (wire.POINT, wire.POSE, wire.JOINT_STATE), ())
 
 #: Roles of the columns of a table; for a bag, axes or joints by role, without the time.
@@ -33,7 +25,7 @@ SENSOR_ROLES: Final = ('time', 'tip_x', 'tip_y', 'tip_z')
 
 #: Usual column names by role, in lower case without separators.
 _USUAL: Final = {
-    'time': TIME_NAMES,
+    'time': tables.TIME_NAMES,
     'tip_x': ('tipx', 'x', 'px', 'pointx', 'positionx'),
     'tip_y': ('tipy', 'y', 'py', 'pointy', 'positiony'),
     'tip_z': ('tipz', 'z', 'pz', 'pointz', 'positionz'),
@@ -87,21 +79,18 @@ def read_sensor_recording(
     ------
     RecordingError
         If a file is not readable, lacks a topic or a column, or the times do not overlap.
-    ParameterError
-        If an axis or the constant position is not valid.
 
     """
     axes = tuple(axes)
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
         raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
-    path, losses = Path(path), list[str]()
-    stamps, tip = _positions(path, _TIP, tip_topic, axes, time, columns or {}, losses)
+    path = Path(path)
+    stamps, tip, losses = _positions(path, TIP, tip_topic, axes, time, columns or {})
     if isinstance(truth, (str, Path)):
-        there = list[str]()
-        true_stamps, true_tip = _positions(
-            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}, there
+        true_stamps, true_tip, others = _positions(
+            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}
         )
-        losses += [f'true position: {loss}' for loss in there]
+        losses += [f'true position: {loss}' for loss in others]
         if stamps[-1] < true_stamps[0] or true_stamps[-1] < stamps[0]:
             spans = (
                 f'from {part[0] / NANOSECONDS:.3f} to {part[-1] / NANOSECONDS:.3f} s'
@@ -129,52 +118,37 @@ def read_sensor_recording(
 
 
 def _positions(
-    path: Path,
-    wanted: Wanted,
-    topic: str | None,
-    axes: Sequence[str],
-    time: str,
-    columns: Mapping[str, str],
-    losses: list[str],
-) -> tuple[IntArray, FloatArray]:
-    """Return stamps [ns], (n,), and positions on the axes [m], (n, k)."""
-    if not is_table(path):
-        return _of_bag(path, wanted, topic, axes, time, columns, losses)
+    path: Path, wanted: Wanted, topic: str | None, axes: Sequence[str], time: str, columns: Roles
+) -> tuple[IntArray, FloatArray, list[str]]:
+    """Return stamps [ns], (n,), positions on the axes [m], (n, k), and losses."""
+    if not tables.is_table(path):
+        return _of_bag(path, wanted, topic, axes, time, columns)
     if topic is not None:
         option = wanted.option.replace('_', '-')
         raise RecordingError(f'{path} is a table: name columns instead of --{option}')
-    table = read_table(path)
-    specs = {**guessed(table, _USUAL), **columns}
-    roles = [f'tip_{axis}' for axis in axes]
-    if missing := [role for role in ('time', *roles) if role not in specs]:
+    table = tables.read_table(path)
+    specs, losses = {**tables.guessed(table.columns, _USUAL), **columns}, list(table.losses)
+    roles = ['time', *(f'tip_{axis}' for axis in axes)]
+    if missing := [role for role in roles if role not in specs]:
         option = '--truth-columns' if wanted is _TRUTH else '--columns'
         raise RecordingError(
             f'{path}: no column found for {" and ".join(missing)}, it has '
             f'{", ".join(table.columns)}: use {option} {missing[0]}=NAME,...'
         )
-    losses += table.losses
-    if words := ', '.join(
-        f'{role}={specs[role]}' for role in ('time', *roles) if role not in columns
-    ):
+    if words := ', '.join(f'{role}={specs[role]}' for role in roles if role not in columns):
         losses.append(f'columns by their names: {words}')
-    values = {role: column_values(table, role, specs[role], losses) for role in ('time', *roles)}
-    rows = np.column_stack([values[role] for role in roles])
-    start, stamps, found = sorted_rows(path, values['time'], rows, losses)
+    times, *tips = (tables.column_values(table, role, specs[role], losses) for role in roles)
+    rows = np.column_stack(tips)
+    start, stamps, found = tables.sorted_rows(path, times, rows, losses)
     if not abs(start) < _LATEST:
         raise RecordingError(f'{path}: time starts at {start:.3g} s: is its unit right?')
     _check_means(losses, int(np.count_nonzero(np.isfinite(rows).all(axis=1))), len(stamps))
-    return round(NANOSECONDS * start) + stamps, found
+    return round(NANOSECONDS * start) + stamps, found, losses
 
 
 def _of_bag(
-    path: Path,
-    wanted: Wanted,
-    name: str | None,
-    axes: Sequence[str],
-    time: str,
-    columns: Mapping[str, str],
-    losses: list[str],
-) -> tuple[IntArray, FloatArray]:
+    path: Path, wanted: Wanted, name: str | None, axes: Sequence[str], time: str, columns: Roles
+) -> tuple[IntArray, FloatArray, list[str]]:
     bag = Bag(path)
     topic = chosen_topic(bag, bag.topics(), wanted, name)
     words = [columns.get(f'tip_{axis}', axis) for axis in axes]
@@ -186,9 +160,9 @@ def _of_bag(
         source = source_of(topic.type_name, [axis for _, axis in parsed])
     gathered, _ = read_samples(bag, {topic: source}, time)
     samples = gathered[topic].samples(bag)
-    losses += bag.losses
+    losses = list(bag.losses)
     _check_means(losses, bag.counts[topic], len(samples.stamps))
-    return samples.stamps, samples.values * [sign for sign, _ in parsed]
+    return samples.stamps, samples.values * [sign for sign, _ in parsed], losses
 
 
 def _check_means(losses: list[str], count: int, samples: int) -> None:

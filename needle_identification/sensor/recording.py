@@ -18,15 +18,7 @@ _MOVING: Final = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class SensorRecording(Displayed):
-    """
-    Measured tip positions, and the true position by the same clock.
-
-    Raises
-    ------
-    ShapeError
-        If the shapes do not match, or a value is not finite.
-
-    """
+    """Measured tip positions, and the true position by the same clock."""
 
     name: str = 'recording'  #: for messages
     axes: tuple[str, ...] = AXES  #: axes of the columns

@@ -11,7 +11,7 @@ inverted. Columns with times of their own, such as ``Base sec`` and ``Base nanos
 rows.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from math import pi
 import re
 from typing import Final
@@ -25,7 +25,7 @@ import numpy as np
 STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
 
 #: Usual column names by role, in lower case without separators.
-_USUAL: Final = {
+USUAL: Final = {
     'depth': ('depth', 'insertion', 'insertiondepth', 'guidey', 'basey'),
     'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
     'guide_z': ('guidez', 'basez', 'zguide', 'zbase'),
@@ -34,31 +34,20 @@ _USUAL: Final = {
     'roll': ('roll', 'rotation', 'theta'),
 }
 
-#: Largest depth in m, and smallest depth in mm; between them the unit is cm or mm.
-_LARGE: Final = 1.0
-_SMALL: Final = 25.0
-
-#: Largest lateral motion, and largest distance from the origin of a frame [m].
-_LATERAL: Final = 0.1
-_FAR: Final = 2.0
-
+_LARGE: Final = 1.0  # largest depth in m
+_SMALL: Final = 25.0  # smallest depth in mm; between them the unit is cm or mm
+_LATERAL: Final = 0.1  # largest lateral motion [m]
+_FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
-
-#: Motion of the tip along the needle over the insertion of the needle, at least.
-_ALONG: Final = 0.5
-
-#: Usual names of the position of the tip along the needle.
-_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}
-
+_ALONG: Final = 0.5  # least motion of the tip along the needle over the insertion
+_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}  # position along the needle
 _MOVED: Final = ('depth', 'guide_x', 'guide_z')
-
-#: Last part of the name of a component, such as ``x`` of ``Base x``.
-_COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)
+_COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)  # ``x`` of ``Base x``
 
 
 def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the columns by role that are given or found, with sign and unit: ``--columns``."""
-    given, found = given or {}, guessed(table, _USUAL)
+    given, found = given or {}, guessed(table.columns, USUAL)
     names = {**found, **{role: _column_of(table, spec) for role, spec in given.items()}}
     specs = {role: names[role] for role in STEERING_ROLES if names.get(role) in table.columns}
     if 'depth' not in specs:
@@ -77,16 +66,6 @@ def is_inverted(depth: FloatArray) -> bool:
     """Return whether a depth decreases into the tissue; zeros before its start do not count."""
     from_start = depth - depth[np.argmax(depth != 0.0)]
     return bool(from_start.max() < -from_start.min())
-
-
-def steering_names(names: Iterable[str]) -> dict[str, str]:
-    """Return the names that are usual for a role, by role."""
-    short = {plain_name(name): name for name in names}
-    return {
-        role: next(short[word] for word in usual if word in short)
-        for role, usual in _USUAL.items()
-        if not short.keys().isdisjoint(usual)
-    }
 
 
 def check_depth(table: Table, spec: str) -> None:
@@ -132,7 +111,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
 
 def _along(table: Table, depth: float) -> set[str]:
     """Return the unit in which the tip moves along the needle by the depth [m], if any."""
-    names = guessed(table, _TIP_ALONG)
+    names = guessed(table.columns, _TIP_ALONG)
     if 'along' not in names or not depth:
         return set()
     span = float(np.ptp(_measured(table.columns[names['along']])))
@@ -145,7 +124,10 @@ def _along(table: Table, depth: float) -> set[str]:
 def new_rows(table: Table, specs: Mapping[str, str]) -> tuple[BoolArray, list[str]]:
     """Return in which rows guide and depth are measured, and the columns of their times."""
     rows = len(next(iter(table.columns.values())))
-    words = [re.escape(word) for word in _sources(table, specs)]
+    moved = [_column_of(table, specs[role]) for role in _MOVED if role in specs]
+    # Measured bodies, such as ``Base`` for ``Base x``.
+    bodies = {part for name in moved if (part := _COMPONENT.sub('', name)) not in ('', name)}
+    words = [re.escape(word) for word in bodies]
     own = re.compile(rf'(?:{"|".join(words)})[\s._-]*n?(?:ano)?secs?', re.IGNORECASE)
     times = [name for name in table.columns if words and own.fullmatch(name.strip())]
     if not times:
@@ -160,12 +142,6 @@ def _measured(column: FloatArray) -> FloatArray:
     """Return the values of a column without those that are missing, at least one."""
     found = column[np.isfinite(column)]
     return found if len(found) else np.zeros(1)
-
-
-def _sources(table: Table, specs: Mapping[str, str]) -> set[str]:
-    """Return the names of the measured bodies, such as ``Base`` for ``Base x``."""
-    moved = [_column_of(table, specs[role]) for role in _MOVED if role in specs]
-    return {part for name in moved if (part := _COMPONENT.sub('', name)) not in ('', name)}
 
 
 def _column_of(table: Table, spec: str) -> str:

@@ -63,11 +63,8 @@ class SteeringEstimate(DisplayedEstimate):
     media: tuple[MediumEstimate, ...]  #: constants by medium
     terms: tuple[str, ...]  #: terms of the fit
     order: str  #: order of guide motion and insertion between samples
-    #: Root mean square of the residuals by set of terms, per axis [m].
-    alternatives: Mapping[tuple[str, ...], float]
-    #: Measured minus fitted tip positions of each recording, without missing measurements,
-    #: shape (samples, 2) [m].
-    residuals: tuple[FloatArray, ...]
+    alternatives: Mapping[tuple[str, ...], float]  #: rms by terms, per axis [m]
+    residuals: tuple[FloatArray, ...]  #: measured minus fitted tips, (samples, 2) [m]
     optima: int  #: number of distinct optima
     warnings: tuple[str, ...] = ()  #: warnings about the validity of the values
 
@@ -83,5 +80,4 @@ class SteeringEstimate(DisplayedEstimate):
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals, per axis [m]."""
         return float(np.sqrt(np.mean(np.concatenate(self.residuals) ** 2)))

@@ -26,7 +26,7 @@ References
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
@@ -53,21 +53,10 @@ _LARGEST: Final = 0.5  # largest error of a drift constant that is determined [r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringSettings:
-    """
-    Settings of the steering identification.
+    """Settings of the steering identification."""
 
-    Raises
-    ------
-    ParameterError
-        If a value is not valid.
-
-    """
-
-    #: Drift terms, of `TERMS`; None selects the term with the smallest residual.
-    terms: tuple[str, ...] | None = None
-    #: Whether guide and needle move ``together`` between samples, or the ``guide first``; None
-    #: selects the order with the smaller residual.
-    order: str | None = None
+    terms: tuple[str, ...] | None = None  #: drift terms; None selects the best
+    order: str | None = None  #: ``together`` or ``guide first``; None selects the better
     free_length: float | None = None  #: known free length [m]; None to estimate it
 
     def __post_init__(self) -> None:
@@ -173,7 +162,6 @@ def _refined(fit: _Fit) -> _Fit:
 
 
 def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> SteeringEstimate:
-    """Compute errors, intervals and predictions, and assemble the result."""
     search, best = fit.search, fit.optima[0]
     fits, residuals = search.fits(best.x), search.residuals(best.x)
     information = search.information(best.x)
@@ -262,12 +250,10 @@ def _constant(
 ) -> ParameterEstimate:
     """Return a constant; without a bounded interval it is undetermined, with the value used."""
     symbol, unit = CONSTANTS[name]
+    found = ParameterEstimate(name=name, symbol=symbol, unit=unit, value=value)
     if not (isfinite(low) and isfinite(high)):
-        return ParameterEstimate(name=name, symbol=symbol, unit=unit, value=value)
-    return ParameterEstimate(
-        name=name, symbol=symbol, unit=unit, value=value, error=error, interval=(low, high),
-        determined=True,
-    )  # fmt: skip
+        return found
+    return replace(found, error=error, interval=(low, high), determined=True)
 
 
 def _warnings(

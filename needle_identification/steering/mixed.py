@@ -8,15 +8,12 @@ In each plane of each recording, the tip minus its response to the guide is
 
 with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the depth d, the path
 noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
-whose variance grows with its travel, and white noise e of deviation sigma. The
-likelihood is restricted [Patterson1971]_ [Harville1974]_: o, beta and sigma are integrated out.
-The ratios of the other deviations to sigma are summed over a grid: a few recordings hardly
-determine them.
+whose variance grows with its travel, and white noise e of deviation sigma. The likelihood is
+restricted [Harville1974]_: o, beta and sigma are integrated out. The ratios of the other
+deviations to sigma are summed over a grid: a few recordings hardly determine them.
 
 References
 ----------
-.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
-   sizes are unequal", Biometrika 58, 1971.
 .. [Harville1974] D. A. Harville, "Bayesian inference for variance components using only error
    contrasts", Biometrika 61, 1974.
 
@@ -39,9 +36,7 @@ _SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
 _RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
-
-#: Constants without effect are 0 +- 1 rad or 1/m, for this deviation of the white noise [m].
-_WEAK: Final = 1e-4
+_WEAK: Final = 1e-4  # noise for which constants without effect are 0 +- 1 rad or 1/m [m]
 
 
 class Likelihood(NamedTuple):

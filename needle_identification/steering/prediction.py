@@ -12,9 +12,7 @@ from needle_identification.steering.search import Optimum, Search, Tips
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-#: Depth of the measurements that determine offset and slope, below the first of them [m].
-_START: Final = 0.015
-
+_START: Final = 0.015  # depth of the measurements that determine offset and slope [m]
 _ANY: Final = 1.0  # standard deviation of the offset [m]
 
 
@@ -76,5 +74,4 @@ def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int)
 
 
 def rms_of(errors: Sequence[FloatArray]) -> float:
-    """Return the root mean square of errors (n, 2), per axis [m]."""
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))

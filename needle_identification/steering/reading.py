@@ -14,12 +14,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import (
-    chosen_topic,
-    first_names,
-    read_samples,
-    Wanted,
-)
+from needle_identification.recordings import reading
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import column_values, is_table, read_table, Table
 from needle_identification.recordings.timebase import merge
@@ -34,8 +29,7 @@ from needle_ros import contract, wire
 from needle_ros.axes import signed, signed_axis
 import numpy as np
 
-_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (contract.TIP_DEFLECTION.name,))
-_MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
+_MOTION: Final = reading.Wanted('motion_topic', (wire.JOINT_STATE,), (contract.JOINT_STATES.name,))
 
 #: Joints by role.
 JOINTS: Final = {
@@ -45,8 +39,7 @@ JOINTS: Final = {
     'roll': contract.ROLL,
 }
 
-#: Components of the tip by role.
-_TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
+_TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}  # components of the tip by role
 _TILTS: Final = (contract.TILT_X, contract.TILT_Z)
 
 _MOVED: Final = 1e-4  # largest change of a constant tilt [rad]
@@ -100,12 +93,12 @@ def read_steering_recording(
         for option, given in (('--tip-topic', tip_topic), ('--motion-topic', motion_topic)):
             if given is not None:
                 raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
-        return read_steering_table(path, columns, medium)
+        return _of_table(path, columns, medium)
     bag = Bag(path)
     topics = bag.topics()
-    tip = chosen_topic(bag, topics, _TIP, tip_topic)
-    motion = chosen_topic(bag, topics, _MOTION, motion_topic)
-    present = {name for names in first_names(bag, motion) for name in names}
+    tip = reading.chosen_topic(bag, topics, reading.TIP, tip_topic)
+    motion = reading.chosen_topic(bag, topics, _MOTION, motion_topic)
+    present = {name for names in reading.first_names(bag, motion) for name in names}
     joints = {role: signed(columns.get(role, name)) for role, name in JOINTS.items()}
     if 'roll' not in columns and contract.ROLL not in present:
         del joints['roll']
@@ -120,7 +113,7 @@ def read_steering_recording(
         tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
         motion: EachJoint(*(name for _, name in joints.values()), *tilts),
     }
-    gathered, _ = read_samples(bag, sources, time)
+    gathered, _ = reading.read_samples(bag, sources, time)
     _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
     losses = list(bag.losses)
     for name, column in zip(tilts, moved[:, len(joints) :].T, strict=True):
@@ -132,15 +125,8 @@ def read_steering_recording(
     return recorded_insertion(path, medium, values, losses)
 
 
-def read_steering_table(
-    path: Path | str, columns: Mapping[str, str], medium: str = ''
-) -> SteeringRecording:
-    """
-    Read an insertion from a table; roles missing in ``columns`` are found by names and values.
-
-    Rows without a new measurement of the guide are left out.
-    """
-    path = Path(path)
+def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRecording:
+    """Read a table; roles missing in ``columns`` are found by names and values."""
     table = read_table(path)
     specs = steering_columns(table, columns)
     specs = {role: specs[role] for role in STEERING_ROLES if role in specs}

@@ -15,40 +15,23 @@ from needle_ros.errors import ShapeError
 import numpy as np
 
 _FROZEN: Final = 3  # number of equal consecutive tip measurements that indicate a frozen sensor
-
-#: Change of depth over these measurements [m]; above the position noise of robots.
-_GONE: Final = 5e-4
-
+_GONE: Final = 5e-4  # change of depth over these, above the noise of robots [m]
 _REST: Final = 1e-5  # largest motion between rows at rest [m]
 _LEVER: Final = 0.01  # motion for a roll of 1 rad [m]
-
-#: Largest number of readings of a recording: with a path of 100 mm, one for each millimeter.
-_MOST: Final = 100
-
+_MOST: Final = 100  # readings of a recording: one per millimeter of a path of 100 mm
 _JUMP: Final = 0.01  # smallest guide position after rows of zeros that is no motion [m]
 _AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
 _JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
-
-#: Largest plausible lateral tip position, in addition to the guide and half the depth [m].
-_ASIDE: Final = 0.03
+_ASIDE: Final = 0.03  # lateral tip position beyond the guide and half the depth [m]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class SteeringRecording(Displayed):
-    """
-    Recorded insertion: depth, guide, roll and tip position.
-
-    Raises
-    ------
-    ShapeError
-        If the shapes do not match, or a value is not finite.
-
-    """
+    """Recorded insertion: depth, guide, roll and tip position."""
 
     name: str = 'recording'  #: for messages
     medium: str = ''  #: name of the tissue; recordings in one tissue share its constants
-    #: (n,) depth of the tip below the skin [m]; the path up to the first depth is straight.
-    depth: FloatArray
+    depth: FloatArray  #: (n,) below the skin [m]; straight up to the first depth
     guide: FloatArray  #: (n, 2) position of the guide in x and z [m], with any origin
     roll: FloatArray  #: (n,) roll of the base, right-handed about y [rad]
     tip: FloatArray  #: (n, 2) position of the tip in x and z [m], any origin; NaN if missing
@@ -81,7 +64,6 @@ class SteeringRecording(Displayed):
 
     @property
     def samples(self) -> int:
-        """Number of samples with a tip position."""
         return int(np.count_nonzero(self.known))
 
 

@@ -65,17 +65,8 @@ class SimulatedCauses:
         layers[:, 1] = tissue
         layers[2, 2] = 1.0 / length
         tips = np.empty((3, self._poses.shape[1], 2))
-        insert(
-            constants,
-            layers,
-            1.0,
-            _NO_WANDER,
-            self._poses,
-            _CAUSES,
-            empty_cut(reach, element, 1),
-            tips,
-            NO_FORCES,
-        )
+        cut = empty_cut(reach, element, 1)
+        insert(constants, layers, 1.0, _NO_WANDER, self._poses, _CAUSES, cut, tips, NO_FORCES)
         guide, tilt, bevel = tips[:, :: self._every]
         return TipResponses(guide=guide, tilt=tilt[:, 1], bevel=bevel)
 

@@ -13,11 +13,9 @@ from needle_identification.steering.response import drift, SimulatedCauses, TipR
 import numpy as np
 from scipy.optimize import least_squares
 
-#: Bounds of free length, bending length and skin [m].
-FREE: Final = (1e-3, 0.3)
-LENGTH: Final = (4e-3, 0.5)
-SKIN: Final = (0.0, 0.5)
-
+FREE: Final = (1e-3, 0.3)  #: bounds of the free length [m]
+LENGTH: Final = (4e-3, 0.5)  #: bounds of the bending length [m]
+SKIN: Final = (0.0, 0.5)  #: bounds of the skin [m]
 _SCALE: Final = 0.02  # the search variable of the skin is skin / (skin + scale) [m]
 
 #: Grid of the global search: free lengths, bending lengths and skins [m].
@@ -112,7 +110,6 @@ class Search:
         return r.guide[one.known].T, columns[:, one.known]
 
     def fits(self, x: FloatArray) -> list[Likelihood]:
-        """Return the fit of each medium."""
         return [self._part(k, *own) for k, own in enumerate(self.lengths(x))]
 
     def _fit(self, medium: int, free: float, length: float, skin: float) -> Likelihood:
@@ -216,7 +213,6 @@ class Search:
         return found
 
     def _starts(self) -> list[FloatArray]:
-        """Return the best point of a grid for each skin."""
         starts = []
         for skin in _SKINS:
             trials = []
@@ -240,18 +236,13 @@ def shown(name: str, variable: float) -> float:
 def interval(
     search: Search, optima: Sequence[Optimum], k: int, rise: float
 ) -> tuple[float, float]:
-    """
-    Return the profile likelihood interval of variable k; infinite at a bound of the search.
-
-    It contains all optima whose deviance is within `rise` of the first, which is the best.
-    """
+    """Return the profile likelihood interval of variable k; infinite at a bound of the search."""
+    # It contains all optima whose deviance is within `rise` of the first, which is the best.
     alike = [one for one in optima if one.deviance - optima[0].deviance <= rise]
     level = optima[0].deviance + rise
     alike.sort(key=lambda one: float(one.x[k]))
-    return (
-        _end(search, optima, alike[0], k, -1.0, level),
-        _end(search, optima, alike[-1], k, 1.0, level),
-    )
+    low = _end(search, optima, alike[0], k, -1.0, level)
+    return low, _end(search, optima, alike[-1], k, 1.0, level)
 
 
 def _end(

@@ -35,8 +35,7 @@ class LevelEstimate(DisplayedEstimate):
     spring: ParameterEstimate
     is_spring: bool  #: whether the interval of ``spring`` is within ``largest_asymmetry``
     words: str  #: whether the tissue is a spring, and why
-    #: Larger and smaller principal stiffness, of the symmetric part [N/m].
-    principal: tuple[ParameterEstimate, ParameterEstimate]
+    principal: tuple[ParameterEstimate, ParameterEstimate]  #: larger, smaller [N/m]
     #: Direction of the larger stiffness, from x toward z, in (-pi/2, pi/2] [rad]; not determined
     #: if the two agree within their errors.
     angle: ParameterEstimate
@@ -46,8 +45,7 @@ class LevelEstimate(DisplayedEstimate):
     residual: float  #: root mean square of force minus K d [N]
     determination: float  #: coefficient of determination R^2
     condition: float  #: of the displacements; large for a single direction
-    #: Rotation of the axes of force against those of motion that would make K symmetric [rad].
-    rotation: ParameterEstimate
+    rotation: ParameterEstimate  #: of the axes of force that makes K symmetric [rad]
     moments: Moments  #: for the prediction of other places
 
     def __getitem__(self, name: str) -> ParameterEstimate:
@@ -158,16 +156,11 @@ def summarize_stiffness(
     summaries = []
     for number in range(int(group.max()) + 1):
         members = [level for level, of in zip(levels, group, strict=True) if of == number]
-        summaries.append(
-            LevelSummary(
-                force=float(np.mean([level.force for level in members])),
-                statistics=tuple(
-                    statistic([level[name] for level in members])
-                    for name in (*ENTRIES, 'curl', 'tissue_stiffness')
-                ),
-                prediction=predicted([level.moments for level in members]),
-            )
-        )
+        mean = float(np.mean([level.force for level in members]))
+        names = (*ENTRIES, 'curl', 'tissue_stiffness')
+        found = tuple(statistic([level[name] for level in members]) for name in names)
+        prediction = predicted([level.moments for level in members])
+        summaries.append(LevelSummary(force=mean, statistics=found, prediction=prediction))
     chosen = summaries[-1]
     if force is not None:
         chosen = min(summaries, key=lambda summary: abs(summary.force - force))

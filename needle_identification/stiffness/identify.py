@@ -7,6 +7,7 @@ each force level the stiffness matrix K of F = K d is fitted to the presses.
 """
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from math import hypot, nan, sqrt
 from typing import Final
@@ -15,15 +16,8 @@ from needle_dynamics.arrays import BoolArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.prediction import moments
 from needle_identification.recordings.recording import IndentationRecording
+from needle_identification.stiffness import matrix
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
-from needle_identification.stiffness.matrix import (
-    ENTRIES,
-    fit_matrix,
-    MatrixFit,
-    principal_estimates,
-    rotation_estimate,
-    spring_estimates,
-)
 from needle_identification.stiffness.plateaus import find_plateaus
 from needle_identification.stiffness.presses import find_presses, Presses
 from needle_identification.stiffness.settings import StiffnessSettings
@@ -83,18 +77,16 @@ def identify_stiffness(
         plateaus = find_plateaus(recording, settings)
         presses, noise, warnings = find_presses(recording, plateaus, settings)
         members = [presses.level == index for index in range(int(presses.level.max()) + 1)]
-        fits = [
-            fit_matrix(presses, noise, np.flatnonzero(chosen), settings.estimator)
-            for chosen in members
-        ]
+        fit = partial(matrix.fit_matrix, presses, noise, estimator=settings.estimator)
+        fits = [fit(np.flatnonzero(chosen)) for chosen in members]
     except IdentificationError as error:
         raise IdentificationError(f'{recording.name}: {error}') from None
     levels = []
     by_doubt: dict[str, list[str]] = {}
-    for chosen, fit in zip(members, fits, strict=True):
-        level = _level(presses, chosen, fit, settings)
+    for chosen, found in zip(members, fits, strict=True):
+        level = _level(presses, chosen, found, settings)
         levels.append(level)
-        for doubt, detail in _doubts(level, fit):
+        for doubt, detail in _doubts(level, found):
             by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')
     warnings += [f'{doubt} ({"; ".join(details)})' for doubt, details in by_doubt.items()]
     size = np.maximum(np.hypot(*presses.displacement.T), 1e-15)
@@ -114,11 +106,11 @@ def identify_stiffness(
 
 
 def _level(
-    presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
+    presses: Presses, chosen: BoolArray, fit: matrix.MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
-    k_zz = float(fit.matrix[1, 1])
-    curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
-    first, second, angle = principal_estimates(fit)
+    k_zz, length = float(fit.matrix[1, 1]), settings.contact_length
+    curl, spring, is_spring, words = matrix.spring_estimates(fit, settings.largest_asymmetry)
+    first, second, angle = matrix.principal_estimates(fit)
     force = presses.force[chosen]
     residual = float((fit.residual**2).sum())
     variation = float(((force - force.mean(axis=0)) ** 2).sum())
@@ -129,7 +121,7 @@ def _level(
         force=float(np.hypot(*force.T).mean()),
         parameters=tuple(
             fit.derived(name, name, 'N/m', float(value), unit)
-            for name, value, unit in zip(ENTRIES, fit.matrix.ravel(), units, strict=True)
+            for name, value, unit in zip(matrix.ENTRIES, fit.matrix.ravel(), units, strict=True)
         ),
         curl=curl,
         spring=spring,
@@ -138,18 +130,14 @@ def _level(
         principal=(first, second),
         angle=angle,
         tissue_stiffness=fit.derived(
-            'tissue_stiffness',
-            'k_a',
-            'N/m^2',
-            k_zz / settings.contact_length,
-            units[3] / settings.contact_length,
+            'tissue_stiffness', 'k_a', 'N/m^2', k_zz / length, units[3] / length
         ),
         presses=len(force),
         directions=len(np.unique(presses.direction[chosen])),
         residual=sqrt(residual / len(force)) if is_known else nan,
         determination=1.0 - residual / variation if is_known and variation > 0.0 else nan,
         condition=fit.condition,
-        rotation=rotation_estimate(fit),
+        rotation=matrix.rotation_estimate(fit),
         moments=moments(
             np.asarray(np.kron(np.eye(2), presses.displacement[chosen]), dtype=np.float64),
             fit.residual.T.ravel() if is_known else np.zeros(2 * len(force)),
@@ -158,7 +146,7 @@ def _level(
     )
 
 
-def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
+def _doubts(level: LevelEstimate, fit: matrix.MatrixFit) -> Iterator[tuple[str, str]]:
     """Yield warnings about the matrix of a level, each with a detail of this level."""
     if not fit.known.all():
         lacking = ', '.join(p.symbol for p in level.parameters if not p.determined)

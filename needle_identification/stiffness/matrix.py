@@ -38,24 +38,22 @@ _FEWEST_PRESSES: Final = 3  # smallest number of presses of a level
 #: attenuation by the noise of the displacements is then below 1 %.
 _SMALLEST_SPREAD: Final = 10.0
 
-#: Ratio of column norm to error below which a column contains only noise.
-_LARGEST_NOISE: Final = 3.0
-
-#: Gradient of the curl k_zx - k_xz with respect to the entries of K.
-_CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])
+_LARGEST_NOISE: Final = 3.0  # column norm over error of a column with only noise
+_CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])  # gradient of k_zx - k_xz by K
 
 
 class MatrixFit(NamedTuple):
-    """Stiffness matrix with errors."""
+    """Stiffness matrix with errors; by default undetermined."""
 
-    matrix: FloatArray  # (2, 2) K [N/m]; undetermined columns are nan
-    known: BoolArray  # (2,) columns that the presses determine
-    factors: FloatArray  # (2, 2, 2) A; R_rs A_r A_s^T is the covariance of rows r, s of K
-    correlation: FloatArray  # (2, 2) R, of the residuals of the rows
-    degrees_of_freedom: float  # of each row
-    residual: FloatArray  # (m, 2) force minus K d [N]
-    scatter: float  # of the presses about the matrix over their noise [1]
-    condition: float  # of the displacements
+    matrix: FloatArray = np.full((2, 2), nan)  # K [N/m]; undetermined columns are nan
+    known: BoolArray = np.zeros(2, dtype=np.bool_)  # (2,) columns that the presses determine
+    #: R_rs A_r A_s^T is the covariance of rows r, s of K; R is that of the residuals of the rows.
+    factors: FloatArray = np.zeros((2, 2, 2))
+    correlation: FloatArray = np.eye(2)
+    degrees_of_freedom: float = 0.0  # of each row
+    residual: FloatArray = np.zeros((1, 2))  # (m, 2) force minus K d [N]
+    scatter: float = 0.0  # of the presses about the matrix over their noise [1]
+    condition: float = inf  # of the displacements
     systematic: float = 0.0  # relative error of the whole matrix by creep and hysteresis
 
     def derived(
@@ -83,29 +81,17 @@ class MatrixFit(NamedTuple):
         return variance, freedom * variance**2 / squares if squares > 0.0 else freedom
 
 
-_UNKNOWN: Final = MatrixFit(
-    matrix=np.full((2, 2), nan),
-    known=np.zeros(2, dtype=np.bool_),
-    factors=np.zeros((2, 2, 2)),
-    correlation=np.eye(2),
-    degrees_of_freedom=0.0,
-    residual=np.zeros((1, 2)),
-    scatter=0.0,
-    condition=inf,
-)
-
-
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """Solve F = K d over the presses ``chosen`` (m,), with errors from their scatter."""
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
     if len(chosen) < _FEWEST_PRESSES:
-        return _UNKNOWN
+        return MatrixFit()
     columns = np.flatnonzero(norm(displacement, axis=0) > _LARGEST_NOISE * error)
     singular = np.linalg.svd(displacement[:, columns], compute_uv=False)
     if not len(columns) or singular[-1] < _SMALLEST_SPREAD * error:
         condition = float(singular[0] / singular[-1]) if len(columns) else inf
-        return _UNKNOWN._replace(condition=condition)
+        return MatrixFit(condition=condition)
     displacement = displacement[:, columns]
     start = np.zeros((2, 2))
     start[:, columns] = np.linalg.lstsq(displacement, force, rcond=None)[0].T
@@ -115,17 +101,14 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
     residual = np.empty_like(force)
     freedom = float(len(chosen) - len(columns))
     freedoms = [freedom, freedom]
-    whitened = []
+    # Weights are in the covariances.
+    kind = 'ordinary' if estimator == 'weighted' else estimator
+    spread, whitened = np.full(len(columns), error / sqrt(len(chosen))), []
     for row, covariance in enumerate(covariances):
         size = float(np.mean(np.diag(covariance)))
         root = np.linalg.cholesky(covariance / size)
         x, y = (solve_triangular(root, a, lower=True) for a in (displacement, force[:, row]))
-        fit = regress(
-            x,
-            y,
-            estimator='ordinary' if estimator == 'weighted' else estimator,
-            regressor_noise=np.full(len(columns), error / sqrt(len(chosen))),
-        )
+        fit = regress(x, y, estimator=kind, regressor_noise=spread)
         deviation, freedoms[row], left = _deviation(fit.residual, freedom, estimator)
         matrix[row, columns] = fit.values
         known[columns] &= fit.determined
@@ -153,9 +136,7 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
 def _deviation(
     residual: FloatArray, freedom: float, estimator: str
 ) -> tuple[float, float, FloatArray]:
-    """Return standard deviation, degrees of freedom, and used values of residuals."""
-    # For ``huber``: P. J. Huber, "Robust Statistics", 1981, section 7.6; each clipped residual
-    # reduces the degrees of freedom by 1.
+    # P. J. Huber, "Robust Statistics", 1981, section 7.6; a clipped residual is not free.
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual
     limit = 1.345 * 1.4826 * float(np.median(np.abs(residual)))
@@ -183,24 +164,16 @@ def principal_estimates(
     differ = fit.known.all() and _differ(fit, np.array([half, shear]), stretch, slide)
     found = []
     for number, sign in ((1, 1.0), (2, -1.0)):
-        one = fit.derived(
-            f'principal_stiffness_{number}',
-            f'k_{number}',
-            'N/m',
-            mean + sign * radius,
-            np.eye(2) / 2.0 + sign * outward,
-        )
+        name, value = f'principal_stiffness_{number}', mean + sign * radius
+        gradient = np.eye(2) / 2.0 + sign * outward
+        one = fit.derived(name, f'k_{number}', 'N/m', value, gradient)
         if one.determined and not differ:
             ends = (*one.interval, *middle.interval)
             one = replace(one, interval=(min(ends), max(ends)))
         found.append(one)
-    angle = fit.derived(
-        'principal_angle',
-        'phi',
-        'rad',
-        atan2(shear, half) / 2.0 if differ else nan,
-        around / (2.0 * (radius or 1.0)),
-    )
+    direction, gradient = atan2(shear, half) / 2.0, around / (2.0 * (radius or 1.0))
+    direction = direction if differ else nan
+    angle = fit.derived('principal_angle', 'phi', 'rad', direction, gradient)
     return found[0], found[1], angle
 
 
@@ -214,20 +187,7 @@ def _differ(fit: MatrixFit, found: FloatArray, stretch: FloatArray, slide: Float
 
 
 def asymmetry(matrix: ArrayLike) -> float:
-    """
-    Return the ratio of the antisymmetric to the symmetric part of a stiffness matrix.
-
-    Parameters
-    ----------
-    matrix : array_like, shape (2, 2)
-        Stiffness matrix [N/m].
-
-    Returns
-    -------
-    float
-        Ratio of the Frobenius norms [1]; nan if the symmetric part is zero.
-
-    """
+    """Return the norm of the antisymmetric part of a matrix over that of the symmetric part."""
     k = np.asarray(matrix, dtype=np.float64)
     symmetric = float(norm(k + k.T))
     return float(norm(k - k.T)) / symmetric if symmetric else nan

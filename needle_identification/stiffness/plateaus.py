@@ -19,19 +19,10 @@ from numpy.linalg import norm
 
 _BINS: Final = 10.0  # number of bins in the shortest plateau; steadiness is tested on bin means
 _GAP: Final = 4  # largest step between bins within a plateau [bins]
-
-#: Largest range of positions in a plateau, as a fraction of their whole range.
-_STEADY_MOTION: Final = 0.05
-
-#: Largest trend of the force over a plateau, as a fraction of its tolerance. Even a slow ramp
-#: extends over the whole tolerance.
-_STEADY_TREND: Final = 1.0 / 3.0
-
+_STEADY_MOTION: Final = 0.05  # largest range of positions over their whole range
+_STEADY_TREND: Final = 1.0 / 3.0  # of the force over its tolerance; a ramp has 1
 _BAND: Final = 12.0  # width of the band that contains noise [standard deviations]
-
-#: Deviation from the middle half of a plateau that indicates a ramp [standard deviations].
-_RAMP: Final = 3.0
-
+_RAMP: Final = 3.0  # deviation from the middle half of a ramp [standard deviations]
 _FEWEST_SAMPLES: Final = 4  # smallest number of samples of a plateau
 ROUNDING: Final = 1e-8  #: relative noise below which values differ by rounding
 
@@ -111,14 +102,9 @@ def _steady_runs(
         taken[start : start + length] = True
         # Ends of ramps may add a trend to a hold.
         begin, end = _trimmed(scaled[start : start + length])
-        if _trend(scaled[start + begin : start + end, :2]) <= _STEADY_TREND:
+        if norm(_line(scaled[start + begin : start + end, :2])) <= _STEADY_TREND:
             found.append((int(start) + begin, end - begin))
     return sorted(found)
-
-
-def _trend(values: FloatArray) -> float:
-    """Return the size of the change of a fitted line from the first to the last row."""
-    return float(norm(_line(values)))
 
 
 def _line(values: FloatArray) -> FloatArray:

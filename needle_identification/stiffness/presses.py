@@ -15,10 +15,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
 _SAME_DIRECTION: Final = pi / 18.0  # largest angle between forces of the same direction [rad]
-#: Smallest ratio of creep or hysteresis to its error, and smallest fraction that counts.
-_CLEARLY: Final = 4.0
-_LEAST_MEMORY: Final = 1e-3
-
+_CLEARLY: Final = 4.0  # smallest ratio of creep or hysteresis to its error
+_LEAST_MEMORY: Final = 1e-3  # smallest creep or hysteresis that counts
 _FEWEST_FOR_MEMORY: Final = 4  # smallest number of presses with a rest after them
 _WORTH_WARNING: Final = 0.1  # relative drift of the zero above which a warning is given
 
@@ -70,14 +68,13 @@ class PressNoise(NamedTuple):
                 np.maximum(a, 0.1 * a.mean(axis=0)) for a in (force, displacement)
             )
         among = np.ix_(chosen, chosen)
-        return np.array(
-            [
-                np.diag(force[:, row] + displacement @ squares[row])
-                + self.force_zero[among]
-                + squares[row].sum() * self.displacement_zero[among]
-                for row in range(2)
-            ]
-        )
+        rows = [
+            np.diag(force[:, row] + displacement @ squares[row])
+            + self.force_zero[among]
+            + squares[row].sum() * self.displacement_zero[among]
+            for row in range(2)
+        ]
+        return np.array(rows)
 
 
 def find_presses(
@@ -95,22 +92,15 @@ def find_presses(
     change = np.empty((len(time), 5))
     covariances = []
     for channels in (slice(0, 2), slice(2, 4), slice(4, 5)):
-        zero, covariance = _follow_zero(
-            plateaus.time[rest],
-            plateaus.mean[rest, channels],
-            plateaus.variance[rest, channels].mean(axis=1),
-            time,
-        )
+        mean, variance = plateaus.mean[rest, channels], plateaus.variance[rest, channels]
+        zero, covariance = _follow_zero(plateaus.time[rest], mean, variance.mean(axis=1), time)
         change[:, channels] = plateaus.mean[hold, channels] - zero
         covariances.append(covariance)
     force, displacement = change[:, :2], change[:, 2:4]
+    variance, creep = plateaus.variance[hold], _fraction(plateaus.trend[hold, 2:4], displacement)
+    left = _remaining(plateaus, displacement)
     noise = PressNoise(
-        plateaus.variance[hold, :2],
-        plateaus.variance[hold, 2:4],
-        covariances[0],
-        covariances[1],
-        _fraction(plateaus.trend[hold, 2:4], displacement),
-        _remaining(plateaus, displacement),
+        variance[:, :2], variance[:, 2:4], covariances[0], covariances[1], creep, left
     )
     presses = Presses(
         time=time,
@@ -124,7 +114,7 @@ def find_presses(
     )
     for array in (getattr(presses, name) for name in Presses.__slots__):
         array.setflags(write=False)
-    return presses, noise, [*_warnings(presses, plateaus, settings), *_of_memory(noise)]
+    return presses, noise, _warnings(presses, noise, plateaus, settings)
 
 
 def _fraction(change: FloatArray, displacement: FloatArray) -> float:
@@ -146,17 +136,9 @@ def _remaining(plateaus: Plateaus, displacement: FloatArray) -> float:
     return _fraction(after - after.mean(axis=0), displacement[follows])
 
 
-def _of_memory(noise: PressNoise) -> list[str]:
-    """Warn of creep and hysteresis, which the errors include."""
-    found = []
-    if noise.creep:
-        found.append(f'the displacement grows by {noise.creep:.1%} during a hold (creep)')
-    if noise.set:
-        found.append(f'{noise.set:.1%} of it remain at the next rest (hysteresis or creep)')
-    return [' and '.join(found) + ': the errors include it'] if found else []
-
-
-def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings) -> list[str]:
+def _warnings(
+    presses: Presses, noise: PressNoise, plateaus: Plateaus, settings: StiffnessSettings
+) -> list[str]:
     warnings = []
     if plateaus.missed:
         warnings.append(
@@ -172,6 +154,13 @@ def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings)
             warnings.append(
                 f'the {what} at rest drifted by {drift:.2g} {unit}; the drift was subtracted'
             )
+    memory = []
+    if noise.creep:
+        memory.append(f'the displacement grows by {noise.creep:.1%} during a hold (creep)')
+    if noise.set:
+        memory.append(f'{noise.set:.1%} of it remain at the next rest (hysteresis or creep)')
+    if memory:
+        warnings.append(f'{" and ".join(memory)}: the errors include it')
     return warnings
 
 

@@ -3,23 +3,17 @@
 
 from dataclasses import dataclass
 
-from needle_identification.estimation import check_estimator
-from needle_ros.settings import check_constants, constant
+from needle_identification.estimation import ESTIMATORS
+from needle_ros.settings import CheckedSettings, choice, constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StiffnessSettings:
+class StiffnessSettings(CheckedSettings):
     """
     Settings of `identify_stiffness`; fields describe meaning and unit.
 
     The mean matrices of Table 2 have an asymmetry of up to 0.086, and the paper calls their
     tissue a spring; ``largest_asymmetry`` is the next round number.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is out of range, or the estimator is unknown.
-
     """
 
     contact_length: float = constant(
@@ -39,8 +33,4 @@ class StiffnessSettings:
     largest_asymmetry: float = constant(
         0.1, '1', 'antisymmetric part over symmetric up to which it counts as a spring'
     )
-    estimator: str = 'ordinary'
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        check_estimator(self.estimator)
+    estimator: str = choice('ordinary', ESTIMATORS)

@@ -74,7 +74,7 @@ def read_motion(path: Path) -> dict[str, FloatArray]:
 
     read = read_table(path)
     names = {name: (name.replace('_', ''),) for name in ('depth', *COLUMNS)}
-    found = guessed(read, names)
+    found = guessed(read.columns, names)
     if 'depth' not in found or len(found) < 2:
         raise RecordingError(
             f'{path} must have the columns depth and any of {", ".join(COLUMNS)}; it has '

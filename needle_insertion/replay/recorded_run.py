@@ -19,7 +19,9 @@ from needle_dynamics.needles import FILES
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.assembly import SETTINGS
 from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRun, TRAJECTORY
-from needle_identification import Bag, BagTopic, deserialize, RecordingError
+from needle_identification import Bag, RecordingError
+from needle_identification.bags.messages import deserialize
+from needle_identification.bags.topics import BagTopic
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import MessageError, ParameterError

@@ -5,7 +5,8 @@ from math import sqrt
 from typing import Final
 
 from needle_dynamics import FloatArray
-from needle_identification import asymmetry, StiffnessSettings
+from needle_identification import StiffnessSettings
+from needle_identification.stiffness.matrix import asymmetry
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 from reproduction.claims.claim import Finding, finding, Tables

@@ -13,7 +13,8 @@ from benchmarks.graph import GraphPlan
 from benchmarks.measure import Bar
 from benchmarks.page import PageSection
 from benchmarks.pairs import Figures, PAIRS
-from needle_identification import BagWriter, encode, message_type
+from needle_identification import BagWriter
+from needle_identification.bags.messages import encode, message_type
 import numpy as np
 import pytest
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from benchmarks import identification as bench_identification
 from benchmarks import measure as bench_measure
-from needle_identification import message_counts, read_friction_recording
+from needle_identification import read_friction_recording
+from needle_identification.bags.bag import message_counts
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -16,14 +16,13 @@ from needle_dynamics.simulated.base import BaseParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_identification import (
     BagWriter,
-    encode,
     identify_friction,
     identify_stiffness,
-    message_type,
     read_friction_recording,
     read_indentation_recording,
     read_topic,
 )
+from needle_identification.bags.messages import encode, message_type
 from needle_insertion.cli import main
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np

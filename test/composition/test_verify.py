@@ -19,7 +19,8 @@ from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParam
 from needle_dynamics.simulated.indenter import IndenterParameters
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
-from needle_identification import BagWriter, encode, message_type, RecordingError
+from needle_identification import BagWriter, RecordingError
+from needle_identification.bags.messages import encode, message_type
 from needle_insertion.cli import main
 from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.replay.rerun import Rerun, verify

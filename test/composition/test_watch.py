@@ -21,7 +21,8 @@ from typing import Any
 from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_identification import BagWriter, encode, RecordingError
+from needle_identification import BagWriter, RecordingError
+from needle_identification.bags.messages import encode
 from needle_insertion import cli
 from needle_insertion.watch import recorded
 from needle_insertion.watch.live import Live, RecordedReader

@@ -15,13 +15,13 @@ from mcap.writer import Writer as McapWriter
 from needle_identification import (
     Bag,
     BagWriter,
-    message_counts,
-    OfferedQos,
     read_friction_recording,
     read_topic,
     Recording,
     RecordingError,
 )
+from needle_identification.bags.bag import message_counts
+from needle_identification.bags.topics import OfferedQos
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest

@@ -5,9 +5,10 @@ from itertools import pairwise
 from pathlib import Path
 import time
 
-from needle_identification import Bag, BagTopic, BagWriter, OfferedQos, RecordingError
+from needle_identification import Bag, BagWriter, RecordingError
 from needle_identification.bags import bag as reading
 from needle_identification.bags.playback import BagPlayback, PlaybackSettings
+from needle_identification.bags.topics import BagTopic, OfferedQos
 import pytest
 from rosbags.interfaces import (
     Qos,

@@ -12,11 +12,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from needle_identification import (
     BagWriter,
-    message_type,
     read_friction_recording,
     read_indentation_recording,
     RecordingError,
 )
+from needle_identification.bags.messages import message_type
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal

@@ -159,12 +159,12 @@ def test_losses_of_regular_samples_only() -> None:
     """Independent losses have no duration; irregular samples have no count."""
     rng = np.random.default_rng(3)
     time = np.arange(3000.0)[rng.random(3000) >= 0.2]
-    found = fit_losses(time)
-    assert found.fraction_interval[0] < 0.2 < found.fraction_interval[1]
-    assert np.isnan(found.time)
-    assert np.isnan(fit_losses(np.cumsum(rng.exponential(1.0, 500))).fraction)
+    fraction, burst = fit_losses(time)
+    assert fraction.interval[0] < 0.2 < fraction.interval[1]
+    assert np.isnan(burst.value)
+    assert np.isnan(fit_losses(np.cumsum(rng.exponential(1.0, 500)))[0].value)
     # Jitter of a tenth of the period is no loss.
-    assert fit_losses(np.arange(3000.0) + rng.uniform(-0.1, 0.1, 3000)).fraction == 0.0
+    assert fit_losses(np.arange(3000.0) + rng.uniform(-0.1, 0.1, 3000))[0].value == 0.0
 
 
 def test_another_sensor_is_a_true_position() -> None:

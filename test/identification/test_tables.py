@@ -219,7 +219,7 @@ def test_damaged_and_new_matlab_files_are_rejected(tmp_path: Path) -> None:
 
 def test_usual_names_are_found_with_any_case_and_unit(tmp_path: Path) -> None:
     path = written(tmp_path, 'Timestamp (s),Insertion [mm],Velocity,Fz_N\n1,2,3,4\n2,3,4,5\n')
-    assert guessed(read_table(path)) == {
+    assert guessed(read_table(path).columns) == {
         'time': 'Timestamp (s)',
         'depth': 'Insertion [mm]',
         'speed': 'Velocity',

@@ -11,7 +11,8 @@ from geometry_msgs.msg import PointStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics.plant_node import PlantNode
-from needle_identification import BagTopic, deserialize, encode
+from needle_identification.bags.messages import deserialize, encode
+from needle_identification.bags.topics import BagTopic
 from needle_insertion.nodes import NODES
 from needle_ros import wire
 from needle_ros.base_node import message_class, profile, SENSOR

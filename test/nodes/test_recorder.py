@@ -13,7 +13,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Goals
-from needle_identification import Bag, BagWriter, message_counts, read_topic
+from needle_identification import Bag, BagWriter, read_topic
+from needle_identification.bags.bag import message_counts
 from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import UNLIMITED
 from needle_identification.recorder_node import RecorderNode
@@ -331,7 +332,7 @@ def test_qos_of_later_publishers_is_recorded(
     node.stop()
     (topic,) = Bag(tmp_path / 'bag').topics()
     one, two = topic.offered_qos()
-    assert (one.deadline, one.lifespan, one.lease) == (
+    assert (one.deadline, one.lifespan, one.liveliness_lease_duration) == (
         2_500_000_000, 30_000_000_000, 1_500_000_000
     )  # fmt: skip
     assert (two.deadline, two.lifespan) == (UNLIMITED, UNLIMITED)

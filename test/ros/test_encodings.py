@@ -14,7 +14,8 @@ import struct
 from typing import Any
 
 from hypothesis import given, HealthCheck, settings, strategies
-from needle_identification import deserialize, RecordingError
+from needle_identification import RecordingError
+from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_ros import wire
 from needle_ros.contract import TOPICS

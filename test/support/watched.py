@@ -6,7 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from needle_identification import BagWriter, encode, message_type
+from needle_identification import BagWriter
+from needle_identification.bags.messages import encode, message_type
 from needle_ros import contract
 from needle_ros.status import ControllerStatus, NodeStatus, PlantStatus, SteeringStatus
 import numpy as np
