@@ -11,10 +11,10 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
+from needle_insertion.graph.lockstep import RunSample, WARM_UP
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle, evenly
@@ -27,6 +27,7 @@ import numpy as np
 from reproduction.insertions import bending
 from reproduction.insertions.bending import read_needles, replay_check
 from reproduction.insertions.insertion import RATE, SETTLING
+from reproduction.insertions.simulated_run import SimulatedRun
 
 #: Target of the tip, x, y, z [m], and insertion depth at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)

@@ -9,12 +9,13 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
+from needle_insertion.graph.lockstep import WARM_UP
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
 from needle_insertion.report.text import Check
 from needle_ros.timing import seconds
 import numpy as np
+from reproduction.insertions.simulated_run import SimulatedRun
 from trajectory_msgs.msg import JointTrajectory
 
 #: Insertion depth at the start and at the end [m], speed [m/s], sample rate [Hz].
