@@ -57,7 +57,6 @@ class ProgressLine:
             self._stream.flush()
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
-        """Set the activity, as `Show`."""
         self._text = activity if fraction is None else f'{activity} {100.0 * fraction:.0f} %'
         # A changed number is not a new activity.
         before, self._kind = self._kind, re.sub(r'\d+', '', activity)

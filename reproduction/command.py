@@ -39,7 +39,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print a result and write its page; return 1 if a result does not hold."""
     # Takes two seconds to import; invalid options are reported without it.
     from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
 

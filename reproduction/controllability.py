@@ -14,7 +14,6 @@ SPEED: Final = 5e-3
 
 
 def section() -> ReportSection:
-    """Return the section of the results page: table of operating points, and map."""
     parameters = NeedleParameters.preset('paper_si')
     model = NeedleModel(parameters)
     straight, bent = (

@@ -25,7 +25,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Run the demo; return 1 if a check failed."""
     check_folder(options.output)
     from needle_insertion.compilation import compile_nodes
     from reproduction import demo

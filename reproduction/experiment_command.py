@@ -41,7 +41,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Record the bags that are missing in the folder."""
     # Takes a second to import; invalid options of the parser are reported without it.
     from reproduction.campaign import Campaign
 

@@ -110,7 +110,6 @@ def _open_outcomes() -> dict[tuple[str, ...], RunOutcome]:
 
 
 def _figure_4() -> PaperFigure:
-    """Draw the tip deflection in the open loop."""
     figure = Figure(figsize=(10.0, 6.0), layout='constrained')
     grid = figure.subplots(2, 2, sharex='row')
     for axes, case in zip(grid.flat, CASES, strict=True):
@@ -134,7 +133,6 @@ def _figure_4() -> PaperFigure:
 
 
 def _figure_5() -> PaperFigure:
-    """Draw the state variables in the open loop."""
     figure = Figure(figsize=(12.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 4, sharex='col')
     for column, case in zip(grid.T, CASES, strict=True):
@@ -188,7 +186,6 @@ def _draw_closed(axes: Axes, law: str, *, hub_stop: bool, k: int | None = None) 
 
 
 def _figure_6() -> PaperFigure:
-    """Draw the state variables under inverse dynamics."""
     figure = Figure(figsize=(11.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 2, sharex=True)
     for column, (hub_stop, words) in zip(grid.T, _HUB.items(), strict=True):
@@ -214,7 +211,6 @@ def _figure_6() -> PaperFigure:
 
 
 def _figure_7() -> PaperFigure:
-    """Draw the tip deflection under inverse dynamics."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     for axes, (hub_stop, words) in zip(figure.subplots(1, 2), _HUB.items(), strict=True):
         _draw_closed(axes, 'inverse_dynamics', hub_stop=hub_stop)
@@ -234,7 +230,6 @@ def _figure_7() -> PaperFigure:
 
 
 def _figure_8() -> PaperFigure:
-    """Draw the tip deflection under PID, and the remaining position error."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     left, right = figure.subplots(1, 2)
     _draw_closed(left, 'pid', hub_stop=True)
@@ -273,7 +268,6 @@ FIGURES: Final[Mapping[str, Callable[[], PaperFigure]]] = {
 
 
 def _comparison() -> Grid:
-    """Compare the remaining deflection and position error of the laws."""
     rows = []
     for reading in READINGS:
         for law in LAWS:

@@ -187,7 +187,6 @@ def _figure(found: Mismatch) -> Figure:
 
 
 def section(found: Mismatch) -> ReportSection:
-    """Return the section of the results page."""
     final = {name: 1e6 * np.median(np.abs(b.final)) for name, b in found.batches.items()}
     rms = {name: 1e6 * np.median(b.rms) for name, b in found.batches.items()}
     stiffness = 100.0 * found.shares('inverse_dynamics')[2]

@@ -11,7 +11,6 @@ DIAMETER: Final = 1.27e-3  #: Diameter of an 18 gauge needle [m].
 
 
 def section() -> ReportSection:
-    """Return Table 3 for the results page."""
     p = NeedleParameters()
     rows = (
         ('l [m]', p.length, None),

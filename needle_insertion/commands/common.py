@@ -81,7 +81,6 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
 def print_result(
     document: object, text: str, files: Iterable[Path] = (), *, as_json: bool
 ) -> None:
-    """Print a result as JSON, or as text with the written files."""
     if as_json:
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
     else:

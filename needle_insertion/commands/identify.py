@@ -123,7 +123,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Run the chosen identification; return 2 if a recording cannot be used."""
     status: int = options.identify(options)
     return status
 

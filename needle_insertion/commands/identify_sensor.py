@@ -23,7 +23,6 @@ from needle_ros.quantities import quantities
 
 
 def add_sensor(what: Any) -> None:
-    """Add the subcommand to the subparsers of ``needle identify``."""
     parser = what.add_parser(
         'sensor',
         help='noise, correlation time, bias, delay, losses and outliers of a tip sensor',
@@ -74,7 +73,6 @@ def add_sensor(what: Any) -> None:
 
 
 def _truth(options: argparse.Namespace) -> Path | list[float]:
-    """Return the constant position or the file of the true position."""
     if options.truth is None:
         if options.truth_topic is None and options.truth_columns is None:
             raise ParameterError(
@@ -136,7 +134,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def sensor_text(found: SensorEstimate) -> str:
-    """Return a result as a table for the terminal."""
     rows = []
     for one in found.parameters:
         unit = '' if one.unit == '1' else f' [{one.unit}]'
@@ -151,7 +148,6 @@ def sensor_text(found: SensorEstimate) -> str:
 
 
 def sensor_document(found: SensorEstimate, recording: SensorRecording) -> dict[str, Any]:
-    """Return a result as a JSON document in SI units."""
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
         if not one.determined:

@@ -35,7 +35,6 @@ _FITS = (
 
 
 def add_steering(what: Any) -> None:
-    """Add the subcommand to the subparsers of ``needle identify``."""
     parser = what.add_parser(
         'steering',
         help='bending length, free length, skin, tilt and bevel of a needle that cuts its path',
@@ -107,7 +106,6 @@ def add_steering(what: Any) -> None:
 
 
 def add_time(reading: argparse._ArgumentGroup) -> None:
-    """Add the option of the source of time stamps."""
     reading.add_argument(
         '--time',
         choices=TIMES,
@@ -211,7 +209,6 @@ def _predicted(one: HeldOut | None) -> str:
 
 
 def steering_text(found: SteeringEstimate) -> str:
-    """Return a result as tables for the terminal."""
     rows = []
     for medium in found.media:
         for one in medium.parameters:
@@ -252,7 +249,6 @@ def steering_text(found: SteeringEstimate) -> str:
 def steering_document(
     found: SteeringEstimate, recordings: Sequence[SteeringRecording]
 ) -> dict[str, Any]:
-    """Return a result as a JSON document in SI units."""
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
         if not one.determined:

@@ -46,7 +46,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Run the nodes until `quit`; return 0."""
     # Imported here: rclpy takes a second.
     from needle_dynamics import find_needle
     from needle_insertion.compilation import compile_nodes

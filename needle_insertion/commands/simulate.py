@@ -95,7 +95,6 @@ def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> fl
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Simulate, write the outputs, and print a summary."""
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')

@@ -39,7 +39,6 @@ _MOST = 1_000_000  #: most samples of a run
 
 
 def add_steering(parser: argparse.ArgumentParser) -> None:
-    """Add the options of this model to the parser of ``needle simulate``."""
     group = parser.add_argument_group('model steering only')
     group.add_argument('--to', help=f'target depth (default {1e3 * TO:g}mm)', **with_unit('m'))
     group.add_argument(
@@ -89,7 +88,6 @@ def read_motion(path: Path) -> dict[str, FloatArray]:
 
 
 def run_steering(name: str, options: argparse.Namespace) -> int:
-    """Simulate, write the outputs, and print a summary."""
     from needle_insertion.report import insertion as report
 
     for path in options.output:
@@ -139,7 +137,6 @@ def _insert(
     speed: float,
     interval: float,
 ) -> None:
-    """Insert a needle to a depth, and record it."""
     begin = one.depth
     while one.depth < to:
         show('inserting', (one.depth - begin) / (to - begin))

@@ -136,7 +136,6 @@ class _Task(NamedTuple):
 
 
 def _task(options: argparse.Namespace) -> _Task:
-    """Parse and check the options."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
@@ -184,7 +183,6 @@ def sample_needle(
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Steer, write the picture, and print the final tip positions of both needles."""
     target, needle, steering, prior, errors, depths = _task(options)
     aim = target[[0, 2]]
     limits = replace(

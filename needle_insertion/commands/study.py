@@ -41,7 +41,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Compute the missing samples, and write table and page."""
     try:
         from needle_insertion.replay.study_sample import replay_sample
         from needle_insertion.report.study_page import write_study

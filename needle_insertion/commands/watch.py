@@ -63,7 +63,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Serve the page until a signal arrives."""
     if options.bag is not None and options.control:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:

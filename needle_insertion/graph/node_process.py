@@ -65,7 +65,6 @@ class NodeProcess:
 
     @property
     def last_line(self) -> str:
-        """Last line of the node output."""
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
         return lines[-1] if lines else ''

@@ -103,7 +103,6 @@ class Readings:
         return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
     def reference_rests_at(self, target: float) -> bool:
-        """Return whether the reference rests at a target depth [m]."""
         reference = self.insertion(contract.REFERENCE)
         if reference is None:
             return False

@@ -302,7 +302,6 @@ def _unfit(word: str, given: Sequence[str]) -> ParameterError:
 
 
 def _has_accepted(state: State, topic: str) -> bool:
-    """Return whether a node has accepted a measurement."""
     status = state.status
     if not isinstance(status, (ControllerStatus, SteeringStatus)):
         return False

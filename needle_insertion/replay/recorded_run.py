@@ -80,7 +80,6 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
 
 
 def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
-    """Read the parameters of a plant with their recording times [ns]."""
     found = []
     for received, message in messages:
         # Skip other texts, and other nodes.
@@ -254,7 +253,6 @@ class RecordedRun:
             yield self._newest(received) + 1, event
 
     def _missing(self, *, has_events: bool) -> Iterator[str]:
-        """Yield notes about missing information."""
         if not has_events:
             yield (
                 f'{self.name}/events is not in the bag: trajectories and changes of parameters '

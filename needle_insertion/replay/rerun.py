@@ -62,7 +62,6 @@ class TopicComparison:
 
     @property
     def verdict(self) -> str:
-        """Verdict: identical, within tolerance or differs."""
         if self.differing:
             return 'differs'
         return 'within tolerance' if self.largest else 'identical'
@@ -108,7 +107,6 @@ class Rerun:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON."""
         recorded = self.recorded
         return {
             'bag': str(recorded.path),
@@ -176,7 +174,6 @@ class Rerun:
         return computed
 
     def _perform(self, plant: PlantRun, event: Event, number: int) -> PlantRun:
-        """Apply an event to the plant, and note it."""
         if event.kind in (CONFIGURED, TIME) and number == 1:
             return plant
         names = ', '.join(sorted(event.content))
@@ -190,7 +187,6 @@ class Rerun:
         return plant
 
     def _compare(self, name: str, computed: FloatArray, tolerance: float) -> TopicComparison:
-        """Compare the recorded messages of a topic with the computed values."""
         rows, quantities = self.recorded.rows[name], self.recorded.topics[name].quantities
         found = computed[rows.numbers]
         # Older versions of the plant did not publish all values.
@@ -243,7 +239,6 @@ class Rerun:
         return np.asarray(tolerance * largest + (1.0 + 1e-6) * resolution)
 
     def _reason(self) -> str:
-        """Return the most probable reason of a difference."""
         recorded, start = self.recorded, self.recorded.numbers[0]
         simulated = recorded.constants.mode == 'simulation'
         differing = {name: topic.differing for name, topic in self.topics.items()}

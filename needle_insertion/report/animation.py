@@ -45,7 +45,6 @@ class Animation:
 
     @property
     def script(self) -> Markup:
-        """Script of the animation."""
         folder = Path(__file__).with_name('templates')
         parts = [(folder / name).read_text(encoding='utf-8') for name in _SCRIPTS]
         # Trusted: the scripts are part of this package.

@@ -46,7 +46,6 @@ class Picture:
 
     @cached_property
     def image(self) -> bytes:
-        """PNG data."""
         return png(self.figure)
 
     @property
@@ -56,12 +55,10 @@ class Picture:
 
     @property
     def width(self) -> int:
-        """Width [pixels]."""
         return int.from_bytes(self.image[16:20], 'big')
 
     @property
     def height(self) -> int:
-        """Height [pixels]."""
         return int.from_bytes(self.image[20:24], 'big')
 
 

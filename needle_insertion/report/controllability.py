@@ -74,7 +74,6 @@ class OperatingPoint:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON, in SI units."""
         system, found = self.system, self.result
         return {
             'depth': self.depth,

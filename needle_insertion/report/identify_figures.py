@@ -276,7 +276,6 @@ def spread_figure(
 
 
 def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Label the axes with typeset symbols, and add a grid."""
     axes.set(xlabel=_typeset(xlabel), ylabel=_typeset(ylabel))
     axes.grid(visible=True, alpha=0.25)
     axes.spines[['top', 'right']].set_visible(False)
@@ -288,7 +287,6 @@ def _typeset(words: str) -> str:
 
 
 def _legend_above(axes: Axes, **options: Any) -> None:
-    """Put the legend above the plot."""
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
         borderaxespad=0.2, handletextpad=0.5, **options,
@@ -296,6 +294,5 @@ def _legend_above(axes: Axes, **options: Any) -> None:
 
 
 def _thinned(*signals: FloatArray, most: int = _MOST_POINTS) -> list[FloatArray]:
-    """Reduce the number of samples for drawing."""
     step = max(1, len(signals[0]) // most)
     return [signal[::step] for signal in signals]

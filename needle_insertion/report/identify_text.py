@@ -86,7 +86,6 @@ def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> l
 
 
 def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
-    """Return tables of identified parameters for the terminal."""
     if isinstance(summary, FrictionSummary):
         return _friction_text(summary)
     return _stiffness_text(summary)

@@ -60,7 +60,6 @@ class InsertionRecord:
 
     @property
     def path(self) -> NeedlePath:
-        """Path cut by the tip."""
         return self._one.needle.path
 
     @property
@@ -70,7 +69,6 @@ class InsertionRecord:
 
     @property
     def punctured(self) -> int:
-        """Number of punctured membranes."""
         return sum(self._one.punctured)
 
 
@@ -99,7 +97,6 @@ def summary(record: InsertionRecord) -> dict[str, float]:
 
 
 def write(path: Path, record: InsertionRecord) -> None:
-    """Write an insertion to a ``.csv`` or ``.png`` file."""
     if path.suffix == '.csv':
         write_whole(path, csv_table(COLUMNS, record.table))
     else:

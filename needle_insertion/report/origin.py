@@ -40,7 +40,6 @@ class Origin:
 
     @property
     def failed(self) -> list[str]:
-        """Unusable recordings with reasons."""
         return [
             reason if name in reason else f'{name}: {reason}' for name, reason in self.failures
         ]

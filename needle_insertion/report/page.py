@@ -61,7 +61,6 @@ def _layout(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def _anchor(words: str) -> str:
-    """Return the anchor of a heading."""
     return re.sub(r'\W+', '-', words.lower()).strip('-')
 
 

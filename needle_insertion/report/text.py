@@ -43,7 +43,6 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def filled(text: str) -> str:
-    """Wrap a paragraph to the width of a table."""
     return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
@@ -88,5 +87,4 @@ class Check:
 
     @property
     def row(self) -> tuple[str, str, str, str]:
-        """Cells of a table, with the verdict 'pass' or 'FAIL'."""
         return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'

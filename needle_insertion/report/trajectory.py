@@ -89,7 +89,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
 
 def _csv(trajectory: Trajectory) -> bytes:
-    """Return time, state and tip deflection of each sample, in SI units."""
     names = NeedleModel(trajectory.parameters).coordinate_names
     heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
     rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
@@ -97,7 +96,6 @@ def _csv(trajectory: Trajectory) -> bytes:
 
 
 def _figure(trajectory: Trajectory) -> Figure:
-    """Draw the trajectory, with the time at which the hub reaches the skin."""
     from matplotlib.figure import Figure
 
     result = Figure(figsize=(9.0, 9.0), layout='constrained')
@@ -109,7 +107,6 @@ def _figure(trajectory: Trajectory) -> Figure:
 
 
 def _write_bag(bag: BagWriter, trajectory: Trajectory) -> None:
-    """Write the topics of the plant, stamped with the simulated time."""
     states, depths, tips = trajectory.states, trajectory.depth, trajectory.tip_deflection
     m = states.shape[1] // 2
     forces = np.append(trajectory.forces, trajectory.forces[-1])

@@ -102,7 +102,6 @@ class Connection:
         return True
 
     def close(self) -> None:
-        """Close the connection and the listening socket."""
         for one in (self._socket, self._listener):
             if one is not None:
                 one.close()
@@ -119,7 +118,6 @@ class Connection:
         return True
 
     def _listen(self) -> None:
-        """Open the port if it is not open."""
         if self._listener is not None or not self._is_time():
             return
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -234,7 +232,6 @@ class Connection:
         return found
 
     def _flush(self) -> None:
-        """Send queued data without blocking."""
         while self._socket is not None and self._out:
             try:
                 sent = self._socket.send(self._out)
@@ -249,7 +246,6 @@ class Connection:
             self._moved = self._steady()
 
     def _lose(self, why: str) -> None:
-        """Log and close a lost connection."""
         self._events.add(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
@@ -264,5 +260,4 @@ class Connection:
 
 
 def _words(error: OSError) -> str:
-    """Return the system's description of an error."""
     return (error.strerror or str(error)).lower()

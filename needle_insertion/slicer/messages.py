@@ -125,7 +125,6 @@ def _millimeters(at: FloatArray) -> str:
 
 
 def _message(frame: Frame) -> Any:
-    """Parse a message with pyigtl."""
     header, body = frame.data[: HEADER.size], frame.data[HEADER.size :]
     # pyigtl does not verify the checksum.
     if HEADER.unpack(header)[-1] != CRC64(body):

@@ -128,7 +128,6 @@ class SlicerNode(BaseNode):
 
     @contextmanager
     def _rejecting(self, topic: Topic) -> Iterator[None]:
-        """Report an invalid message of a topic."""
         try:
             yield
         except MessageError as error:
@@ -176,7 +175,6 @@ class SlicerNode(BaseNode):
     # Messages of the peer.
 
     def _tick(self) -> None:
-        """Receive messages of the peer, and send shape and state."""
         link, interpreter = self._link, self._interpreter
         if link is None or interpreter is None:
             return
@@ -209,7 +207,6 @@ class SlicerNode(BaseNode):
             self._target.publish(message)
 
     def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
-        """Publish the newest target."""
         newest = None
         for frame in frames[-_AT_ONCE:]:
             try:

@@ -195,7 +195,6 @@ class ShownRecording:
         return time
 
     def _take(self, name: str, message: Recorded) -> None:
-        """Store the content of a message."""
         data = message.data
         time = self._newest if self._header else self._time(message.received)
         if name in self._readers:

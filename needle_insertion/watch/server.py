@@ -127,7 +127,6 @@ class Server:
 
     @property
     def words(self) -> list[str]:
-        """Lines to print at the start."""
         lines = [f'page: {self.address}']
         if self.token:
             lines.append('this address permits motion of the needle: do not share it')
@@ -305,7 +304,6 @@ class _Connection:
         task.add_done_callback(self.asking.discard)
 
     async def answer(self, *, success: bool, words: str, asked: str = '') -> None:
-        """Send the result of a message."""
         answer = {'asked': asked, 'success': success, 'words': printable(words)}
         await self._put(json.dumps({'answer': answer}))
 
@@ -319,7 +317,6 @@ class _Connection:
 
 
 def _break_off(request: web.Request) -> None:
-    """Abort the connection of a request."""
     if request.transport is not None:
         request.transport.abort()
 
@@ -334,7 +331,6 @@ def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.Stream
 
 
 def _message(message: WSMessage) -> dict[str, Any]:
-    """Parse a message as a JSON object."""
     try:
         content = json.loads(message.data, parse_constant=_no_number)
     except (ValueError, TypeError, RecursionError):

@@ -49,7 +49,6 @@ def _joint(topic: contract.Topic, joint: str, part: int = 0) -> Signal:
 
 
 def _axis(topic: contract.Topic, axis: int) -> Signal:
-    """Return a number of a vector as a signal."""
     return Signal(topic.name, lambda reading: number(reading.values[0][axis]))
 
 
@@ -212,7 +211,6 @@ class View:
         return self._vector(contract.TARGET.name) if not statuses else None
 
     def _hit_probability(self) -> float | None:
-        """Return the hit probability of the steered insertion."""
         statuses = [status for _, _, status in self._nodes.values()]
         found = [one.hit_probability for one in statuses if isinstance(one, SteeringStatus)]
         return next((number(one) for one in found if one is not None), None)

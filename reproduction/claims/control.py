@@ -90,7 +90,6 @@ def _same_inputs() -> Finding:
 
 
 def _turns(run: LoopRun) -> int:
-    """Count sign changes of the tip deflection above rounding."""
     tip = run.tip_deflection
     tip = tip[np.abs(tip) > 1e-9]
     return int(np.count_nonzero(np.diff(np.sign(tip))))

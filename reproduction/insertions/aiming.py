@@ -130,7 +130,6 @@ class Aimed:
 
     @property
     def miss(self) -> float:
-        """Distance of the tip from the target [m]."""
         return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
 
     @property
@@ -197,7 +196,6 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
 
 
 def animate_aiming(bag: Path) -> Animation:
-    """Return an animation of the steered needle with some 80 frames."""
     recording = ShownRecording(bag)
     times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
     frames = [recording.view(time).frame(time) for time in times]

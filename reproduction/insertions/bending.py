@@ -99,7 +99,6 @@ def replay_check(bag: Path, what: str) -> Check:
 
 
 def draw_bending(bag: Path) -> Figure:
-    """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
     return draw_needle(evenly(needles, DRAWN), path)
 

@@ -79,7 +79,6 @@ def record_insertion(
 
 
 def read_insertion(law: str, bag: Path) -> RecordedInsertion:
-    """Read a recording of `record_insertion`."""
 
     def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
         pairs = [(seconds(m.header.stamp), value(m)) for _, m in read_topic(bag, f'/{topic}')]

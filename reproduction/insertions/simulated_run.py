@@ -110,12 +110,10 @@ class SimulatedRun:
         return publish
 
     def _show_start(self, name: str) -> None:
-        """Show the starting node and its status."""
         message = self.states[name].message if name in self.states else ''
         self._show(f'starting {name}' + (f': {message}' if message else ''))
 
     def _is_recorded(self) -> bool:
-        """Return whether the recorder has subscribed to all topics."""
         node = self.node
         return all(
             'recorder' in [one.node_name for one in node.get_subscriptions_info_by_topic(topic)]
