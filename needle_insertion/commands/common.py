@@ -41,12 +41,14 @@ def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '')
     added.completer = lambda **_: [*NEEDLES, *map(str, Path().glob('*.yaml'))]
 
 
-def with_unit(unit: str) -> dict[str, Any]:
+def with_unit(
+    unit: str, read: Callable[[str, str], float | list[float]] = quantity
+) -> dict[str, Any]:
     """Return type and word of an option for a quantity, such as ``50mm``."""
 
-    def parse(text: str) -> float:
+    def parse(text: str) -> float | list[float]:
         try:
-            return quantity(text, unit)
+            return read(text, unit)
         except ParameterError as error:
             raise ArgumentTypeError(str(error)) from None
 
@@ -93,8 +95,10 @@ def print_each(kind: str, lines: Iterable[object]) -> None:
         sys.stderr.write(shown(f'{kind}: {line}') + '\n')
 
 
-def check_file(path: Path) -> None:
+def check_file(path: Path | None) -> None:
     """Raise `ParameterError` if a file cannot be written, before its content is computed."""
+    if path is None:
+        return
     if not path.name or path.is_dir():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')
     if not path.absolute().parent.is_dir():
@@ -102,8 +106,10 @@ def check_file(path: Path) -> None:
     check_folder(path.absolute().parent)
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path | None) -> None:
     """Raise `ParameterError` if a folder cannot be created and written to; create nothing."""
+    if folder is None:
+        return
     there = folder.absolute()
     while not there.exists():
         there = there.parent

@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from itertools import takewhile
 from pathlib import Path
@@ -36,7 +37,7 @@ from needle_insertion.commands.common import (
     with_unit,
 )
 from needle_insertion.commands.identify_sensor import add_sensor
-from needle_insertion.commands.identify_steering import add_steering, add_time
+from needle_insertion.commands.identify_steering import add_steering, add_time, words_of
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
@@ -82,7 +83,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--terms',
-        type=_words,
+        type=words_of,
         action='extend',
         metavar='TERM,...',
         help=f'terms of the force model, from {", ".join(TERMS)} '
@@ -90,8 +91,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--layers',
-        type=_lengths,
-        metavar='30mm,...',
+        **{**with_unit('m', quantities), 'metavar': '30mm,...'},
         help='insertion depths at which layers begin, for the term layers',
     )
     friction.set_defaults(identify=_run_friction)
@@ -107,7 +107,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     reading, fitting = _add_common(stiffness, StiffnessSettings())
     reading.add_argument(
         '--axes',
-        type=_words,
+        type=words_of,
         default=['x', 'z'],
         metavar='X,Z',
         help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
@@ -120,22 +120,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     stiffness.set_defaults(identify=_run_stiffness)
     add_steering(what)
     add_sensor(what)
-
-
-def _run(options: argparse.Namespace) -> int:
-    status: int = options.identify(options)
-    return status
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(',')]
-
-
-def _lengths(text: str) -> list[float]:
-    try:
-        return quantities(text, 'm')
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _add_common(
@@ -259,10 +243,8 @@ def _identify(
     other: tuple[str, Callable[[Path], Any]],
 ) -> int:
     """Identify all bags, write the results, print warnings and tables; return the exit status."""
-    if options.output is not None:
-        check_file(options.output)
-    if options.report is not None:
-        check_folder(options.report)
+    check_file(options.output)
+    check_folder(options.report)
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(
@@ -272,7 +254,12 @@ def _identify(
         Origin(settings=settings, reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
-    _report_failures(origin, *other)
+    print_each('error', origin.failed)
+    what, identify_other = other
+    for name, _reason in origin.failures:
+        with suppress(NeedleError, OSError):
+            identify_other(Path(name))
+            sys.stderr.write(shown(f'{name}: try needle identify {what}') + '\n')
     if not estimates:
         return 2
     summary = summarize(estimates)
@@ -298,22 +285,6 @@ def _identify(
     print_result(document, identified_text(summary), written, as_json=options.json)
     print_each('error', complaints)
     return 2 if origin.failures or complaints else 0
-
-
-def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
-    """Print the recordings that cannot be used, and the other subcommand if it accepts them."""
-    print_each('error', origin.failed)
-    for name, _reason in origin.failures:
-        if _can(identify, Path(name)):
-            sys.stderr.write(shown(f'{name}: try needle identify {other}') + '\n')
-
-
-def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
-    try:
-        identify(bag)
-    except (NeedleError, OSError):
-        return False
-    return True
 
 
 def _chosen(words: Sequence[str]) -> list[str]:
@@ -350,7 +321,7 @@ def _is_recording(word: str) -> bool:
 
 COMMAND = Subcommand(
     _add_arguments,
-    _run,
+    lambda options: int(options.identify(options)),
     signed=('--force-axis', '--motion-axis', '--axes', '--truth'),
     completed=_chosen,
 )

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from needle_identification.estimation.estimate import ParameterEstimate
-from needle_identification.estimation.formatting import between, rounded
+from needle_identification.estimation.formatting import rounded
 from needle_identification.recordings.tables import column_roles, is_table
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
 from needle_identification.sensor.recording import SensorRecording
 from needle_insertion.commands.common import check_file, print_each, print_result
-from needle_insertion.commands.identify_steering import add_time
+from needle_insertion.commands.identify_steering import add_time, words_of
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.identify_text import interval_of, title_of
 from needle_insertion.report.text import table
 from needle_ros.axes import AXES
 from needle_ros.errors import ParameterError
@@ -100,8 +101,7 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification import identify_sensor
     from needle_identification.result import sensor_yaml
 
-    if options.output is not None:
-        check_file(options.output)
+    check_file(options.output)
 
     def roles(text: str | None) -> dict[str, str]:
         return column_roles(text, SENSOR_ROLES) if text else {}
@@ -110,7 +110,7 @@ def _run(options: argparse.Namespace) -> int:
         recording = read_sensor_recording(
             options.log,
             _truth(options),
-            axes=tuple(axis.strip() for axis in options.axes.split(',')),
+            axes=tuple(words_of(options.axes)),
             tip_topic=options.tip_topic,
             truth_topic=options.truth_topic,
             time=options.time,
@@ -121,13 +121,12 @@ def _run(options: argparse.Namespace) -> int:
     with ProgressLine('identification', brief=True):
         found = identify_sensor(recording)
     print_each('warning', found.warnings)
-    written = list[Path]()
-    if options.output is not None:
+    written = list(filter(None, [options.output]))
+    if written:
         # Stamps of headers are the times of the samples: their messages come later.
         delayed = is_table(options.log) or options.time == 'receive'
         text = sensor_yaml(found, ExecutiveSettings().measurement_time, delayed=delayed)
         write_whole(options.output, text.encode())
-        written.append(options.output)
     document = sensor_document(found, recording)
     print_result(document, sensor_text(found), written, as_json=options.json)
     return 0
@@ -136,11 +135,9 @@ def _run(options: argparse.Namespace) -> int:
 def sensor_text(found: SensorEstimate) -> str:
     rows = []
     for one in found.parameters:
-        unit = '' if one.unit == '1' else f' [{one.unit}]'
-        name = f'{one.name.replace("_", " ").capitalize()} {one.symbol}{unit}'
         low, high = one.interval
         shown = rounded(one.value, (high - low) / 4.0) if one.determined else 'not determined'
-        rows.append((name, shown, between(one.interval) if one.determined else ''))
+        rows.append((title_of(one), shown, interval_of(one)))
     return (
         f'{table(rows, ("parameter", "value", "95 % interval"))}\n\n'
         f'{found.samples} samples at {found.rate:.4g} Hz in {found.duration:.4g} s'
@@ -150,14 +147,8 @@ def sensor_text(found: SensorEstimate) -> str:
 def sensor_document(found: SensorEstimate, recording: SensorRecording) -> dict[str, Any]:
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
-        if not one.determined:
-            return {'unit': one.unit, 'determined': False}
-        return {
-            'value': one.value,
-            'interval': list(one.interval),
-            'unit': one.unit,
-            'determined': True,
-        }
+        known = {'value': one.value, 'interval': one.interval} if one.determined else {}
+        return {**known, 'unit': one.unit, 'determined': one.determined}
 
     return {
         'parameters': {one.name: entry(one) for one in found.parameters},
