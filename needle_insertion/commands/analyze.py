@@ -15,7 +15,6 @@ from needle_insertion.commands.common import (
     constants,
     make_folder,
     print_result,
-    Subcommand,
     with_unit,
 )
 from needle_insertion.report import controllability as report
@@ -23,7 +22,7 @@ from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_needle(parser, PAPER_NEEDLE)
     add_constants(parser, '--set', 'any other constant of the model')
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
@@ -52,7 +51,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     if options.map and (options.output is None or len(options.speed) > 1):
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:
@@ -98,6 +97,3 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         options.sliding,
     )
     return report.write_map(options.output, found)
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -1,31 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared parts of the commands: `Subcommand`, model constants from words, output folders."""
+"""Shared parts of the commands: options, model constants from words, results and their folders."""
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable, Sequence
 import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 from needle_ros.errors import ParameterError, shown
 from needle_ros.quantities import EXAMPLES, quantity
-
-
-class Subcommand(NamedTuple):
-    """
-    Subcommand of `needle`: the constant ``COMMAND`` of its module.
-
-    `run` returns the exit status. It raises a `JobError` if the job fails, and any other
-    `NeedleError` if an option or an input is not valid.
-    """
-
-    add_arguments: Callable[[ArgumentParser], None]
-    run: Callable[[Namespace], int]
-    signed: tuple[str, ...] = ()  #: options whose value may begin with a minus sign
-    #: Returns the words of the command with those that the user left out.
-    completed: Callable[[Sequence[str]], list[str]] = list
 
 
 def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '') -> None:

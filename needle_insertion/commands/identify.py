@@ -33,7 +33,6 @@ from needle_insertion.commands.common import (
     make_folder,
     print_each,
     print_result,
-    Subcommand,
     with_unit,
 )
 from needle_insertion.commands.identify_sensor import add_sensor
@@ -44,10 +43,13 @@ from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.quantities import quantities
 
+#: Options whose value may begin with a minus sign.
+SIGNED: Final = ('--force-axis', '--motion-axis', '--axes', '--truth')
+
 KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')  #: Kinds of identification.
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         'needle identify RECORDINGS [OPTIONS] chooses friction, stiffness or steering by the '
         'content of the recordings, as needle inspect does, and prints the command'
@@ -287,7 +289,7 @@ def _identify(
     return 2 if origin.failures or complaints else 0
 
 
-def _chosen(words: Sequence[str]) -> list[str]:
+def completed(words: Sequence[str]) -> list[str]:
     """Insert the kind and the options for recordings that are given without a kind."""
     first = words[0] if words else '-'
     if first in KINDS or first.startswith('-') or not _is_recording(first):
@@ -319,9 +321,6 @@ def _is_recording(word: str) -> bool:
     return path.exists() or bool(path.suffix) or len(path.parts) > 1
 
 
-COMMAND = Subcommand(
-    _add_arguments,
-    lambda options: int(options.identify(options)),
-    signed=('--force-axis', '--motion-axis', '--axes', '--truth'),
-    completed=_chosen,
-)
+def run(options: argparse.Namespace) -> int:
+    status: int = options.identify(options)
+    return status

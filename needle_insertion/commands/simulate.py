@@ -17,7 +17,6 @@ from needle_insertion.commands.common import (
     constants,
     print_each,
     print_result,
-    Subcommand,
     with_unit,
 )
 from needle_insertion.commands.simulate_steering import add_steering, run_steering
@@ -39,7 +38,7 @@ _ONLY: Final = {
 }
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model',
         choices=tuple(_ONLY),
@@ -94,7 +93,7 @@ def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> fl
     return float(f'{1.05 * longest:.2g}')
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
@@ -157,6 +156,3 @@ def _pace(ratio: float) -> str:
     """Format the ratio of simulated to real time to two digits."""
     times, word = (ratio, 'faster') if ratio >= 1.0 else (1.0 / ratio, 'slower')
     return f'{float(f"{times:.2g}"):g} times {word} than'
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -36,7 +36,6 @@ from needle_insertion.commands.common import (
     constants,
     print_each,
     print_result,
-    Subcommand,
     with_unit,
 )
 from needle_insertion.progress import ProgressLine
@@ -59,7 +58,7 @@ _DRAWN: Final = 0.5  #: standard deviation of the sampled disturbances, as a fra
 _SHOWN: Final = 4  #: number of needle shapes in the picture
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         'Insert a simulated needle that differs from the nominal model, in steps: measure the '
         'tip, move the guide, insert. For comparison, repeat the insertion with a guide at rest.'
@@ -182,7 +181,7 @@ def sample_needle(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     target, needle, steering, prior, errors, depths = _task(options)
     aim = target[[0, 2]]
     limits = replace(
@@ -263,6 +262,3 @@ def _text(found: Mapping[str, Any]) -> str:
         for x, z in (at,)
     ]
     return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
-
-
-COMMAND = Subcommand(_add_arguments, _run)

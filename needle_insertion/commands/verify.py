@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import print_result, Subcommand
+from needle_insertion.commands.common import print_result
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -15,7 +15,7 @@ from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recording of a plant')
     parser.add_argument(
         '--tolerance',
@@ -28,7 +28,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Verify each bag and print the results; return 1 if a run differs, 2 if a bag is unusable."""
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
@@ -91,6 +91,3 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'
-
-
-COMMAND = Subcommand(_add_arguments, _run)
