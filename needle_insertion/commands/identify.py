@@ -27,14 +27,7 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings.tables import column_roles, ROLES
-from needle_insertion.commands.common import (
-    check_file,
-    check_folder,
-    make_folder,
-    print_each,
-    print_result,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
 from needle_insertion.commands.identify_steering import add_steering, add_time, words_of
 from needle_insertion.progress import ProgressLine
@@ -93,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--layers',
-        **{**with_unit('m', quantities), 'metavar': '30mm,...'},
+        **{**common.with_unit('m', quantities), 'metavar': '30mm,...'},
         help='insertion depths at which layers begin, for the term layers',
     )
     friction.set_defaults(identify=_run_friction)
@@ -116,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--level',
-        **with_unit('N'),
+        **common.with_unit('N'),
         help='force level of the stiffness to report (default: the largest)',
     )
     stiffness.set_defaults(identify=_run_stiffness)
@@ -179,7 +172,7 @@ def _add_common(
             fitting.add_argument(
                 f'--{item.name.replace("_", "-")}',
                 default=item.default,
-                **with_unit(unit),
+                **common.with_unit(unit),
                 help=f'{item.metadata["description"]} (default {default})',
             )
     return reading, fitting
@@ -245,8 +238,8 @@ def _identify(
     other: tuple[str, Callable[[Path], Any]],
 ) -> int:
     """Identify all bags, write the results, print warnings and tables; return the exit status."""
-    check_file(options.output)
-    check_folder(options.report)
+    common.check_file(options.output)
+    common.check_folder(options.report)
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(
@@ -256,7 +249,7 @@ def _identify(
         Origin(settings=settings, reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
-    print_each('error', origin.failed)
+    common.print_each('error', origin.failed)
     what, identify_other = other
     for name, _reason in origin.failures:
         with suppress(NeedleError, OSError):
@@ -276,16 +269,16 @@ def _identify(
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
 
-        make_folder(options.report)
+        common.make_folder(options.report)
         with ProgressLine('page', brief=True):
             written.append(write_identified_page(options.report, summary, origin))
     short, full = warned(summary, origin)
-    print_each('warning', full if options.all_warnings else short)
+    common.print_each('warning', full if options.all_warnings else short)
     if len(full) > len(short) and not options.all_warnings:
         sys.stderr.write(f'--all-warnings prints all {len(full)} warnings\n')
     document = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
-    print_result(document, identified_text(summary), written, as_json=options.json)
-    print_each('error', complaints)
+    common.print_result(document, identified_text(summary), written, as_json=options.json)
+    common.print_each('error', complaints)
     return 2 if origin.failures or complaints else 0
 
 

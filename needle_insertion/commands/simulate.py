@@ -10,15 +10,7 @@ from typing import Final
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
-from needle_insertion.commands.common import (
-    add_constants,
-    add_needle,
-    check_file,
-    constants,
-    print_each,
-    print_result,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.commands.simulate_steering import add_steering, run_steering
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report import trajectory as report
@@ -45,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='modes: model of the paper; steering: the needle bends about the path that it cuts '
         '(default: modes for a needle of the paper, steering for all others)',
     )
-    add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
-    add_constants(parser, '--set', 'any other constant of the model')
+    common.add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
+    common.add_constants(parser, '--set', 'any other constant of the model')
     for name, unit, words in (
         ('depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)'),
         ('force', 'N', f'insertion force (default {_FORCE:g}N)'),
@@ -54,13 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)'),
         ('tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})'),
     ):
-        parser.add_argument(f'--{name}', help=words, **with_unit(unit))
+        parser.add_argument(f'--{name}', help=words, **common.with_unit(unit))
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         '--tip-deflection',
         help='tip deflection at the start, in the shape of least elastic energy (default '
         f'{1e3 * _DEFLECTION:g}mm)',
-        **with_unit('m'),
+        **common.with_unit('m'),
     )
     start.add_argument(
         '--modal',
@@ -99,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
         if not path.suffix and path.exists():
             raise ParameterError(f'{path}: a bag must not exist')
-        check_file(path)
+        common.check_file(path)
     needle = options.needle or (PAPER_NEEDLE if options.model == _MODES else DEFAULT_NEEDLE)
     chosen = options.model or ('steering' if find_needle(needle).bends else _MODES)
     for model, names in _ONLY.items():
@@ -116,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
 def _run_modes(needle: str, options: argparse.Namespace) -> int:
     depth = _DEPTH if options.depth is None else options.depth
     force = _FORCE if options.force is None else options.force
-    parameters = NeedleParameters.preset(needle, **constants(options.set))
+    parameters = NeedleParameters.preset(needle, **common.constants(options.set))
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
@@ -140,7 +132,7 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     for path in options.output:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
-    print_each('warning', report.warnings(trajectory))
+    common.print_each('warning', report.warnings(trajectory))
     # Decayed values have no significant digits left.
     rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
     text = (
@@ -148,7 +140,7 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
         f'{table(rows, ("quantity", "value"))}\n'
         f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time'
     )
-    print_result(summary, text, options.output, as_json=options.json)
+    common.print_result(summary, text, options.output, as_json=options.json)
     return 0
 
 

@@ -29,15 +29,7 @@ from needle_dynamics import (
     NeedleShape,
     SteeringParameters,
 )
-from needle_insertion.commands.common import (
-    add_constants,
-    add_needle,
-    check_file,
-    constants,
-    print_each,
-    print_result,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach, evenly
@@ -70,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='X,Y,Z',
         help=f'target of the tip: {TARGET_HELP} (default {TARGET})',
     )
-    add_needle(parser, DEFAULT_NEEDLE)
+    common.add_needle(parser, DEFAULT_NEEDLE)
     parser.add_argument(
         '--law',
         default=DEFAULT_LAW,
@@ -79,22 +71,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'(default {DEFAULT_LAW})',
     )
     words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
-    add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
-    add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
+    common.add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
+    common.add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
     errors = ', '.join(asdict(SteppedTipErrors()))
-    add_constants(parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}')
+    common.add_constants(
+        parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}'
+    )
     parser.add_argument(
         '--step',
         default=STEP_LENGTH,
         help=f'depth per step (default {1e3 * STEP_LENGTH:g}mm)',
-        **with_unit('m'),
+        **common.with_unit('m'),
     )
     parser.add_argument(
         '--limit',
         default=SIMULATION_LIMITS.guide_limit,
         help='largest displacement of the guide along x and z '
         f'(default {1e3 * SIMULATION_LIMITS.guide_limit:g}mm)',
-        **with_unit('m'),
+        **common.with_unit('m'),
     )
     parser.add_argument(
         '--turns',
@@ -106,7 +100,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--load-limit',
         default=SIMULATION_LIMITS.load_limit,
         help='largest planned lateral force on the guide (default: no limit)',
-        **with_unit('N'),
+        **common.with_unit('N'),
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
@@ -138,7 +132,7 @@ def _task(options: argparse.Namespace) -> _Task:
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
-        check_file(options.output)
+        common.check_file(options.output)
     find_law(options.law)
     if options.seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {options.seed}')
@@ -155,15 +149,15 @@ def _task(options: argparse.Namespace) -> _Task:
             f'--step must be in (0, {target[1]:g}] m, the depth of the target, got '
             f'{options.step!r} m'
         )
-    for name in constants(options.set):
+    for name in common.constants(options.set):
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
-    given = {**asdict(SteeringPrior()), **constants(options.prior)}
+    given = {**asdict(SteeringPrior()), **common.constants(options.prior)}
     return _Task(
         target,
-        *found.changed(constants(options.set))[:2],
+        *found.changed(common.constants(options.set))[:2],
         from_values(SteeringPrior, given),
-        from_values(SteppedTipErrors, constants(options.sensor)),
+        from_values(SteppedTipErrors, common.constants(options.sensor)),
         step_depths(target[1], options.step),
     )
 
@@ -228,7 +222,7 @@ def run(options: argparse.Namespace) -> int:
         'bending length ratio': law.status().get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
-    print_each('warning', found['warnings'])
+    common.print_each('warning', found['warnings'])
     if options.output is not None:
         figure = draw_needle(
             evenly(shapes, min(_SHOWN, len(shapes))),
@@ -243,7 +237,7 @@ def run(options: argparse.Namespace) -> int:
         f'to {done.load:.1f} N, {done.turns} turns of the needle\n\n'
         f'{_text(found)}'
     )
-    print_result(found, text, filter(None, [options.output]), as_json=options.json)
+    common.print_result(found, text, filter(None, [options.output]), as_json=options.json)
     return 0
 
 
