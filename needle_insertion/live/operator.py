@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.messages import listen_states, State, target_message
-from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
+from needle_insertion.live.requests import CONTROLLER, NODES, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile, steady_timer
 from needle_ros.calls_node import Calls
@@ -51,10 +51,9 @@ class Operator:
             PointStamped, contract.TARGET.name, profile(contract.TARGET.qos)
         )
         self._clients: dict[tuple[str, str], Client] = {}
-        for requests in REQUESTS.values():
-            for request in requests:
-                kind = Trigger if request.data is None else SetBool
-                self._client(kind, request.node, request.service)
+        for service, data in REQUESTS.values():
+            for name in NODES:
+                self._client(Trigger if data is None else SetBool, name, service)
         self.states = listen_states(node, self._on_state)
         steady_timer(node, _CHECK, self._repeat)
 
@@ -99,25 +98,18 @@ class Operator:
 
     def ask(self, word: str) -> Future:
         """Call the services of a key of `REQUESTS`; the future has a `RequestOutcome`."""
-        ready = [
-            (request, client)
-            for request in REQUESTS[word]
-            if (client := self._clients[request.node, request.service]).service_is_ready()
-        ]
-        if not ready:
-            services = ' or '.join(f'{one.node}/{one.service}' for one in REQUESTS[word])
-            return _done(RequestOutcome(False, f'no node offers {services}'))
+        service, data = REQUESTS[word]
+        clients = {f'{name}/{service}': self._clients[name, service] for name in NODES}
+        request = Trigger.Request() if data is None else SetBool.Request(data=data)
+        answers = {
+            name: self._calls.call(client, request)
+            for name, client in clients.items()
+            if client.service_is_ready()
+        }
+        if not answers:
+            return _done(RequestOutcome(False, f'no node offers {" or ".join(clients)}'))
         return _gathered(
-            {
-                f'{request.node}/{request.service}': self._calls.call(
-                    client,
-                    Trigger.Request()
-                    if request.data is None
-                    else SetBool.Request(data=request.data),
-                )
-                for request, client in ready
-            },
-            lambda answer: RequestOutcome(answer.success, printable(answer.message)),
+            answers, lambda answer: RequestOutcome(answer.success, printable(answer.message))
         )
 
     def set(self, node: str, name: str, value: Any) -> Future:

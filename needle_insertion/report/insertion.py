@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, TYPE_CHECKING, TypeVar
 
-from needle_dynamics import FloatArray, Insertion, NeedlePath, NeedleShape
+from needle_dynamics import FloatArray, Insertion, NeedleShape
 from needle_insertion.report.content import csv_table, png
 from needle_ros.files import write_whole
 import numpy as np
@@ -35,14 +35,14 @@ class InsertionRecord:
     """Samples of an insertion, with needle shapes."""
 
     def __init__(self, one: Insertion) -> None:
-        self._one = one
+        self.one = one
         self._rows: list[list[float]] = []
         self._shapes: list[NeedleShape] = []
         self.take(0.0)
 
     def take(self, force: float) -> None:
         """Record a sample; ``force`` is the mean axial force since the previous sample [N]."""
-        one = self._one
+        one = self.one
         (guide_x, guide_z), (tip_x, _, tip_z) = one.needle.guide, one.needle.tip
         force_x, force_z, *torques = one.wrench
         self._rows.append(
@@ -59,17 +59,9 @@ class InsertionRecord:
         return np.array(self._rows)
 
     @property
-    def path(self) -> NeedlePath:
-        return self._one.needle.path
-
-    @property
     def shapes(self) -> list[NeedleShape]:
         """Needle shapes at evenly spaced samples, including the last."""
         return evenly(self._shapes, _DRAWN + 1)[1:]
-
-    @property
-    def punctured(self) -> int:
-        return sum(self._one.punctured)
 
 
 def evenly(items: Sequence[_Item], count: int) -> list[_Item]:
@@ -92,7 +84,7 @@ def summary(record: InsertionRecord) -> dict[str, float]:
         'largest lateral force on the guide [N]': float(
             np.hypot(column['force_x [N]'], column['force_z [N]']).max()
         ),
-        'membranes punctured': float(record.punctured),
+        'membranes punctured': float(sum(record.one.punctured)),
     }
 
 
@@ -101,7 +93,8 @@ def write(path: Path, record: InsertionRecord) -> None:
         write_whole(path, csv_table(COLUMNS, record.table))
     else:
         shapes = [np.insert(one.deflections, 1, one.depths, axis=1) for one in record.shapes]
-        cut = np.insert(record.path.deflections, 1, record.path.depths, axis=1)
+        cut_path = record.one.needle.path
+        cut = np.insert(cut_path.deflections, 1, cut_path.depths, axis=1)
         write_whole(path, png(draw_needle(shapes, cut)))
 
 

@@ -77,7 +77,10 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
 def write(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a ``.csv`` or ``.png`` file, or as a bag to a new folder."""
     if path.suffix == '.csv':
-        write_whole(path, _csv(trajectory))
+        names = NeedleModel(trajectory.parameters).coordinate_names
+        heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
+        columns = (trajectory.time, trajectory.states, trajectory.tip_deflection)
+        write_whole(path, csv_table(heads, np.column_stack(columns)))
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
@@ -86,13 +89,6 @@ def write(path: Path, trajectory: Trajectory) -> None:
 
         with BagWriter(path) as bag:
             _write_bag(bag, trajectory)
-
-
-def _csv(trajectory: Trajectory) -> bytes:
-    names = NeedleModel(trajectory.parameters).coordinate_names
-    heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
-    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
-    return csv_table(heads, rows)
 
 
 def _figure(trajectory: Trajectory) -> Figure:

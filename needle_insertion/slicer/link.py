@@ -10,7 +10,9 @@ declares, do not verify checksums, send outdated data, and print tracebacks.
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from errno import EADDRINUSE, EINPROGRESS
+from ipaddress import AddressValueError, IPv4Address
 import os
 import select
 import socket
@@ -18,9 +20,9 @@ from time import monotonic
 from typing import Final
 
 from needle_insertion.slicer.frames import Frame, Frames
-from needle_insertion.slicer.settings import LinkSettings
-from needle_ros.errors import MessageError
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.settings import check_constants, choice, constant, text
 
 _RETRY: Final = 1.0  #: time between attempts to listen or to connect [s]
 _PATIENCE: Final = 5.0  #: timeout of a peer that accepts no byte [s]
@@ -35,6 +37,32 @@ _SYSTEM_BUFFER: Final = 1 << 16
 
 #: Largest number of additional peers that are rejected in a call of `poll`.
 _MOST_STRANGERS: Final = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSettings:
+    """Role and address of the connection, and the limit of targets."""
+
+    role: str = choice('server', ('server', 'client'), 'the server waits, the client connects')
+    host: str = text(
+        '127.0.0.1', 'IPv4 address: as server, address of this machine to listen on (0.0.0.0: all '
+        'addresses); as client, address of the peer',
+    )  # fmt: skip
+    port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0, whole=True)
+    reach: float = constant(
+        0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        try:
+            # A name lookup can block.
+            IPv4Address(self.host)
+        except AddressValueError as error:
+            raise ParameterError(
+                f'host must be an IPv4 address such as 127.0.0.1, got {self.host!r}'
+            ) from error
+        object.__setattr__(self, 'port', int(self.port))
 
 
 class Connection:
@@ -102,10 +130,9 @@ class Connection:
         return True
 
     def close(self) -> None:
-        for one in (self._socket, self._listener):
-            if one is not None:
-                one.close()
-        self._forget()
+        self._drop()
+        if self._listener is not None:
+            self._listener.close()
         self._listener, self._tried = None, -_RETRY
 
     # Connection.
@@ -252,9 +279,6 @@ class Connection:
     def _drop(self) -> None:
         if self._socket is not None:
             self._socket.close()
-        self._forget()
-
-    def _forget(self) -> None:
         self._socket, self.peer = None, ''
         self._out.clear()
 

@@ -14,10 +14,9 @@ from typing import Any, Final, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.graph.messages import target_message
-from needle_insertion.slicer.link import Connection
+from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
-from needle_insertion.slicer.settings import LinkSettings
 from needle_insertion.slicer.states import NodeStates
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer

@@ -13,9 +13,8 @@ from typing import Any
 
 from benchmarks.igtl_peer import free_port
 from needle_insertion.slicer.frames import HEADER
-from needle_insertion.slicer.link import Connection
+from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.messages import is_wanted, TARGET
-from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.event_log import EventLog
 import numpy as np
 import pyigtl
