@@ -43,9 +43,8 @@ def run(options: argparse.Namespace) -> int:
     from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
 
     folder = options.output or (_OUTPUT if options.what == 'all' else None)
-    for path in (folder, options.record):
-        if path is not None:
-            check_folder(path)
+    check_folder(folder)
+    check_folder(options.record)
     recorded = None
     if options.record is not None:
         wanted = campaigns(options.what)

@@ -50,8 +50,7 @@ def run(options: argparse.Namespace) -> int:
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:
         raise ParameterError('-o DIR is the folder of the map: it needs --map')
-    if options.output is not None:
-        common.check_folder(options.output)
+    common.check_folder(options.output)
     changes = common.constants(options.set)
     for name in ('formulation', 'modes'):
         if name in changes:

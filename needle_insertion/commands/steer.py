@@ -5,7 +5,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
@@ -77,30 +77,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_constants(
         parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}'
     )
-    parser.add_argument(
-        '--step',
-        default=STEP_LENGTH,
-        help=f'depth per step (default {1e3 * STEP_LENGTH:g}mm)',
-        **common.with_unit('m'),
+    limits = SIMULATION_LIMITS
+    most = (
+        f'largest displacement of the guide along x and z (default {1e3 * limits.guide_limit:g}mm)'
     )
-    parser.add_argument(
-        '--limit',
-        default=SIMULATION_LIMITS.guide_limit,
-        help='largest displacement of the guide along x and z '
-        f'(default {1e3 * SIMULATION_LIMITS.guide_limit:g}mm)',
-        **common.with_unit('m'),
-    )
+    load = 'largest planned lateral force on the guide (default: no limit)'
+    for name, unit, default, text in (
+        ('step', 'm', STEP_LENGTH, f'depth per step (default {1e3 * STEP_LENGTH:g}mm)'),
+        ('limit', 'm', limits.guide_limit, most),
+        ('load-limit', 'N', limits.load_limit, load),
+    ):
+        parser.add_argument(f'--{name}', default=default, help=text, **common.with_unit(unit))
     parser.add_argument(
         '--turns',
         type=int,
-        default=SIMULATION_LIMITS.turns,
+        default=limits.turns,
         help='largest number of needle rotations (default 0)',
-    )
-    parser.add_argument(
-        '--load-limit',
-        default=SIMULATION_LIMITS.load_limit,
-        help='largest planned lateral force on the guide (default: no limit)',
-        **common.with_unit('N'),
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
@@ -117,18 +109,12 @@ def _line(line: NeedleShape | NeedlePath, frame: FloatArray) -> FloatArray:
     return np.insert(seen, 1, line.depths, axis=1)
 
 
-class _Task(NamedTuple):
-    """Inputs of a steered insertion, from the options."""
-
-    target: FloatArray
-    needle: NeedleParameters
-    steering: SteeringParameters
-    prior: SteeringPrior
-    errors: SteppedTipErrors
-    depths: FloatArray
-
-
-def _task(options: argparse.Namespace) -> _Task:
+def _task(
+    options: argparse.Namespace,
+) -> tuple[
+    FloatArray, NeedleParameters, SteeringParameters, SteeringPrior, SteppedTipErrors, FloatArray
+]:
+    """Return target, nominal needle, prior, errors of the sensor and depths, from the options."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
@@ -153,13 +139,10 @@ def _task(options: argparse.Namespace) -> _Task:
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
     given = {**asdict(SteeringPrior()), **common.constants(options.prior)}
-    return _Task(
-        target,
-        *found.changed(common.constants(options.set))[:2],
-        from_values(SteeringPrior, given),
-        from_values(SteppedTipErrors, common.constants(options.sensor)),
-        step_depths(target[1], options.step),
-    )
+    needle, steering, _ = found.changed(common.constants(options.set))
+    prior = from_values(SteeringPrior, given)
+    errors = from_values(SteppedTipErrors, common.constants(options.sensor))
+    return target, needle, steering, prior, errors, step_depths(target[1], options.step)
 
 
 def sample_needle(

@@ -6,7 +6,7 @@ from time import time_ns
 from typing import Final
 
 from needle_controller.hardware import Robot, STAMPS
-from needle_insertion.live.waiting import waiting
+from needle_insertion.graph.messages import waiting
 from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError

@@ -264,14 +264,11 @@ class View:
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
                     'last_rejection': printable(rejection),
-                    **_progress(typed),
+                    **(
+                        {'step': typed.step, 'steps': typed.steps}
+                        if isinstance(typed, SteeringStatus) and typed.steps
+                        else {}
+                    ),
                 }
             )
         return sorted(nodes, key=lambda node: (-node['level'], node['name']))
-
-
-def _progress(status: NodeStatus | None) -> dict[str, int]:
-    """Return completed and all steps of a steered insertion; empty for other nodes."""
-    if not isinstance(status, SteeringStatus) or not status.steps:
-        return {}
-    return {'step': status.step, 'steps': status.steps}

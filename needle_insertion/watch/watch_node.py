@@ -11,8 +11,8 @@ import os
 from time import monotonic
 from typing import Any, Final
 
+from needle_insertion.graph.messages import waiting
 from needle_insertion.live.operator import Operator
-from needle_insertion.live.waiting import waiting
 from needle_insertion.watch.recorded import STREAMS
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import View
