@@ -28,8 +28,7 @@ class ProgressLine:
     Write the activity of a job with the elapsed time, also while its thread is busy.
 
     On a terminal it is one line that changes; elsewhere a line for each new activity, and one
-    every ten seconds. A `brief` line is on a terminal only, until the job ends. The default stream
-    is stderr.
+    every ten seconds. A `brief` line is on a terminal only, until the job ends.
     """
 
     def __init__(self, title: str, stream: TextIO | None = None, *, brief: bool = False) -> None:

@@ -210,8 +210,7 @@ class Graph:
 
         The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
         condition is checked after each event, which costs more CPU time. Raises `GraphError` on a
-        timeout, with the awaited event (`what`) and the last log line of each process, and if a
-        process of the graph has ended.
+        timeout, with the awaited event `what`, and if a process of the graph has ended.
         """
         deadline, last = time.monotonic() + timeout, sign()
         with DeferredSignals() as signals:

@@ -34,10 +34,9 @@ class RequestOutcome(NamedTuple):
 
 class Operator:
     """
-    Send requests to nodes of the suite, repeat them until they are answered, collect statuses.
+    Send requests to nodes of the suite, and repeat them until they are answered.
 
-    The owner of `node` spins it. `states` has the latest status of each node by its name without
-    namespace.
+    The owner of `node` spins it. `states` has the latest status of each node by its bare name.
     """
 
     def __init__(self, node: Node) -> None:
@@ -82,11 +81,7 @@ class Operator:
         return STEERING if STEERING in self.states else CONTROLLER
 
     def target(self, x: float, y: float, z: float) -> PendingRequest:
-        """
-        Send a target of the tip in ``needle_entry`` [m]; it is repeated until it has an answer.
-
-        Without the node `steering` only the depth y is used.
-        """
+        """Send a target in ``needle_entry`` [m], of which `controller` uses the depth y only."""
         stamp = nanoseconds(request_stamp(self._node))
         # A stamp identifies the request: simulated time may stand still.
         self._stamp = max(stamp, self._stamp + 1) if stamp else 0

@@ -94,11 +94,7 @@ class Terminal:
         self._steers = False
 
     def begin(self, nodes: Collection[str]) -> None:
-        """
-        Wait until all nodes report their state, and controller and steering have measurements.
-
-        Earlier requests would be rejected. Raises `GraphError` on a timeout.
-        """
+        """Wait for states and measurements of the nodes: earlier requests would be rejected."""
         for name in nodes:
             self._state(name)
         for name, topic in _NEEDED:

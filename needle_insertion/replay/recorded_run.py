@@ -125,11 +125,7 @@ class Rows(NamedTuple):
 
 
 class RecordedRun:
-    """
-    Run of a plant as recorded in a bag.
-
-    Raises `RecordingError` if a parameter is missing or not valid, or measurements are missing.
-    """
+    """Recorded run of a plant; `RecordingError` for invalid parameters or no measurements."""
 
     def __init__(
         self, path: Path, name: str, messages: Mapping[str, _Messages], losses: list[str]

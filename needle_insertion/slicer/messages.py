@@ -80,12 +80,7 @@ class Interpreter:
         return point
 
     def shape(self, shape: Shape, number: int) -> list[bytes]:
-        """
-        Return a POINT message with the shape, from the guide to the tip, and its STRING header.
-
-        The string has time, number of the shape, number of points, frame and source, separated by
-        semicolons.
-        """
+        """Return a POINT message with the shape, from guide to tip, and its STRING header."""
         time = _seconds(shape.stamp)
         count = len(shape.points)
         points = PointMessage(
