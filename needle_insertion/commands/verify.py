@@ -33,24 +33,17 @@ def run(options: argparse.Namespace) -> int:
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
     results: list[Rerun] = []
-    bad = 0
+    bad = False
     for path in tqdm(options.bags, desc='bags', disable=None, delay=2.0):
-        found = _verified(path, options.tolerance)
-        results += found
-        bad += not found
+        try:
+            results += verify(path, options.tolerance)
+        except (NeedleError, OSError) as error:  # noqa: PERF203
+            tqdm.write(f'error: {error}', file=sys.stderr)
+            bad = True
     if results or options.json:
         text = '\n'.join([_table(results), *map(shown, _remarks(results))])
         print_result([one.document for one in results], text, as_json=options.json)
     return 2 if bad else int(any(result.verdict == 'differs' for result in results))
-
-
-def _verified(path: Path, tolerance: float) -> list[Rerun]:
-    """Verify a bag, or print the error and return an empty list."""
-    try:
-        return verify(path, tolerance)
-    except (NeedleError, OSError) as error:
-        tqdm.write(f'error: {error}', file=sys.stderr)
-        return []
 
 
 def _table(results: Sequence[Rerun]) -> str:
@@ -58,7 +51,7 @@ def _table(results: Sequence[Rerun]) -> str:
     for result in results:
         name = shown(result.recorded.path.name)
         for topic, found in result.topics.items():
-            worst = f'{found.difference:.3g} {found.unit} ({found.quantity})'
+            worst = f'{found.largest_difference:.3g} {found.unit} ({found.quantity})'
             rows.append(
                 (
                     name, shown(topic), str(found.compared), worst if found.quantity else '0',

@@ -54,11 +54,17 @@ class TopicComparison:
     differing: int
     #: Largest difference, relative to the accepted difference, and in its unit.
     largest: float
-    difference: float
+    largest_difference: float
     #: Of the largest difference, '' if there is no difference.
     quantity: str
     unit: str
     first: dict[str, Any] | None  #: First difference beyond the tolerance.
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Document for JSON."""
+        names = ('compared', 'differing', 'largest_difference', 'quantity', 'unit', 'verdict')
+        return {name.replace('_', ' '): getattr(self, name) for name in names}
 
     @property
     def verdict(self) -> str:
@@ -115,17 +121,7 @@ class Rerun:
             'samples': len(recorded.numbers),
             'first sample': recorded.numbers[0],
             'verdict': self.verdict,
-            'topics': {
-                name: {
-                    'compared': topic.compared,
-                    'differing': topic.differing,
-                    'largest difference': topic.difference,
-                    'quantity': topic.quantity,
-                    'unit': topic.unit,
-                    'verdict': topic.verdict,
-                }
-                for name, topic in self.topics.items()
-            },
+            'topics': {name: topic.document for name, topic in self.topics.items()},
             'first difference': self.first,
             'reason': self.reason,
             'notes': self.notes,
@@ -215,7 +211,7 @@ class Rerun:
             compared=len(part),
             differing=len(differing),
             largest=largest,
-            difference=float(difference[row, column]),
+            largest_difference=float(difference[row, column]),
             quantity=quantities[column].name if largest else '',
             unit=quantities[column].unit if largest else '',
             first=first,
