@@ -29,7 +29,12 @@ from needle_identification import (
 from needle_identification.recordings.tables import column_roles, ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
-from needle_insertion.commands.identify_steering import add_steering, add_time, words_of
+from needle_insertion.commands.identify_steering import (
+    add_output,
+    add_steering,
+    add_time,
+    words_of,
+)
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
@@ -130,9 +135,7 @@ def _add_common(
         'unusable recording is reported and skipped, and the exit status is 2',
     )
     writing = parser.add_argument_group('output')
-    writing.add_argument(
-        '-o', '--output', type=Path, metavar='FILE', help='ROS parameter file with the result'
-    )
+    add_output(writing)
     writing.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
     )
@@ -141,7 +144,6 @@ def _add_common(
         action='store_true',
         help='print the warnings of each recording, not one warning of each kind',
     )
-    writing.add_argument('--json', action='store_true', help='print JSON instead of tables')
     reading = parser.add_argument_group('input')
     reading.add_argument(
         '--wrench-topic',
@@ -258,13 +260,13 @@ def _identify(
     if not estimates:
         return 2
     summary = summarize(estimates)
-    written, complaints = list[Path](), list[str]()
+    written, errors = list[Path](), list[str]()
     if options.output is not None:
         try:
             write(options.output, summary)
             written.append(options.output)
         except IdentificationError as error:
-            complaints.append(f'{options.output} is not written: {error}')
+            errors.append(f'{options.output} is not written: {error}')
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
@@ -278,8 +280,8 @@ def _identify(
         sys.stderr.write(f'--all-warnings prints all {len(full)} warnings\n')
     document = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
     common.print_result(document, identified_text(summary), written, as_json=options.json)
-    common.print_each('error', complaints)
-    return 2 if origin.failures or complaints else 0
+    common.print_each('error', errors)
+    return 2 if origin.failures or errors else 0
 
 
 def completed(words: Sequence[str]) -> list[str]:

@@ -13,7 +13,7 @@ from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
 from needle_identification.sensor.recording import SensorRecording
 from needle_insertion.commands.common import check_file, print_each, print_result
-from needle_insertion.commands.identify_steering import add_time, words_of
+from needle_insertion.commands.identify_steering import add_output, add_time, words_of
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import interval_of, title_of
 from needle_insertion.report.text import table
@@ -41,14 +41,7 @@ def add_sensor(what: Any) -> None:
         help='true position: constant, such as 0mm,52.3mm,0mm, or a bag or table by the same '
         'clock (default: LOG itself, with --truth-topic or --truth-columns)',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
-        help='ROS parameter file with the result, for plant and steering',
-    )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_output(parser, ', for plant and steering')
     reading = parser.add_argument_group('input')
     for option, of in (('--columns', 'the sensor'), ('--truth-columns', 'the true position')):
         reading.add_argument(

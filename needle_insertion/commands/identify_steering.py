@@ -52,14 +52,7 @@ def add_steering(what: Any) -> None:
         help='insertions as bags, or as tables (.csv, .tsv, .mat); an unusable recording is '
         'reported and skipped, and the exit status is 2',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
-        help='ROS parameter file with the result, for a steered plant; for a single medium only',
-    )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_output(parser, ', for a steered plant; for a single medium only')
     reading = parser.add_argument_group('input')
     reading.add_argument(
         '--columns',
@@ -112,6 +105,18 @@ def add_time(reading: argparse._ArgumentGroup) -> None:
         default='header',
         help='time of a sample: stamp of its message or time of receipt (default header)',
     )
+
+
+def add_output(parser: argparse._ActionsContainer, use: str = '') -> None:
+    """Add the options of the results, of which the parameter file has a use."""
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        metavar='FILE',
+        help=f'ROS parameter file with the result{use}',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
 def words_of(text: str) -> list[str]:
@@ -174,17 +179,17 @@ def _run(options: argparse.Namespace) -> int:
         fits = count(1)
         found = identify_steering(recordings, settings, lambda: show(f'fit {next(fits)}'))
     print_each('warning', found.warnings)
-    written, complaints = list[Path](), list[str]()
+    written, errors = list[Path](), list[str]()
     if options.output is not None:
         try:
             write_whole(options.output, steering_yaml(found).encode())
             written.append(options.output)
         except IdentificationError as error:
-            complaints.append(f'{options.output} is not written: {error}')
+            errors.append(f'{options.output} is not written: {error}')
     document = steering_document(found, recordings)
     print_result(document, steering_text(found), written, as_json=options.json)
-    print_each('error', complaints)
-    return 2 if complaints or len(recordings) < len(read) else 0
+    print_each('error', errors)
+    return 2 if errors or len(recordings) < len(read) else 0
 
 
 def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:

@@ -105,8 +105,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _line(line: NeedleShape | NeedlePath, frame: FloatArray) -> FloatArray:
     """Return a needle or its path in the frame of the sensor, as points x, y, z, (k, 3) [m]."""
-    seen = line.deflections + np.outer(line.depths, frame)
-    return np.insert(seen, 1, line.depths, axis=1)
+    shape = line.deflections + np.outer(line.depths, frame)
+    return np.insert(shape, 1, line.depths, axis=1)
 
 
 def _task(

@@ -106,16 +106,16 @@ def identify_all(
 ) -> tuple[list[Any], Origin]:
     """Identify recordings except copies and unusable ones; return estimates and origin."""
     estimates, sources, failures, copies = [], [], [], []
-    seen: dict[bytes, str] = {}
+    known: dict[bytes, str] = {}
     with ProgressLine('identification', brief=True) as show:
         for number, bag in enumerate(bags, 1):
             show(f'recording {number} of {len(bags)}')
             try:
                 recording = read(bag)
-                if recording.digest in seen:
-                    copies.append((recording.name, seen[recording.digest]))
+                if recording.digest in known:
+                    copies.append((recording.name, known[recording.digest]))
                     continue
-                seen[recording.digest] = recording.name
+                known[recording.digest] = recording.name
                 estimates.append(identify(recording))
             except (NeedleError, OSError) as error:
                 failures.append((str(bag), str(error)))

@@ -36,7 +36,7 @@ _MOST_WAITING: Final = 1 << 18
 _SYSTEM_BUFFER: Final = 1 << 16
 
 #: Largest number of additional peers that are rejected in a call of `poll`.
-_MOST_STRANGERS: Final = 8
+_MOST_REJECTED: Final = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +76,7 @@ class Connection:
         steady: Callable[[], float] = monotonic,
     ) -> None:
         #: Address of the peer, '' without a connection; reason why no connection is possible.
-        self.peer = self.complaint = ''
+        self.peer = self.error = ''
         #: Number of messages that were dropped because the peer reads too slowly.
         self.left_out = 0
         self._settings, self._wanted = settings, wanted
@@ -100,7 +100,7 @@ class Connection:
         if self.peer:
             return f'connected with {self.peer}'
         verb = 'waits for a peer on' if self._settings.role == 'server' else 'tries to connect to'
-        return self.complaint or f'{verb} {self.place}'
+        return self.error or f'{verb} {self.place}'
 
     def poll(self) -> list[Frame]:
         """Restore the connection if necessary, send queued data, and return received messages."""
@@ -153,19 +153,19 @@ class Connection:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
             listener.setblocking(False)
             listener.bind((self._settings.host, self._settings.port))
-            listener.listen(_MOST_STRANGERS)
+            listener.listen(_MOST_REJECTED)
         except OSError as error:
             listener.close()
             why = 'the port is in use' if error.errno == EADDRINUSE else _words(error)
-            self._complain(f'cannot listen on {self.place}: {why}')
+            self._report(f'cannot listen on {self.place}: {why}')
             return
-        self._listener, self.complaint = listener, ''
+        self._listener, self.error = listener, ''
         self._events.add(Severity.INFO, f'listens on {self.place}')
 
     def _accept(self) -> None:
         """Accept the first peer and reject all others."""
         listener = self._listener
-        for _ in range(_MOST_STRANGERS):
+        for _ in range(_MOST_REJECTED):
             if listener is None:
                 return
             try:
@@ -182,7 +182,7 @@ class Connection:
                 )
             else:
                 accepted.setblocking(False)
-                self._greet(accepted, f'{host}:{port}')
+                self._establish(accepted, f'{host}:{port}')
 
     def _connect(self) -> None:
         """Start a connection, or check its progress."""
@@ -203,17 +203,17 @@ class Connection:
             if not ready.poll(0):
                 if self._steady() - self._tried > _PATIENCE:
                     self._drop()
-                    self._complain(f'cannot connect to {self.place}: no answer')
+                    self._report(f'cannot connect to {self.place}: no answer')
                 return
             found = coming.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if found:
             self._drop()
-            self._complain(f'cannot connect to {self.place}: {os.strerror(found).lower()}')
+            self._report(f'cannot connect to {self.place}: {os.strerror(found).lower()}')
         else:
-            self.complaint = ''
-            self._greet(coming, self.place)
+            self.error = ''
+            self._establish(coming, self.place)
 
-    def _greet(self, connection: socket.socket, peer: str) -> None:
+    def _establish(self, connection: socket.socket, peer: str) -> None:
         """Initialize an established connection."""
         self._socket, self.peer = connection, peer
         self._frames = Frames(self._wanted, self._events.reject)
@@ -227,10 +227,10 @@ class Connection:
             )
         self._events.add(Severity.INFO, f'connected with {peer}', 'connected')
 
-    def _complain(self, line: str) -> None:
+    def _report(self, line: str) -> None:
         """Log the reason why no connection is possible, once."""
-        if line != self.complaint:
-            self.complaint = line
+        if line != self.error:
+            self.error = line
             self._events.add(
                 Severity.ERROR, f'{line}; tries again every {_RETRY:g} s', 'no connection'
             )

@@ -272,12 +272,12 @@ class SlicerNode(BaseNode):
             f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
             f'{contract.TIP_DEFLECTION.name} received'
         )
-        broken = SlicerPhase.ERROR if link.complaint else SlicerPhase.WAITING
+        broken = SlicerPhase.ERROR if link.error else SlicerPhase.WAITING
         phase = SlicerPhase.CONNECTED if link.peer else broken
         status = SlicerStatus(
             phase=phase,
             peer=link.peer,
-            error=link.complaint,
+            error=link.error,
             shape_source=source,
             shapes=self._shapes,
             shape_rate=self._rate.rate(self._steady_ns()),
@@ -286,7 +286,7 @@ class SlicerNode(BaseNode):
             rejected=self._events.rejected,
             last_rejection=self._events.last_rejection,
         )
-        severity = Severity.ERROR if link.complaint else Severity.INFO
+        severity = Severity.ERROR if link.error else Severity.INFO
         return Diagnosis(severity, f'{link.state}; shape: {shown}', status)
 
 

@@ -39,7 +39,7 @@ PLANT: Final[dict[str, object]] = {
 #: Moving joints, and their trajectory: times [s] and positions [m, rad]. The guide is displaced
 #: early, and the needle is rotated by half a turn in the middle of the insertion.
 JOINTS: Final = ('guide_x', 'roll')
-COURSE: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
+MOTION: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
 
 LEAST_DEFLECTION: Final = 2e-3  #: Least distance of the tip of a bending needle from the axis [m].
 
@@ -51,14 +51,14 @@ DRAWN: Final = 5  #: Number of needles in the picture.
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
     """Insert a bending needle with a moving guide and record everything."""
-    course = JointTrajectory(
+    motion = JointTrajectory(
         joint_names=list(JOINTS),
         points=[
             JointTrajectoryPoint(positions=list(at), time_from_start=Duration(sec=time))
-            for time, at in COURSE
+            for time, at in MOTION
         ],
     )
-    record_insertion('adaptive', bag, logs, show, PLANT, course, lockstep=lockstep)
+    record_insertion('adaptive', bag, logs, show, PLANT, motion, lockstep=lockstep)
 
 
 def bending_checks(bag: Path) -> list[Check]:

@@ -49,7 +49,7 @@ def record_insertion(
     logs: Path,
     show: Show,
     plant: Mapping[str, object] | None = None,
-    course: JointTrajectory | None = None,
+    motion: JointTrajectory | None = None,
     *,
     lockstep: bool = True,
 ) -> None:
@@ -57,7 +57,7 @@ def record_insertion(
     Insert the simulated needle to the target under a control law and record everything.
 
     `plant` holds parameters of the plant, of which ``model.*`` also go to the controller; default
-    is the needle of the paper, bent at the start. `course` moves the guide of a steered needle
+    is the needle of the paper, bent at the start. `motion` moves the guide of a steered needle
     from the time of the target on. Raises `GraphError` if a node fails.
     """
     given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
@@ -74,7 +74,7 @@ def record_insertion(
             START_DEPTH,
             (0.0, TARGET_DEPTH, 0.0),
             lambda sample: sample.time < end,
-            course,
+            motion,
         )
 
 
