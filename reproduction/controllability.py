@@ -5,7 +5,8 @@ from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.report import controllability as report
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
+from reproduction.content import Grid, ReportSection
 
 #: Operating points: insertion depths [m], tip deflections [m], velocity [m/s].
 DEPTHS: Final = (0.02, 0.1, 0.2)

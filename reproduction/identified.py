@@ -16,9 +16,9 @@ from needle_identification import (
     summarize,
     summarize_stiffness,
 )
-from needle_insertion.report.content import Grid, ReportSection
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import NeedleError
+from reproduction.content import Grid, ReportSection
 from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import compare_friction, compare_stiffness, Coverage, LEVEL
 from scipy.special import chdtri

@@ -28,8 +28,9 @@ from needle_controller import (
 )
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.parameters import PAPER_NEEDLE
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
 import numpy as np
+from reproduction.content import Grid, ReportSection
 from reproduction.figures import LAW_COLORS
 from reproduction.runs import LAWS
 

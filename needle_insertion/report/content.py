@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Content of pages as plain data: pictures, tables and sections."""
+"""Pictures of pages, and tables as files."""
 
 from __future__ import annotations
 
@@ -60,22 +60,3 @@ class Picture:
     @property
     def height(self) -> int:
         return int.from_bytes(self.image[20:24], 'big')
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Grid:
-    """Table; the first cell of a row is its name."""
-
-    caption: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportSection:
-    """Heading with paragraphs of plain text, tables and pictures."""
-
-    title: str
-    paragraphs: tuple[str, ...]
-    tables: tuple[Grid, ...] = ()
-    pictures: tuple[Picture, ...] = ()

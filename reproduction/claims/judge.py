@@ -6,9 +6,9 @@ from importlib.resources import files
 from types import ModuleType
 from typing import Any
 
-from needle_insertion.report.content import Grid, ReportSection
 from reproduction.claims import analysis, assumptions, control, identified, mismatch, needle
 from reproduction.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
+from reproduction.content import Grid, ReportSection
 from reproduction.mismatch import Mismatch
 import yaml
 

@@ -18,12 +18,12 @@ from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.progress import Show
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle, evenly
-from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
+from reproduction.content import Check
 from reproduction.insertions import bending
 from reproduction.insertions.bending import read_needles, replay_check
 from reproduction.insertions.insertion import RATE, SETTLING

@@ -18,9 +18,9 @@ from needle_identification import (
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle, evenly
-from needle_insertion.report.text import Check
 from needle_ros.errors import NeedleError
 import numpy as np
+from reproduction.content import Check
 from reproduction.insertions.insertion import record_insertion
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 

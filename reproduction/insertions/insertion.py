@@ -12,9 +12,9 @@ from needle_identification import read_topic
 from needle_insertion.graph.lockstep import WARM_UP
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.progress import Show
-from needle_insertion.report.text import Check
 from needle_ros.timing import seconds
 import numpy as np
+from reproduction.content import Check
 from reproduction.insertions.simulated_run import SimulatedRun
 from trajectory_msgs.msg import JointTrajectory
 
