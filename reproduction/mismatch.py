@@ -76,11 +76,7 @@ class Mismatch:
     nominal: Mapping[str, LoopBatch]
 
     def shares(self, law: str) -> FloatArray:
-        """
-        Return the fraction of each factor in the variance of the final error, shape (3,).
-
-        It is the variance of the means within 20 equal bins of a factor, over the whole variance.
-        """
+        """Return the variance of the means in 20 bins of a factor over the whole, shape (3,)."""
         final = self.batches[law].final
         shares = np.zeros(len(DRAWN))
         for k, factor in enumerate(self.factors.T):

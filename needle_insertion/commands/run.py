@@ -70,7 +70,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each node that the options change."""
     steered = {'steered': True} if steers else {}
     nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {**steered}}
     nodes['controller'] = {**steered}
@@ -92,7 +91,6 @@ def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, 
 
 
 def _parameter(word: str) -> tuple[str, str, Any]:
-    """Parse NODE.NAME=VALUE."""
     # Imported here: the help does not need it.
     from needle_ros.documents import DocumentError, read_document
 

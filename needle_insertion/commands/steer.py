@@ -225,7 +225,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _text(found: Mapping[str, Any]) -> str:
-    """Return the final tip positions as a table, without values that the law does not have."""
     rows = [
         (name, f'{1e3 * x:.3f}', f'{1e3 * z:.3f}', '' if miss is None else f'{1e3 * miss:.3f}')
         for name, at, miss in (

@@ -70,7 +70,6 @@ class NodeProcess:
         return lines[-1] if lines else ''
 
     def kill(self) -> None:
-        """Kill the node, as in a crash, and wait for it."""
         self.ended = True
         self.process.kill()
         self.process.wait()

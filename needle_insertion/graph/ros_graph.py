@@ -122,7 +122,6 @@ class Graph:
         return node
 
     def node(self, name: str) -> Node:
-        """Create a plain node in this process, spun by `spin_until`."""
         node: Node = self.add(Node, name)
         return node
 

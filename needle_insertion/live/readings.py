@@ -110,7 +110,6 @@ class Readings:
         return abs(depth - target) < _SAME and abs(velocity) < _SAME
 
     def line(self) -> str:
-        """Return depth, velocity, force and tip deflection as one line of text."""
         words = []
         if (insertion := self.insertion()) is not None:
             words.append(f'depth {1e3 * insertion[0]:.2f} mm')

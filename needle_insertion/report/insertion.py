@@ -71,7 +71,6 @@ def evenly(items: Sequence[_Item], count: int) -> list[_Item]:
 
 
 def summary(record: InsertionRecord) -> dict[str, float]:
-    """Return the main metrics of an insertion, by name with unit."""
     column = dict(zip(COLUMNS, record.table.T, strict=True))
     return {
         'duration [s]': float(column['time [s]'][-1]),

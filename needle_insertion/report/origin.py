@@ -46,7 +46,6 @@ class Origin:
 
     @property
     def losses(self) -> list[str]:
-        """Lost or corrected data, as sentences."""
         return [f'{name}: {words}' for name, words in self.lost]
 
     @property

@@ -27,7 +27,6 @@ _SOON: Final = 0.02
 
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
-    """Return the main metrics of a trajectory, by name with unit."""
     model = NeedleModel(trajectory.parameters)
     states, tips = trajectory.states, trajectory.tip_deflection
     at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]

@@ -163,7 +163,6 @@ class Connection:
         self._events.add(Severity.INFO, f'listens on {self.place}')
 
     def _accept(self) -> None:
-        """Accept the first peer and reject all others."""
         listener = self._listener
         for _ in range(_MOST_REJECTED):
             if listener is None:

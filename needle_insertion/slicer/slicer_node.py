@@ -99,13 +99,11 @@ class SlicerNode(BaseNode):
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
-        """Discard the connection."""
         if self._link is not None:
             self._link.close()
         self._link = self._interpreter = None
 
     def activate(self) -> None:
-        """Open the connection and start its timer."""
         self._due = monotonic()
         self._timer = steady_timer(self, _CHECK, self._tick)
 
@@ -115,7 +113,6 @@ class SlicerNode(BaseNode):
             self._link.close()
 
     def about(self) -> str:
-        """Describe the connection and the topics."""
         return (
             f'{self._link.state if self._link is not None else ""}; publishes '
             f'{contract.TARGET.name} and {contract.TIP_POSE.name}, subscribes to '
@@ -193,7 +190,6 @@ class SlicerNode(BaseNode):
         self.publish_events(self._events)
 
     def _repeat_target(self) -> None:
-        """Publish the target again until it is answered, and report a rejection."""
         if self._sending is None:
             return
         pending, message = self._sending

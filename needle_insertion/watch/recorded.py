@@ -267,7 +267,6 @@ class Comparison:
         return needle
 
     def content(self) -> dict[str, Any]:
-        """Return name, words, first and last time, and signals, for JSON."""
         signals = {
             name: [[round(time + self.shift, 6) for time in times if time is not None], values]
             for name, (times, values) in self.recording.signals().items()

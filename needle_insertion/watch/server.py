@@ -229,7 +229,6 @@ class Server:
         return socket
 
     async def _take(self, connection: _Connection, message: WSMessage) -> None:
-        """Process a message, or answer with the error."""
         try:
             content = _message(message)
             if 'ask' in content:
@@ -273,13 +272,11 @@ class _Connection:
         self._ahead = 0
 
     def acknowledge(self, number: int) -> None:
-        """Process the acknowledgement of frames."""
         for _ in range(min(number, self._ahead)):
             self._ahead -= 1
             self._credit.release()
 
     async def send(self) -> None:
-        """Send frames until the connection ends."""
         while True:
             await self._credit.acquire()
             self._ahead += 1

@@ -125,7 +125,6 @@ class Buttons:
             self.spin()
 
     async def ask(self, what: str) -> tuple[bool, str]:
-        """Call the services of a request in `REQUESTS`; return success and the answers."""
         answer = self._operator.ask(what)
         # Ends without an answer, too.
         await self._spin_until(answer.done, what)

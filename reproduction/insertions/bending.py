@@ -104,11 +104,7 @@ def draw_bending(bag: Path) -> Figure:
 
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
-    """
-    Read the shapes of the needle, each (k, 3) [m], and the path that it cut, (m, 3) [m].
-
-    The shapes are at successive times, without the straight part of the needle outside.
-    """
+    """Read the shapes of the needle inside, each (k, 3) [m], and its cut path, (m, 3) [m]."""
     needles, path = [], None
     for _, message in read_topic(bag, '/needle_shape'):
         points = np.array([(point.x, point.y, point.z) for point in message.points])
