@@ -158,16 +158,10 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     start = NeedleModel(parameters).state_at(depth, deflection, modal)
     # Loads the machine code, which takes longer than most runs.
     simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
+    accuracy = {'interval': options.interval, 'tolerance': options.tolerance}
     with ProgressLine('simulation', brief=True):
         begin = perf_counter()
-        trajectory = simulate(
-            parameters,
-            start,
-            force,
-            duration=duration,
-            interval=options.interval,
-            tolerance=options.tolerance,
-        )
+        trajectory = simulate(parameters, start, force, duration=duration, **accuracy)
         taken = perf_counter() - begin
     for path in options.output:
         report.write(path, trajectory)

@@ -96,10 +96,8 @@ def run(session: Session) -> int:
                 if not rests:
                     terminal.stop()
         # Nodes that move the needle end first, the recorder last: the bag is complete.
-        for name in _ENDING:
-            for process in processes:
-                if process.name == name:
-                    process.interrupt()
+        for process in sorted(processes, key=lambda one: _ENDING.index(one.name)):
+            process.interrupt()
     if 'recorder' in session.nodes:
         screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
     return 0

@@ -128,14 +128,8 @@ def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
     form = f'.{min(9, max(1, 1 - floor(log10(wide))))}f' if wide > 0.0 else '.4g'
     sign = unit if unit == '%' else ''
     ends = [f'{end:{form}}{sign}' for end in (low, high) if isfinite(end)]
-    match isfinite(low), isfinite(high):
-        case True, True:
-            return f'{value:{form}}{sign}', ' to '.join(ends)
-        case True, False:
-            return f'{value:{form}}{sign}', f'≥ {ends[0]}'
-        case False, True:
-            return f'{value:{form}}{sign}', f'≤ {ends[0]}'
-    return f'{value:{form}}{sign}', 'too few samples'
+    bound = '' if len(ends) == 2 else '≥ ' if isfinite(low) else '≤ '
+    return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else 'too few samples'
 
 
 def _share(part: float) -> str:

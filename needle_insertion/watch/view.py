@@ -264,11 +264,8 @@ class View:
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
                     'last_rejection': printable(rejection),
-                    **(
-                        {'step': typed.step, 'steps': typed.steps}
-                        if isinstance(typed, SteeringStatus) and typed.steps
-                        else {}
-                    ),
                 }
             )
+            if isinstance(typed, SteeringStatus) and typed.steps:
+                nodes[-1] |= {'step': typed.step, 'steps': typed.steps}
         return sorted(nodes, key=lambda node: (-node['level'], node['name']))
