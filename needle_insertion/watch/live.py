@@ -28,7 +28,7 @@ class Live:
         self._view, self._poll = view, poll
         self.setting = {'control': control, 'recording': None}
         self.history: deque[list[float | None]] = deque(maxlen=round(SPAN * RATE))
-        self.changed = asyncio.Condition()
+        self._changed = asyncio.Condition()
         self.scene: dict[str, Any] = {}
         self.number, self.frame = 0, ''
 
@@ -43,14 +43,18 @@ class Live:
             self.history.append(frame['row'])
             self.scene = self._view.scene
             self.number, self.frame = self.number + 1, _json(frame)
-            async with self.changed:
-                self.changed.notify_all()
+            async with self._changed:
+                self._changed.notify_all()
             # No extra frames after a delay.
             due = max(due + PERIOD, now)
             await asyncio.sleep(due - monotonic())
 
     def reader(self) -> LiveReader:
         return LiveReader(self)
+
+    async def newer(self, number: int) -> None:
+        async with self._changed:
+            await self._changed.wait_for(lambda: self.number > number)
 
 
 class LiveReader:
@@ -64,8 +68,7 @@ class LiveReader:
     async def next(self) -> str:
         """Wait for the next newer frame; return it, with the scene if it has changed, as JSON."""
         live, first = self._live, self._number == 0
-        async with live.changed:
-            await live.changed.wait_for(lambda: live.number > self._number)
+        await live.newer(self._number)
         self._number = live.number
         parts = [f'"frame":{live.frame}']
         if first or live.scene is not self._scene:
