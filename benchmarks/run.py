@@ -14,7 +14,6 @@ from typing import TypeAlias
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, conclusion, header, Tick
-from needle_insertion.commands.common import Subcommand
 from needle_ros.errors import ParameterError
 from tqdm import tqdm
 
@@ -150,6 +149,3 @@ def ask(name: str, command: str, questions: Sequence[Question]) -> tuple[str, bo
                 tell(f'\n{section}')
         tell(f'\n{conclusion(bars, time.perf_counter() - begin)}')
     return page, any(bar.missed for bar in bars)
-
-
-COMMAND = Subcommand(add_arguments, run)

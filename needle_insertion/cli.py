@@ -12,10 +12,9 @@ import re
 import shlex
 import signal
 import sys
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import Any, Final, NoReturn
 
-from needle_insertion.commands.common import Subcommand
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, missing_ros, NeedleError
 from needle_ros.signals import ENDINGS
@@ -85,7 +84,7 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
 
 def _run(words: list[str]) -> int:
     chosen = next((word for word in words if not word.startswith('-')), '')
-    command: Subcommand | None = None
+    command: ModuleType | None = None
     COMMAND.set(shlex.join(['needle', *words]))
     if chosen in COMMANDS:
         command = _load(chosen)
@@ -93,11 +92,11 @@ def _run(words: list[str]) -> int:
         try:
             # A completion must not read recordings.
             if '_ARGCOMPLETE' not in os.environ:
-                words = [*words[:at], *command.completed(words[at:])]
+                words = [*words[:at], *getattr(command, 'completed', list)(words[at:])]
         except NeedleError as error:
             sys.stderr.write(f'error: {error}\n')
             return 2
-        words = _joined(words, command.signed)
+        words = _joined(words, getattr(command, 'SIGNED', ()))
     parser = _parser(chosen, command)
     if '_ARGCOMPLETE' in os.environ:
         import argcomplete
@@ -128,7 +127,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _load(name: str) -> Subcommand:
+def _load(name: str) -> ModuleType:
     """Import a subcommand; the benchmarks are not installed."""
     if name == 'bench':
         if not (_ROOT / 'benchmarks').is_dir():
@@ -137,12 +136,10 @@ def _load(name: str) -> Subcommand:
             )
         # The clone is not on the import path.
         sys.path.insert(0, str(_ROOT))
-    module = ABOVE.get(name, f'needle_insertion.commands.{name}')
-    command: Subcommand = import_module(module).COMMAND
-    return command
+    return import_module(ABOVE.get(name, f'needle_insertion.commands.{name}'))
 
 
-def _parser(chosen: str, command: Subcommand | None) -> argparse.ArgumentParser:
+def _parser(chosen: str, command: ModuleType | None) -> argparse.ArgumentParser:
     """Return a parser with the options of the chosen command only: other commands cost imports."""
     parser = _Parser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')

@@ -62,7 +62,6 @@ def compile_nodes() -> int:
 
 
 def _compile(name: str) -> str:
-    """Compile one kernel in a worker process; return its name."""
     for _ in prepare([name]):
         pass
     return name.partition(':')[2]

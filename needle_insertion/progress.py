@@ -28,8 +28,7 @@ class ProgressLine:
     Write the activity of a job with the elapsed time, also while its thread is busy.
 
     On a terminal it is one line that changes; elsewhere a line for each new activity, and one
-    every ten seconds. A `brief` line is on a terminal only, until the job ends. The default stream
-    is stderr.
+    every ten seconds. A `brief` line is on a terminal only, until the job ends.
     """
 
     def __init__(self, title: str, stream: TextIO | None = None, *, brief: bool = False) -> None:
@@ -57,7 +56,6 @@ class ProgressLine:
             self._stream.flush()
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
-        """Set the activity, as `Show`."""
         self._text = activity if fraction is None else f'{activity} {100.0 * fraction:.0f} %'
         # A changed number is not a new activity.
         before, self._kind = self._kind, re.sub(r'\d+', '', activity)

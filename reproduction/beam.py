@@ -34,12 +34,7 @@ class WholeNeedle(NamedTuple):
 
 
 def whole_needle(parameters: NeedleParameters, depth: float, entry: str) -> WholeNeedle:
-    """
-    Solve the needle from base to tip, on an elastic foundation inside the tissue.
-
-    ``depth`` is the insertion depth [m], less than the length of the needle; ``entry`` is a key of
-    `ENTRIES`.
-    """
+    """Solve the needle on an elastic foundation from a depth [m]; ``entry`` is of `ENTRIES`."""
     p, n = parameters, _ELEMENTS
     lengths = np.repeat([(p.length - depth) / n, depth / n], n)
     stiffness, mass = np.zeros((2, 4 * n + 2, 4 * n + 2))

@@ -7,7 +7,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import check_folder, make_folder, Subcommand
+from needle_insertion.commands.common import check_folder, make_folder
 from needle_insertion.report.text import table
 
 #: Results to choose from.
@@ -20,7 +20,7 @@ RESULTS: Final = (
 _OUTPUT: Final = Path('reproduce_output')  #: Default folder of the page of all results.
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('what', choices=RESULTS)
     parser.add_argument(
         '-o',
@@ -38,15 +38,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Print a result and write its page; return 1 if a result does not hold."""
+def run(options: argparse.Namespace) -> int:
     # Takes two seconds to import; invalid options are reported without it.
     from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
 
     folder = options.output or (_OUTPUT if options.what == 'all' else None)
-    for path in (folder, options.record):
-        if path is not None:
-            check_folder(path)
+    check_folder(folder)
+    check_folder(options.record)
     recorded = None
     if options.record is not None:
         wanted = campaigns(options.what)
@@ -78,6 +76,3 @@ def _run(options: argparse.Namespace) -> int:
         if not options.json:
             sys.stdout.write(f'\nwrote {page}\n')
     return 0 if passed else 1
-
-
-COMMAND = Subcommand(_add_arguments, _run)

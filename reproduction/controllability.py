@@ -5,7 +5,8 @@ from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.report import controllability as report
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
+from reproduction.content import Grid, ReportSection
 
 #: Operating points: insertion depths [m], tip deflections [m], velocity [m/s].
 DEPTHS: Final = (0.02, 0.1, 0.2)
@@ -14,7 +15,6 @@ SPEED: Final = 5e-3
 
 
 def section() -> ReportSection:
-    """Return the section of the results page: table of operating points, and map."""
     parameters = NeedleParameters.preset('paper_si')
     model = NeedleModel(parameters)
     straight, bent = (

@@ -20,36 +20,14 @@ from needle_identification import (
     write_result,
 )
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report import identify_figures
 from needle_insertion.report.content import Picture
-from needle_insertion.report.identify_figures import (
-    friction_data,
-    stiffness_levels,
-    stiffness_presses,
-)
 from needle_insertion.report.page import write_page
-from needle_insertion.report.text import Check, CHECK_HEADS, table
+from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError
 from reproduction.campaign import Campaign
-from reproduction.insertions.aiming import (
-    aiming_checks,
-    animate_aiming,
-    draw_aiming,
-    read_aimed,
-    record_aimed,
-)
-from reproduction.insertions.bending import bending_checks, draw_bending, record_bending
-from reproduction.insertions.insertion import (
-    draw_insertions,
-    insertion_checks,
-    RATE,
-    read_insertion,
-    record_insertion,
-    RecordedInsertion,
-    SPEED,
-    START_DEFLECTION,
-    START_DEPTH,
-    TARGET_DEPTH,
-)
+from reproduction.content import Check, CHECK_HEADS
+from reproduction.insertions import aiming, bending, insertion
 from reproduction.protocol import PROTOCOLS
 from reproduction.record import rig
 from reproduction.truth import compare_friction, compare_stiffness, Coverage, TruthComparison
@@ -63,10 +41,11 @@ LARGEST_DISTANCE: Final = 2.0
 _MARKER: Final = '.needle-demo'
 
 _INTRODUCTION: Final = (
-    f'Nodes over DDS at {RATE:g} Hz: insertion from {START_DEPTH * 100:g} cm to '
-    f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s, of a needle that bends and under two '
-    'control laws, and of one that is steered to a target, recorded to MCAP; friction and tissue '
-    'stiffness identified from the shipped simulated recordings and one fresh recording each, '
+    f'Nodes over DDS at {insertion.RATE:g} Hz: insertion from '
+    f'{insertion.START_DEPTH * 100:g} cm to {insertion.TARGET_DEPTH * 100:g} cm at '
+    f'{insertion.SPEED * 1000:g} mm/s, of a needle that bends and under two control laws, and of '
+    'one that is steered to a target, recorded to MCAP; friction and tissue stiffness identified '
+    'from the shipped simulated recordings and one fresh recording each, '
     f'made at {EXPERIMENT_SPEED:g} times real time.'
 )
 
@@ -87,16 +66,18 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
     _clear(output)
     insertions, bent = [], output / 'bending'
     with ProgressLine('insertion, bent needle') as show:
-        record_bending(bent, output / 'logs' / 'bending', show, lockstep=lockstep)
+        bending.record_bending(bent, output / 'logs' / 'bending', show, lockstep=lockstep)
     for law in ('adaptive', 'pid'):
         with ProgressLine(f'insertion, {law}') as show:
-            record_insertion(law, output / law, output / 'logs' / law, show, lockstep=lockstep)
-        insertions.append(read_insertion(law, output / law))
+            insertion.record_insertion(
+                law, output / law, output / 'logs' / law, show, lockstep=lockstep
+            )
+        insertions.append(insertion.read_insertion(law, output / law))
     aimed, alone = output / 'steered', output / 'guide_at_rest'
     for folder, steered in ((alone, False), (aimed, True)):
         with ProgressLine(f'insertion, {folder.name.replace("_", " ")}') as show:
             logs = output / 'logs' / folder.name
-            record_aimed(folder, logs, show, steered=steered, lockstep=lockstep)
+            aiming.record_aimed(folder, logs, show, steered=steered, lockstep=lockstep)
     for name, protocol in PROTOCOLS.items():
         # The noise is the same in each demo, and so is the verdict.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
@@ -127,10 +108,10 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
 
     with ProgressLine('report') as show:
         show('checking the bent needle')
-        checks = bending_checks(bent)
+        checks = bending.bending_checks(bent)
         show('checking the steered needle')
-        checks += aiming_checks(aimed, alone)
-        checks += [check for insertion in insertions for check in insertion_checks(insertion)]
+        checks += aiming.aiming_checks(aimed, alone)
+        checks += [check for one in insertions for check in insertion.insertion_checks(one)]
         for *recorded, fresh in compared.values():
             checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
             checks += _fresh_checks(fresh)
@@ -148,14 +129,14 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
                 ('Checks', f'{passed} of {len(checks)} pass', 'true values and results'),
                 (
                     'Steered',
-                    f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
-                    f'expected tip at {read_aimed(aimed).interval_text} (95 %)',
+                    f'{1e3 * aiming.read_aimed(aimed).miss:.2f} mm from its target',
+                    f'expected tip at {aiming.read_aimed(aimed).interval_text} (95 %)',
                 ),
             ],
             rows=rows,
             heads=CHECK_HEADS,
             pictures=_pictures(bent, (aimed, alone), insertions, friction[-1], stiffness[-1]),
-            animation=animate_aiming(aimed),
+            animation=aiming.animate_aiming(aimed),
         )
     sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1
@@ -183,7 +164,7 @@ def _clear(output: Path) -> None:
 def _pictures(
     bent: Path,
     aimed: tuple[Path, Path],
-    insertions: Sequence[RecordedInsertion],
+    insertions: Sequence[insertion.RecordedInsertion],
     friction: FrictionEstimate,
     stiffness: StiffnessEstimate,
 ) -> list[Picture]:
@@ -193,39 +174,39 @@ def _pictures(
             'Bending needle during the insertion, about the path that it cuts, to scale: the '
             'bevel pushes the tip along z until the needle is rotated, and the guide is displaced '
             'along x.',
-            draw_bending(bent),
+            bending.draw_bending(bent),
         ),
         Picture(
             'steered',
             'Needle steered to a target off the axis, in tissue that is softer than the nominal '
             'model, and the same insertion with a guide at rest. To scale: the needle during the '
             'insertion, about the path that it cuts, and its target.',
-            draw_aiming(*aimed),
+            aiming.draw_aiming(*aimed),
         ),
         Picture(
             'insertion',
             'Insertion under both controllers. At the bottom, the tip sensor after the start: '
-            f'{START_DEFLECTION * 1e3:g} mm that ring at 2 kHz and decay. The sensor averages '
-            'over 1 ms, which leaves little more than its noise.',
-            draw_insertions(insertions),
+            f'{insertion.START_DEFLECTION * 1e3:g} mm that ring at 2 kHz and decay. The sensor '
+            'averages over 1 ms, which leaves little more than its noise.',
+            insertion.draw_insertions(insertions),
         ),
         Picture(
             'friction',
             'Friction, fresh recording. Force over time and against speed, with the fit of '
             'F = mu_s sgn(v) + mu_v v, (15), to steady motion.',
-            friction_data(friction),
+            identify_figures.friction_data(friction),
         ),
         Picture(
             'presses',
             'Presses, fresh recording. Left: force against displacement of each press. Right: '
             'rest positions of the end-effector, and those of the fitted matrix (ellipses).',
-            stiffness_presses(stiffness),
+            identify_figures.stiffness_presses(stiffness),
         ),
         Picture(
             'stiffness',
             'Stiffness, fresh recording, by force. Entries of the matrix with 95 % intervals. The '
             'true values are the means of Table 2 (gray).',
-            stiffness_levels(summarize_stiffness([stiffness])),
+            identify_figures.stiffness_levels(summarize_stiffness([stiffness])),
         ),
     ]
 

@@ -4,11 +4,11 @@
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import check_folder, Subcommand
+from needle_insertion.commands.common import check_folder
 from reproduction.protocol import SHIPPED_BAGS
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-o',
         '--output',
@@ -24,14 +24,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Run the demo; return 1 if a check failed."""
+def run(options: argparse.Namespace) -> int:
     check_folder(options.output)
     from needle_insertion.compilation import compile_nodes
     from reproduction import demo
 
     compile_nodes()
     return demo.run(options.output, options.bags, lockstep=not options.realtime)
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -4,12 +4,12 @@
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import check_folder, Subcommand
+from needle_insertion.commands.common import check_folder
 from needle_ros.errors import ParameterError
 from reproduction.protocol import FASTEST, PROTOCOLS, SPEED
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'which', choices=tuple(PROTOCOLS), help='quantity to identify from the recordings'
     )
@@ -40,8 +40,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Record the bags that are missing in the folder."""
+def run(options: argparse.Namespace) -> int:
     # Takes a second to import; invalid options of the parser are reported without it.
     from reproduction.campaign import Campaign
 
@@ -60,6 +59,3 @@ def _run(options: argparse.Namespace) -> int:
 
     record(campaign, options.output, options.speed)
     return 0
-
-
-COMMAND = Subcommand(_add_arguments, _run)

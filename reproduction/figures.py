@@ -8,26 +8,15 @@ from typing import Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray, NeedleParameters
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
 import numpy as np
-from reproduction.runs import (
-    base_alone,
-    CASES,
-    closed_loop,
-    FORCE,
-    hub_time,
-    LAWS,
-    open_loop,
-    PID_KP,
-    READINGS,
-    RunOutcome,
-    SHOWN,
-)
+from reproduction import runs
+from reproduction.content import Grid, ReportSection
 
 LAW_COLORS: Final[Mapping[str, str]] = {'inverse_dynamics': '#c25a00', 'pid': '#1f5fa8'}
 
-_COLORS: Final = dict(zip(CASES, ('#1f5fa8', '#c25a00', '#2a9d5c', '#7b3fa0'), strict=True))
-_DASHES: Final = dict(zip(CASES, ('-', '--', '-.', ':'), strict=True))
+_COLORS: Final = dict(zip(runs.CASES, ('#1f5fa8', '#c25a00', '#2a9d5c', '#7b3fa0'), strict=True))
+_DASHES: Final = dict(zip(runs.CASES, ('-', '--', '-.', ':'), strict=True))
 _HUB: Final = {False: 'without a hub', True: 'the hub stops the needle'}
 
 #: Drawn state variables: index and axis label.
@@ -44,7 +33,7 @@ _HEADS: Final = (
 )
 
 
-def _cells(found: RunOutcome) -> tuple[str, ...]:
+def _cells(found: runs.RunOutcome) -> tuple[str, ...]:
     return (
         f'{1e3 * found.peak:.4g}',
         f'{found.peak_time:.4g}',
@@ -71,7 +60,7 @@ class PaperFigure:
 
     picture: Picture
     #: Metrics of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
-    outcomes: Mapping[tuple[str, ...], RunOutcome]
+    outcomes: Mapping[tuple[str, ...], runs.RunOutcome]
 
     def table(self, title: str = '') -> Grid:
         """Return the metrics as a table with a row per run; default title is the figure."""
@@ -84,7 +73,7 @@ def _draw_open(axes: Axes, case: tuple[str, str], values: FloatArray) -> float:
     """Draw values of an open-loop run [mm]; return the factor of the time axis."""
     is_fast = case[0] == 'paper_si'
     factor, unit = (1e3, 'ms') if is_fast else (1.0, 's')
-    _draw_band(axes, factor * open_loop(*case).time, 1e3 * values, _COLORS[case])
+    _draw_band(axes, factor * runs.open_loop(*case).time, 1e3 * values, _COLORS[case])
     axes.set_xlabel(f'time [{unit}]')
     axes.grid(visible=True, alpha=0.3)
     return factor
@@ -105,28 +94,28 @@ def _draw_band(axes: Axes, time: FloatArray, values: FloatArray, color: str) -> 
     )
 
 
-def _open_outcomes() -> dict[tuple[str, ...], RunOutcome]:
-    return {case: RunOutcome.of(open_loop(*case)) for case in CASES}
+def _open_outcomes() -> dict[tuple[str, ...], runs.RunOutcome]:
+    return {case: runs.RunOutcome.of(runs.open_loop(*case)) for case in runs.CASES}
 
 
 def _figure_4() -> PaperFigure:
-    """Draw the tip deflection in the open loop."""
     figure = Figure(figsize=(10.0, 6.0), layout='constrained')
     grid = figure.subplots(2, 2, sharex='row')
-    for axes, case in zip(grid.flat, CASES, strict=True):
-        run = open_loop(*case)
+    for axes, case in zip(grid.flat, runs.CASES, strict=True):
+        run = runs.open_loop(*case)
         factor = _draw_open(axes, case, run.tip_deflection)
-        axes.axvline(factor * hub_time(run), color='0.4', linewidth=0.8, linestyle=':')
+        axes.axvline(factor * runs.hub_time(run), color='0.4', linewidth=0.8, linestyle=':')
         axes.set_title(_label(case))
     for axes in grid[:, 0]:
         axes.set_ylabel('tip deflection [mm]')
     found = _open_outcomes()
     fast, fast_printed, slow, slow_printed = (1e3 * abs(one.peak) for one in found.values())
+    soon, late = (runs.hub_time(runs.open_loop(*runs.CASES[k])) for k in (0, 2))
     caption = (
-        f'Figure 4, tip deflection under {FORCE:g} N. With mu_v = 0.3 N s/m the needle is at its '
-        f'hub after {1e3 * hub_time(open_loop(*CASES[0])):.1f} ms (dotted), with 0.3 N s/mm after '
-        f'{hub_time(open_loop(*CASES[2])):.1f} s. The deflection is not constant: it rings, at '
-        f'kilohertz at first, with up to {fast:.3g} mm and {slow:.3g} mm by the complete and '
+        f'Figure 4, tip deflection under {runs.FORCE:g} N. With mu_v = 0.3 N s/m the needle is at '
+        f'its hub after {1e3 * soon:.1f} ms (dotted), with 0.3 N s/mm after {late:.1f} s. The '
+        f'deflection is not constant: it rings, at kilohertz at first, with up to {fast:.3g} mm '
+        f'and {slow:.3g} mm by the complete and '
         f'{fast_printed:.3g} mm and {slow_printed:.3g} mm by the printed equations. The model has '
         'no damping. Bands are the envelope of fast vibration.'
     )
@@ -134,47 +123,47 @@ def _figure_4() -> PaperFigure:
 
 
 def _figure_5() -> PaperFigure:
-    """Draw the state variables in the open loop."""
     figure = Figure(figsize=(12.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 4, sharex='col')
-    for column, case in zip(grid.T, CASES, strict=True):
+    for column, case in zip(grid.T, runs.CASES, strict=True):
         for axes, (k, _name) in zip(column, _STATES, strict=True):
-            _draw_open(axes, case, open_loop(*case).states[:, k])
+            _draw_open(axes, case, runs.open_loop(*case).states[:, k])
         for axes in column[:-1]:
             axes.set_xlabel('')
         column[0].set_title(_label(case), fontsize='medium')
     for axes, (_k, name) in zip(grid[:, 0], _STATES, strict=True):
         axes.set_ylabel(name)
     fast, slow = (
-        1e3 * float(np.abs(np.subtract(*(open_loop(*case).states[:, 0] for case in pair))).max())
-        for pair in (CASES[:2], CASES[2:])
+        float(np.abs(np.subtract(*(runs.open_loop(*case).states[:, 0] for case in pair))).max())
+        for pair in (runs.CASES[:2], runs.CASES[2:])
     )
     caption = (
         'Figure 5, state variables under 3 N. d decreases to the hub and stays there. By the '
         'complete equations q1 and q2 decrease during the insertion, since the same deflection of '
         'a longer needle requires smaller values; by the printed equations they do not. The two '
-        f'differ in d by at most {fast:.2g} mm (0.3 N s/m) and {slow:.2g} mm (0.3 N s/mm): the '
+        f'differ in d by at most {1e3 * fast:.2g} mm (0.3 N s/m) and {1e3 * slow:.2g} mm '
+        '(0.3 N s/mm): the '
         'printed equations have no force of the deflection on d.'
     )
     return PaperFigure(picture=Picture('figure_5', caption, figure), outcomes=_open_outcomes())
 
 
-def _closed_outcomes(law: str) -> dict[tuple[str, ...], RunOutcome]:
+def _closed_outcomes(law: str) -> dict[tuple[str, ...], runs.RunOutcome]:
     return {
-        (*case, 'hub' if hub_stop else 'no hub'): RunOutcome.of(
-            closed_loop(law, *case, hub_stop=hub_stop)
+        (*case, 'hub' if hub_stop else 'no hub'): runs.RunOutcome.of(
+            runs.closed_loop(law, *case, hub_stop=hub_stop)
         )
         # PID stops before the hub.
         for hub_stop in ((True,) if law == 'pid' else (False, True))
-        for case in CASES
+        for case in runs.CASES
     }
 
 
 def _draw_closed(axes: Axes, law: str, *, hub_stop: bool, k: int | None = None) -> None:
     """Draw a state variable of all cases, or the tip deflection [mm]."""
-    for case in CASES:
-        run = closed_loop(law, *case, hub_stop=hub_stop)
-        shown = run.time <= SHOWN
+    for case in runs.CASES:
+        run = runs.closed_loop(law, *case, hub_stop=hub_stop)
+        shown = run.time <= runs.SHOWN
         values = run.tip_deflection if k is None else run.states[:, k]
         axes.plot(
             run.time[shown],
@@ -188,7 +177,6 @@ def _draw_closed(axes: Axes, law: str, *, hub_stop: bool, k: int | None = None) 
 
 
 def _figure_6() -> PaperFigure:
-    """Draw the state variables under inverse dynamics."""
     figure = Figure(figsize=(11.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 2, sharex=True)
     for column, (hub_stop, words) in zip(grid.T, _HUB.items(), strict=True):
@@ -214,7 +202,6 @@ def _figure_6() -> PaperFigure:
 
 
 def _figure_7() -> PaperFigure:
-    """Draw the tip deflection under inverse dynamics."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     for axes, (hub_stop, words) in zip(figure.subplots(1, 2), _HUB.items(), strict=True):
         _draw_closed(axes, 'inverse_dynamics', hub_stop=hub_stop)
@@ -234,22 +221,21 @@ def _figure_7() -> PaperFigure:
 
 
 def _figure_8() -> PaperFigure:
-    """Draw the tip deflection under PID, and the remaining position error."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     left, right = figure.subplots(1, 2)
     _draw_closed(left, 'pid', hub_stop=True)
     left.set(xlabel='time [s]', ylabel='tip deflection [mm]')
     left.legend(fontsize='small')
-    for law, name in LAWS.items():
-        run = closed_loop(law, 'paper_mm', 'complete', hub_stop=law == 'pid')
+    for law, name in runs.LAWS.items():
+        run = runs.closed_loop(law, 'paper_mm', 'complete', hub_stop=law == 'pid')
         right.semilogy(run.time, 1e3 * np.abs(run.states[:, 0]), color=LAW_COLORS[law], label=name)
-    bound = NeedleParameters().coulomb_friction / PID_KP
+    bound = NeedleParameters().coulomb_friction / runs.PID_KP
     right.axhline(1e3 * bound, color='0.4', linestyle=':', label=r'$\mu_s / k_p$')
     right.set(xlabel='time [s]', ylabel='position error |d| [mm]', ylim=(1e-2, 3e2))
     right.grid(visible=True, alpha=0.3)
     right.legend(fontsize='small')
     found = _closed_outcomes('pid')
-    fast, slow = (found[reading, 'complete', 'hub'] for reading in READINGS)
+    fast, slow = (found[reading, 'complete', 'hub'] for reading in runs.READINGS)
     caption = (
         'Figure 8, PID with the gains of the paper. Left: the tip deflection grows to '
         f'{1e3 * abs(fast.peak):.1f} mm (0.3 N s/m) or {1e3 * abs(slow.peak):.1f} mm '
@@ -273,17 +259,16 @@ FIGURES: Final[Mapping[str, Callable[[], PaperFigure]]] = {
 
 
 def _comparison() -> Grid:
-    """Compare the remaining deflection and position error of the laws."""
     rows = []
-    for reading in READINGS:
-        for law in LAWS:
-            runs = {
-                'forces on d, q1, q2': closed_loop(law, reading, 'complete', hub_stop=True),
-                'f_y alone': base_alone(law, reading),
+    for reading in runs.READINGS:
+        for law, name in runs.LAWS.items():
+            compared = {
+                'forces on d, q1, q2': runs.closed_loop(law, reading, 'complete', hub_stop=True),
+                'f_y alone': runs.base_alone(law, reading),
             }
             rows += [
-                (f'{LAWS[law]}, {_label((reading,))}, {how}', *_cells(RunOutcome.of(run)))
-                for how, run in runs.items()
+                (f'{name}, {_label((reading,))}, {how}', *_cells(runs.RunOutcome.of(run)))
+                for how, run in compared.items()
             ]
     return Grid(
         caption='Metrics of each controller by actuated coordinates (hub on, complete equations)',
@@ -295,9 +280,9 @@ def _comparison() -> Grid:
 def section() -> ReportSection:
     """Return the section of the results page: figures 4 to 8, and a comparison of the laws."""
     figures = [draw() for draw in FIGURES.values()]
-    pid = RunOutcome.of(closed_loop('pid', 'paper_mm', 'complete', hub_stop=True))
+    pid = runs.RunOutcome.of(runs.closed_loop('pid', 'paper_mm', 'complete', hub_stop=True))
     inverse, proportional = (
-        1e3 * RunOutcome.of(base_alone(law, 'paper_mm')).final for law in LAWS
+        1e3 * runs.RunOutcome.of(runs.base_alone(law, 'paper_mm')).final for law in runs.LAWS
     )
     return ReportSection(
         title='Figures 4 to 8',

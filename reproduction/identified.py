@@ -16,9 +16,9 @@ from needle_identification import (
     summarize,
     summarize_stiffness,
 )
-from needle_insertion.report.content import Grid, ReportSection
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import NeedleError
+from reproduction.content import Grid, ReportSection
 from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import compare_friction, compare_stiffness, Coverage, LEVEL
 from scipy.special import chdtri
@@ -85,7 +85,6 @@ class PublishedValue:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """Cells of a table."""
         return (
             self.quantity,
             _plus_minus(*self.paper),
@@ -98,7 +97,6 @@ class PublishedValue:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON."""
         mean, deviation = self.paper
         return {
             'quantity': self.quantity,
@@ -154,7 +152,6 @@ class IdentifiedTable:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON."""
         truth = self.truth
         return {
             'unit': 'SI',
@@ -171,7 +168,6 @@ class IdentifiedTable:
 
     @property
     def section(self) -> ReportSection:
-        """Section of the results page."""
         return ReportSection(
             title=self.title,
             paragraphs=(
@@ -195,7 +191,6 @@ class IdentifiedTable:
 
 
 def _table_1(bags: Sequence[Path]) -> list[PublishedValue]:
-    """Return mu_s and mu_v over repeated experiments."""
     recordings = [read_friction_recording(bag) for bag in _shown(bags, 'reading')]
     estimates = [identify_friction(recording) for recording in _shown(recordings, 'fits')]
     compared = list(map(compare_friction, recordings, estimates))
@@ -263,5 +258,4 @@ def identify_table(
 
 
 def _shown(items: Sequence[Any], what: str) -> Any:
-    """Show progress over items."""
     return tqdm(items, desc=what, disable=None, leave=False)

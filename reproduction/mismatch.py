@@ -28,8 +28,9 @@ from needle_controller import (
 )
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.parameters import PAPER_NEEDLE
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
 import numpy as np
+from reproduction.content import Grid, ReportSection
 from reproduction.figures import LAW_COLORS
 from reproduction.runs import LAWS
 
@@ -75,11 +76,7 @@ class Mismatch:
     nominal: Mapping[str, LoopBatch]
 
     def shares(self, law: str) -> FloatArray:
-        """
-        Return the fraction of each factor in the variance of the final error, shape (3,).
-
-        It is the variance of the means within 20 equal bins of a factor, over the whole variance.
-        """
+        """Return the variance of the means in 20 bins of a factor over the whole, shape (3,)."""
         final = self.batches[law].final
         shares = np.zeros(len(DRAWN))
         for k, factor in enumerate(self.factors.T):
@@ -187,7 +184,6 @@ def _figure(found: Mismatch) -> Figure:
 
 
 def section(found: Mismatch) -> ReportSection:
-    """Return the section of the results page."""
     final = {name: 1e6 * np.median(np.abs(b.final)) for name, b in found.batches.items()}
     rms = {name: 1e6 * np.median(b.rms) for name, b in found.batches.items()}
     stiffness = 100.0 * found.shares('inverse_dynamics')[2]

@@ -5,13 +5,12 @@ from math import pi
 from typing import Final
 
 from needle_dynamics import NeedleParameters
-from needle_insertion.report.content import Grid, ReportSection
+from reproduction.content import Grid, ReportSection
 
 DIAMETER: Final = 1.27e-3  #: Diameter of an 18 gauge needle [m].
 
 
 def section() -> ReportSection:
-    """Return Table 3 for the results page."""
     p = NeedleParameters()
     rows = (
         ('l [m]', p.length, None),

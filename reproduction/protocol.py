@@ -58,7 +58,6 @@ class ExperimentProtocol:
 
     @property
     def duration(self) -> float:
-        """Time of the last point [s]."""
         return self.points[-1].time
 
     @property

@@ -8,12 +8,12 @@ from math import nan
 from pathlib import Path
 from typing import Any, Final
 
-from needle_insertion.report.content import ReportSection
 from needle_insertion.report.page import write_page
 from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 from needle_insertion.report.text import filled, table
 from reproduction import claims, controllability, figures, mismatch, needle_constants
 from reproduction.campaign import Campaign
+from reproduction.content import ReportSection
 from reproduction.identified import (
     IdentifiedTable,
     identify_table,

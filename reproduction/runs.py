@@ -62,7 +62,6 @@ class RunOutcome:
     @classmethod
     @cache
     def of(cls, run: LoopRun) -> RunOutcome:
-        """Compute the metrics of a run."""
         tip = run.tip_deflection
         k = int(np.abs(tip).argmax())
         late = run.time >= run.time[0] + 0.9 * (run.time[-1] - run.time[0])

@@ -48,7 +48,6 @@ class Coverage:
 
     @classmethod
     def of(cls, comparisons: Iterable[TruthComparison]) -> Coverage:
-        """Count the intervals of comparisons."""
         known = [one.holds for one in comparisons if one.truth is not None]
         return cls(sum(known), len(known))
 

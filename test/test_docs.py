@@ -213,8 +213,10 @@ def test_commands_in_the_documentation_are_valid(monkeypatch: pytest.MonkeyPatch
             sorted(map(str, Path().glob(word))) if word.startswith('bags/') else [word]
             for word in words
         ]
-        words = [name, *command.completed([one for several in listed for one in several])]
-        cli._parser(name, command).parse_args(cli._joined(words, command.signed))
+        completed = getattr(command, 'completed', list)
+        words = [name, *completed([one for several in listed for one in several])]
+        signed = getattr(command, 'SIGNED', ())
+        cli._parser(name, command).parse_args(cli._joined(words, signed))
 
 
 def test_make_targets_in_the_documentation_exist() -> None:

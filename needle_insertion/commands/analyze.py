@@ -8,24 +8,15 @@ from pathlib import Path
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters
 from needle_dynamics.linearization import SLIDING
 from needle_dynamics.parameters import PAPER_NEEDLE
-from needle_insertion.commands.common import (
-    add_constants,
-    add_needle,
-    check_folder,
-    constants,
-    make_folder,
-    print_result,
-    Subcommand,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_needle(parser, PAPER_NEEDLE)
-    add_constants(parser, '--set', 'any other constant of the model')
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    common.add_needle(parser, PAPER_NEEDLE)
+    common.add_constants(parser, '--set', 'any other constant of the model')
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
     points = parser.add_argument_group('operating points', 'every combination of the values given')
@@ -34,9 +25,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         ('tip-deflection', 'm', [0.0, 5e-4], 'tip deflections (default 0 0.5mm)'),
         ('speed', 'm/s', [5e-3], 'insertion velocities, negative for retraction (default 5mm/s)'),
     ):
-        points.add_argument(f'--{name}', nargs='+', default=default, help=text, **with_unit(unit))
+        points.add_argument(
+            f'--{name}', nargs='+', default=default, help=text, **common.with_unit(unit)
+        )
     points.add_argument(
-        '--force', default=0.0, help='insertion force (default 0)', **with_unit('N')
+        '--force', default=0.0, help='insertion force (default 0)', **common.with_unit('N')
     )
     points.add_argument(
         '--sliding',
@@ -52,15 +45,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Analyze the operating points and print the results."""
+def run(options: argparse.Namespace) -> int:
     if options.map and (options.output is None or len(options.speed) > 1):
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:
         raise ParameterError('-o DIR is the folder of the map: it needs --map')
-    if options.output is not None:
-        check_folder(options.output)
-    changes = constants(options.set)
+    common.check_folder(options.output)
+    changes = common.constants(options.set)
     for name in ('formulation', 'modes'):
         if name in changes:
             raise ParameterError(f'{name} is given by --{name}, not by --set')
@@ -84,12 +75,12 @@ def _run(options: argparse.Namespace) -> int:
         'files': [str(path) for path in files],
     }
     text = table([point.row for point in points], report.POINT_HEADS)
-    print_result(document, text, files, as_json=options.json)
+    common.print_result(document, text, files, as_json=options.json)
     return 0
 
 
 def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> list[Path]:
-    make_folder(options.output)
+    common.make_folder(options.output)
     (speed,) = options.speed
     found = report.map_needle(
         parameters,
@@ -99,6 +90,3 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         options.sliding,
     )
     return report.write_map(options.output, found)
-
-
-COMMAND = Subcommand(_add_arguments, _run)

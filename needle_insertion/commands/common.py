@@ -1,31 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared parts of the commands: `Subcommand`, model constants from words, output folders."""
+"""Shared parts of the commands: options, model constants from words, results and their folders."""
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, ArgumentTypeError
 from collections.abc import Callable, Iterable, Sequence
 import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 from needle_ros.errors import ParameterError, shown
 from needle_ros.quantities import EXAMPLES, quantity
-
-
-class Subcommand(NamedTuple):
-    """
-    Subcommand of `needle`: the constant ``COMMAND`` of its module.
-
-    `run` returns the exit status. It raises a `JobError` if the job fails, and any other
-    `NeedleError` if an option or an input is not valid.
-    """
-
-    add_arguments: Callable[[ArgumentParser], None]
-    run: Callable[[Namespace], int]
-    signed: tuple[str, ...] = ()  #: options whose value may begin with a minus sign
-    #: Returns the words of the command with those that the user left out.
-    completed: Callable[[Sequence[str]], list[str]] = list
 
 
 def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '') -> None:
@@ -41,12 +26,14 @@ def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '')
     added.completer = lambda **_: [*NEEDLES, *map(str, Path().glob('*.yaml'))]
 
 
-def with_unit(unit: str) -> dict[str, Any]:
+def with_unit(
+    unit: str, read: Callable[[str, str], float | list[float]] = quantity
+) -> dict[str, Any]:
     """Return type and word of an option for a quantity, such as ``50mm``."""
 
-    def parse(text: str) -> float:
+    def parse(text: str) -> float | list[float]:
         try:
-            return quantity(text, unit)
+            return read(text, unit)
         except ParameterError as error:
             raise ArgumentTypeError(str(error)) from None
 
@@ -81,7 +68,6 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
 def print_result(
     document: object, text: str, files: Iterable[Path] = (), *, as_json: bool
 ) -> None:
-    """Print a result as JSON, or as text with the written files."""
     if as_json:
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
     else:
@@ -94,8 +80,10 @@ def print_each(kind: str, lines: Iterable[object]) -> None:
         sys.stderr.write(shown(f'{kind}: {line}') + '\n')
 
 
-def check_file(path: Path) -> None:
+def check_file(path: Path | None) -> None:
     """Raise `ParameterError` if a file cannot be written, before its content is computed."""
+    if path is None:
+        return
     if not path.name or path.is_dir():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')
     if not path.absolute().parent.is_dir():
@@ -103,8 +91,10 @@ def check_file(path: Path) -> None:
     check_folder(path.absolute().parent)
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path | None) -> None:
     """Raise `ParameterError` if a folder cannot be created and written to; create nothing."""
+    if folder is None:
+        return
     there = folder.absolute()
     while not there.exists():
         there = there.parent

@@ -5,10 +5,8 @@ import argparse
 import os
 import sys
 
-from needle_insertion.commands.common import Subcommand
 
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--portable',
         action='store_true',
@@ -16,7 +14,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Compile all kernels; return 1 if no folder is writable."""
     from needle_dynamics.compiled.store import PORTABLE, writable_folder
 
@@ -31,6 +29,3 @@ def _run(options: argparse.Namespace) -> int:
         return 1
     sys.stdout.write(f'{len(kernels(MODULES))} compiled functions: {where_kept()}\n')
     return 0
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from itertools import takewhile
 from pathlib import Path
@@ -26,27 +27,27 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings.tables import column_roles, ROLES
-from needle_insertion.commands.common import (
-    check_file,
-    check_folder,
-    make_folder,
-    print_each,
-    print_result,
-    Subcommand,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
-from needle_insertion.commands.identify_steering import add_steering, add_time
+from needle_insertion.commands.identify_steering import (
+    add_output,
+    add_steering,
+    add_time,
+    words_of,
+)
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.quantities import quantities
 
+#: Options whose value may begin with a minus sign.
+SIGNED: Final = ('--force-axis', '--motion-axis', '--axes', '--truth')
+
 KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')  #: Kinds of identification.
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         'needle identify RECORDINGS [OPTIONS] chooses friction, stiffness or steering by the '
         'content of the recordings, as needle inspect does, and prints the command'
@@ -82,7 +83,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--terms',
-        type=_words,
+        type=words_of,
         action='extend',
         metavar='TERM,...',
         help=f'terms of the force model, from {", ".join(TERMS)} '
@@ -90,8 +91,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--layers',
-        type=_lengths,
-        metavar='30mm,...',
+        **{**common.with_unit('m', quantities), 'metavar': '30mm,...'},
         help='insertion depths at which layers begin, for the term layers',
     )
     friction.set_defaults(identify=_run_friction)
@@ -107,36 +107,19 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     reading, fitting = _add_common(stiffness, StiffnessSettings())
     reading.add_argument(
         '--axes',
-        type=_words,
+        type=words_of,
         default=['x', 'z'],
         metavar='X,Z',
         help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
     )
     fitting.add_argument(
         '--level',
-        **with_unit('N'),
+        **common.with_unit('N'),
         help='force level of the stiffness to report (default: the largest)',
     )
     stiffness.set_defaults(identify=_run_stiffness)
     add_steering(what)
     add_sensor(what)
-
-
-def _run(options: argparse.Namespace) -> int:
-    """Run the chosen identification; return 2 if a recording cannot be used."""
-    status: int = options.identify(options)
-    return status
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(',')]
-
-
-def _lengths(text: str) -> list[float]:
-    try:
-        return quantities(text, 'm')
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _add_common(
@@ -152,9 +135,7 @@ def _add_common(
         'unusable recording is reported and skipped, and the exit status is 2',
     )
     writing = parser.add_argument_group('output')
-    writing.add_argument(
-        '-o', '--output', type=Path, metavar='FILE', help='ROS parameter file with the result'
-    )
+    add_output(writing)
     writing.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
     )
@@ -163,7 +144,6 @@ def _add_common(
         action='store_true',
         help='print the warnings of each recording, not one warning of each kind',
     )
-    writing.add_argument('--json', action='store_true', help='print JSON instead of tables')
     reading = parser.add_argument_group('input')
     reading.add_argument(
         '--wrench-topic',
@@ -194,7 +174,7 @@ def _add_common(
             fitting.add_argument(
                 f'--{item.name.replace("_", "-")}',
                 default=item.default,
-                **with_unit(unit),
+                **common.with_unit(unit),
                 help=f'{item.metadata["description"]} (default {default})',
             )
     return reading, fitting
@@ -260,10 +240,8 @@ def _identify(
     other: tuple[str, Callable[[Path], Any]],
 ) -> int:
     """Identify all bags, write the results, print warnings and tables; return the exit status."""
-    if options.output is not None:
-        check_file(options.output)
-    if options.report is not None:
-        check_folder(options.report)
+    common.check_file(options.output)
+    common.check_folder(options.report)
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(
@@ -273,51 +251,40 @@ def _identify(
         Origin(settings=settings, reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
-    _report_failures(origin, *other)
+    common.print_each('error', origin.failed)
+    what, identify_other = other
+    for name, _reason in origin.failures:
+        with suppress(NeedleError, OSError):
+            identify_other(Path(name))
+            sys.stderr.write(shown(f'{name}: try needle identify {what}') + '\n')
     if not estimates:
         return 2
     summary = summarize(estimates)
-    written, complaints = list[Path](), list[str]()
+    written, errors = list[Path](), list[str]()
     if options.output is not None:
         try:
             write(options.output, summary)
             written.append(options.output)
         except IdentificationError as error:
-            complaints.append(f'{options.output} is not written: {error}')
+            errors.append(f'{options.output} is not written: {error}')
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
 
-        make_folder(options.report)
+        common.make_folder(options.report)
         with ProgressLine('page', brief=True):
             written.append(write_identified_page(options.report, summary, origin))
     short, full = warned(summary, origin)
-    print_each('warning', full if options.all_warnings else short)
+    common.print_each('warning', full if options.all_warnings else short)
     if len(full) > len(short) and not options.all_warnings:
         sys.stderr.write(f'--all-warnings prints all {len(full)} warnings\n')
     document = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
-    print_result(document, identified_text(summary), written, as_json=options.json)
-    print_each('error', complaints)
-    return 2 if origin.failures or complaints else 0
+    common.print_result(document, identified_text(summary), written, as_json=options.json)
+    common.print_each('error', errors)
+    return 2 if origin.failures or errors else 0
 
 
-def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
-    """Print the recordings that cannot be used, and the other subcommand if it accepts them."""
-    print_each('error', origin.failed)
-    for name, _reason in origin.failures:
-        if _can(identify, Path(name)):
-            sys.stderr.write(shown(f'{name}: try needle identify {other}') + '\n')
-
-
-def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
-    try:
-        identify(bag)
-    except (NeedleError, OSError):
-        return False
-    return True
-
-
-def _chosen(words: Sequence[str]) -> list[str]:
+def completed(words: Sequence[str]) -> list[str]:
     """Insert the kind and the options for recordings that are given without a kind."""
     first = words[0] if words else '-'
     if first in KINDS or first.startswith('-') or not _is_recording(first):
@@ -349,9 +316,6 @@ def _is_recording(word: str) -> bool:
     return path.exists() or bool(path.suffix) or len(path.parts) > 1
 
 
-COMMAND = Subcommand(
-    _add_arguments,
-    _run,
-    signed=('--force-axis', '--motion-axis', '--axes', '--truth'),
-    completed=_chosen,
-)
+def run(options: argparse.Namespace) -> int:
+    status: int = options.identify(options)
+    return status

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from needle_identification.estimation.estimate import ParameterEstimate
-from needle_identification.estimation.formatting import between, rounded
+from needle_identification.estimation.formatting import rounded
 from needle_identification.recordings.tables import column_roles, is_table
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
 from needle_identification.sensor.recording import SensorRecording
 from needle_insertion.commands.common import check_file, print_each, print_result
-from needle_insertion.commands.identify_steering import add_time
+from needle_insertion.commands.identify_steering import add_output, add_time, words_of
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.identify_text import interval_of, title_of
 from needle_insertion.report.text import table
 from needle_ros.axes import AXES
 from needle_ros.errors import ParameterError
@@ -23,7 +24,6 @@ from needle_ros.quantities import quantities
 
 
 def add_sensor(what: Any) -> None:
-    """Add the subcommand to the subparsers of ``needle identify``."""
     parser = what.add_parser(
         'sensor',
         help='noise, correlation time, bias, delay, losses and outliers of a tip sensor',
@@ -41,14 +41,7 @@ def add_sensor(what: Any) -> None:
         help='true position: constant, such as 0mm,52.3mm,0mm, or a bag or table by the same '
         'clock (default: LOG itself, with --truth-topic or --truth-columns)',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
-        help='ROS parameter file with the result, for plant and steering',
-    )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_output(parser, ', for plant and steering')
     reading = parser.add_argument_group('input')
     for option, of in (('--columns', 'the sensor'), ('--truth-columns', 'the true position')):
         reading.add_argument(
@@ -74,7 +67,6 @@ def add_sensor(what: Any) -> None:
 
 
 def _truth(options: argparse.Namespace) -> Path | list[float]:
-    """Return the constant position or the file of the true position."""
     if options.truth is None:
         if options.truth_topic is None and options.truth_columns is None:
             raise ParameterError(
@@ -102,8 +94,7 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification import identify_sensor
     from needle_identification.result import sensor_yaml
 
-    if options.output is not None:
-        check_file(options.output)
+    check_file(options.output)
 
     def roles(text: str | None) -> dict[str, str]:
         return column_roles(text, SENSOR_ROLES) if text else {}
@@ -112,7 +103,7 @@ def _run(options: argparse.Namespace) -> int:
         recording = read_sensor_recording(
             options.log,
             _truth(options),
-            axes=tuple(axis.strip() for axis in options.axes.split(',')),
+            axes=tuple(words_of(options.axes)),
             tip_topic=options.tip_topic,
             truth_topic=options.truth_topic,
             time=options.time,
@@ -123,27 +114,23 @@ def _run(options: argparse.Namespace) -> int:
     with ProgressLine('identification', brief=True):
         found = identify_sensor(recording)
     print_each('warning', found.warnings)
-    written = list[Path]()
-    if options.output is not None:
+    written = list(filter(None, [options.output]))
+    if written:
         # Stamps of headers are the times of the samples: their messages come later.
         delayed = is_table(options.log) or options.time == 'receive'
         text = sensor_yaml(found, ExecutiveSettings().measurement_time, delayed=delayed)
         write_whole(options.output, text.encode())
-        written.append(options.output)
     document = sensor_document(found, recording)
     print_result(document, sensor_text(found), written, as_json=options.json)
     return 0
 
 
 def sensor_text(found: SensorEstimate) -> str:
-    """Return a result as a table for the terminal."""
     rows = []
     for one in found.parameters:
-        unit = '' if one.unit == '1' else f' [{one.unit}]'
-        name = f'{one.name.replace("_", " ").capitalize()} {one.symbol}{unit}'
         low, high = one.interval
         shown = rounded(one.value, (high - low) / 4.0) if one.determined else 'not determined'
-        rows.append((name, shown, between(one.interval) if one.determined else ''))
+        rows.append((title_of(one), shown, interval_of(one)))
     return (
         f'{table(rows, ("parameter", "value", "95 % interval"))}\n\n'
         f'{found.samples} samples at {found.rate:.4g} Hz in {found.duration:.4g} s'
@@ -151,17 +138,10 @@ def sensor_text(found: SensorEstimate) -> str:
 
 
 def sensor_document(found: SensorEstimate, recording: SensorRecording) -> dict[str, Any]:
-    """Return a result as a JSON document in SI units."""
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
-        if not one.determined:
-            return {'unit': one.unit, 'determined': False}
-        return {
-            'value': one.value,
-            'interval': list(one.interval),
-            'unit': one.unit,
-            'determined': True,
-        }
+        known = {'value': one.value, 'interval': one.interval} if one.determined else {}
+        return {**known, 'unit': one.unit, 'determined': one.determined}
 
     return {
         'parameters': {one.name: entry(one) for one in found.parameters},

@@ -4,7 +4,6 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from itertools import count
-from math import isfinite
 from pathlib import Path
 import re
 from typing import Any
@@ -21,6 +20,7 @@ from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
 from needle_insertion.commands.common import check_file, print_each, print_result, with_unit
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.identify_text import interval_of, plain, title_of
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
@@ -35,7 +35,6 @@ _FITS = (
 
 
 def add_steering(what: Any) -> None:
-    """Add the subcommand to the subparsers of ``needle identify``."""
     parser = what.add_parser(
         'steering',
         help='bending length, free length, skin, tilt and bevel of a needle that cuts its path',
@@ -53,14 +52,7 @@ def add_steering(what: Any) -> None:
         help='insertions as bags, or as tables (.csv, .tsv, .mat); an unusable recording is '
         'reported and skipped, and the exit status is 2',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
-        help='ROS parameter file with the result, for a steered plant; for a single medium only',
-    )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_output(parser, ', for a steered plant; for a single medium only')
     reading = parser.add_argument_group('input')
     reading.add_argument(
         '--columns',
@@ -107,13 +99,29 @@ def add_steering(what: Any) -> None:
 
 
 def add_time(reading: argparse._ArgumentGroup) -> None:
-    """Add the option of the source of time stamps."""
     reading.add_argument(
         '--time',
         choices=TIMES,
         default='header',
         help='time of a sample: stamp of its message or time of receipt (default header)',
     )
+
+
+def add_output(parser: argparse._ActionsContainer, use: str = '') -> None:
+    """Add the options of the results, of which the parameter file has a use."""
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        metavar='FILE',
+        help=f'ROS parameter file with the result{use}',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+
+
+def words_of(text: str) -> list[str]:
+    """Return the words of a list with commas."""
+    return [word.strip() for word in text.split(',')]
 
 
 def _pattern(text: str) -> re.Pattern[str]:
@@ -157,11 +165,8 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification import identify_steering, SteeringSettings
     from needle_identification.result import steering_yaml
 
-    if options.output is not None:
-        check_file(options.output)
-    terms = None
-    if options.terms is not None:
-        terms = tuple(word.strip() for word in options.terms.split(','))
+    check_file(options.output)
+    terms = options.terms and tuple(words_of(options.terms))
     settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
     columns = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
     with ProgressLine('reading', brief=True):
@@ -174,17 +179,17 @@ def _run(options: argparse.Namespace) -> int:
         fits = count(1)
         found = identify_steering(recordings, settings, lambda: show(f'fit {next(fits)}'))
     print_each('warning', found.warnings)
-    written, complaints = list[Path](), list[str]()
+    written, errors = list[Path](), list[str]()
     if options.output is not None:
         try:
             write_whole(options.output, steering_yaml(found).encode())
             written.append(options.output)
         except IdentificationError as error:
-            complaints.append(f'{options.output} is not written: {error}')
+            errors.append(f'{options.output} is not written: {error}')
     document = steering_document(found, recordings)
     print_result(document, steering_text(found), written, as_json=options.json)
-    print_each('error', complaints)
-    return 2 if complaints or len(recordings) < len(read) else 0
+    print_each('error', errors)
+    return 2 if errors or len(recordings) < len(read) else 0
 
 
 def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:
@@ -199,10 +204,6 @@ def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:
     ]
 
 
-def _cell(one: ParameterEstimate) -> str:
-    return measured(one.value, one.error) if one.determined else 'not determined'
-
-
 def _predicted(one: HeldOut | None) -> str:
     if one is None:
         return ''
@@ -211,17 +212,19 @@ def _predicted(one: HeldOut | None) -> str:
 
 
 def steering_text(found: SteeringEstimate) -> str:
-    """Return a result as tables for the terminal."""
-    rows = []
-    for medium in found.media:
-        for one in medium.parameters:
-            name = f'{one.name.replace("_", " ").capitalize()} {one.symbol}'
-            unit = '' if one.unit == '1' else f' [{one.unit}]'
-            interval = between(one.interval) if one.determined else ''
-            rows.append((medium.medium or _ONE, f'{name}{unit}', _cell(one), interval))
-    free = found.free_length
-    interval = between(free.interval) if free.determined and free.error else ''
-    rows.append(('all media', f'Free length {free.symbol} [m]', _cell(free), interval))
+    parameters = [
+        (medium.medium or _ONE, one) for medium in found.media for one in medium.parameters
+    ]
+    rows = [
+        (
+            medium,
+            title_of(one),
+            measured(one.value, one.error) if one.determined else 'not determined',
+            # A given free length has no error.
+            interval_of(one) if one.error else '',
+        )
+        for medium, one in [*parameters, ('all media', found.free_length)]
+    ]
     fits = [
         (
             medium.medium or _ONE,
@@ -252,31 +255,22 @@ def steering_text(found: SteeringEstimate) -> str:
 def steering_document(
     found: SteeringEstimate, recordings: Sequence[SteeringRecording]
 ) -> dict[str, Any]:
-    """Return a result as a JSON document in SI units."""
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
-        if not one.determined:
-            return {'used': one.value, 'unit': one.unit, 'determined': False}
-        return {
-            'value': one.value,
-            'error': one.error,
-            'interval': [end if isfinite(end) else None for end in one.interval],
-            'unit': one.unit,
-            'determined': True,
-        }
+        known = {'value': one.value, 'error': one.error, 'interval': plain(one.interval)}
+        values = known if one.determined else {'used': one.value}
+        return {**values, 'unit': one.unit, 'determined': one.determined}
 
     return {
         'free_length': entry(found.free_length),
         'media': {
             medium.medium or _ONE: {
                 'parameters': {one.name: entry(one) for one in medium.parameters},
-                'rms': medium.rms,
-                'noise': medium.noise,
-                'path_noise': medium.path_noise,
-                'slope': medium.slope,
-                'held_out': None if medium.held_out is None else medium.held_out._asdict(),
-                'samples': medium.samples,
-                'recordings': medium.recordings,
+                **{
+                    name: getattr(medium, name) for name in ('rms', 'noise', 'path_noise', 'slope')
+                },
+                'held_out': medium.held_out and medium.held_out._asdict(),
+                **{name: getattr(medium, name) for name in ('samples', 'recordings')},
             }
             for medium in found.media
         },

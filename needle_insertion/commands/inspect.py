@@ -6,14 +6,14 @@ from math import isfinite
 from pathlib import Path
 
 from needle_identification import inspect_recording, Inspection
-from needle_insertion.commands.common import print_each, print_result, Subcommand
+from needle_insertion.commands.common import print_each, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, shown
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'recordings',
         type=Path,
@@ -24,7 +24,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Print the contents of each recording; return 2 if a recording cannot be read."""
     found, bad = list[Inspection](), 0
     for path in options.recordings:
@@ -62,6 +62,3 @@ def _text(found: Inspection) -> str:
     if found.command:
         lines += [f'try: {shown(found.command)}']
     return '\n'.join(lines)
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -6,11 +6,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from needle_insertion.commands.common import add_needle, check_folder, Subcommand
+from needle_insertion.commands.common import add_needle, check_folder
 from needle_ros.errors import ParameterError
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--hardware', action='store_true', help='start no plant: a robot publishes joint_states'
     )
@@ -45,12 +45,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--no-recording', action='store_true', help='do not record')
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Run the nodes until `quit`; return 0."""
+def run(options: argparse.Namespace) -> int:
     # Imported here: rclpy takes a second.
     from needle_dynamics import find_needle
     from needle_insertion.compilation import compile_nodes
-    from needle_insertion.live.session import config_file, run, Session
+    from needle_insertion.live.session import config_file, Session
+    from needle_insertion.live.session import run as run_session
 
     if options.output is None:
         options.output = Path('needle_runs') / f'{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}'
@@ -66,11 +66,10 @@ def _run(options: argparse.Namespace) -> int:
         nodes = {'recorder': {'path': str(options.output / 'bag')}, **nodes}
     compile_nodes()
     lockstep = not (options.hardware or options.realtime)
-    return run(Session(nodes, file, options.output / 'logs', lockstep=lockstep))
+    return run_session(Session(nodes, file, options.output / 'logs', lockstep=lockstep))
 
 
 def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each node that the options change."""
     steered = {'steered': True} if steers else {}
     nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {**steered}}
     nodes['controller'] = {**steered}
@@ -92,7 +91,6 @@ def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, 
 
 
 def _parameter(word: str) -> tuple[str, str, Any]:
-    """Parse NODE.NAME=VALUE."""
     # Imported here: the help does not need it.
     from needle_ros.documents import DocumentError, read_document
 
@@ -104,6 +102,3 @@ def _parameter(word: str) -> tuple[str, str, Any]:
         return node, name, read_document(text)
     except DocumentError as error:
         raise ParameterError(f'-p {word}: {text!r} is not a value in YAML') from error
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -1,36 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle simulate`: simulate the needle in open loop; write a table, CSV, picture or bag."""
 
+from __future__ import annotations
+
 import argparse
-from math import sqrt
+from collections.abc import Mapping
+from dataclasses import fields
+from math import inf, sqrt
 from pathlib import Path
 from time import perf_counter
-from typing import Final
+from typing import Final, TYPE_CHECKING
 
-from needle_dynamics import DEFAULT_NEEDLE, find_needle, NeedleModel, NeedleParameters, simulate
+from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
+    FloatArray,
+    Insertion,
+    NeedleModel,
+    NeedleParameters,
+    simulate,
+    SteeringParameters,
+)
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
-from needle_insertion.commands.common import (
-    add_constants,
-    add_needle,
-    check_file,
-    constants,
-    print_each,
-    print_result,
-    Subcommand,
-    with_unit,
-)
-from needle_insertion.commands.simulate_steering import add_steering, run_steering
-from needle_insertion.progress import ProgressLine
+from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
+from needle_insertion.commands import common
+from needle_insertion.progress import ProgressLine, Show
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
+from needle_ros.settings import unknown_name
+import numpy as np
+
+if TYPE_CHECKING:
+    # Takes half a second to import.
+    from needle_insertion.report.insertion import InsertionRecord
 
 _DEFLECTION: Final = 5e-4  #: default tip deflection at the start [m], from section 3.2.8
 _DURATION: Final = 1.0  #: default duration if the force does not insert the needle [s]
 _MOMENT: Final = 1e-6  #: duration of the warm-up simulation [s]
 
 _DEPTH, _FORCE = 0.02, 3.0  #: Default insertion depth at the start [m] and default force [N].
+
+#: Default target depth [m], speed [m/s] and distance between samples [m].
+_TO, _SPEED, _STEP = 0.1, 5e-3, 1e-3
+
+#: Columns of a table of guide motion, in addition to the depth.
+_COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
+
+_MOST = 1_000_000  #: most samples of a run
 
 _MODES: Final = 'modes'  #: Options of a single model.
 _ONLY: Final = {
@@ -39,15 +57,15 @@ _ONLY: Final = {
 }
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model',
         choices=tuple(_ONLY),
         help='modes: model of the paper; steering: the needle bends about the path that it cuts '
         '(default: modes for a needle of the paper, steering for all others)',
     )
-    add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
-    add_constants(parser, '--set', 'any other constant of the model')
+    common.add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
+    common.add_constants(parser, '--set', 'any other constant of the model')
     for name, unit, words in (
         ('depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)'),
         ('force', 'N', f'insertion force (default {_FORCE:g}N)'),
@@ -55,13 +73,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)'),
         ('tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})'),
     ):
-        parser.add_argument(f'--{name}', help=words, **with_unit(unit))
+        parser.add_argument(f'--{name}', help=words, **common.with_unit(unit))
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         '--tip-deflection',
         help='tip deflection at the start, in the shape of least elastic energy (default '
         f'{1e3 * _DEFLECTION:g}mm)',
-        **with_unit('m'),
+        **common.with_unit('m'),
     )
     start.add_argument(
         '--modal',
@@ -79,7 +97,20 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='file.csv, file.png or a folder for a bag; repeatable',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
-    add_steering(parser)
+    group = parser.add_argument_group('model steering only')
+    for name, unit, words in (
+        ('to', 'm', f'target depth (default {1e3 * _TO:g}mm)'),
+        ('speed', 'm/s', f'insertion velocity (default {1e3 * _SPEED:g}mm/s)'),
+    ):
+        group.add_argument(f'--{name}', help=words, **common.with_unit(unit))
+    group.add_argument(
+        '--motion',
+        type=Path,
+        metavar='FILE',
+        help='table (.csv, .mat) with the columns depth and any of '
+        f'{", ".join(_COLUMNS)}: positions of guide and roll at each depth',
+    )
+    group.add_argument('--seed', type=int, help='seed of the noise of the path (default 0)')
 
 
 def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
@@ -94,14 +125,13 @@ def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> fl
     return float(f'{1.05 * longest:.2g}')
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Simulate, write the outputs, and print a summary."""
+def run(options: argparse.Namespace) -> int:
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
         if not path.suffix and path.exists():
             raise ParameterError(f'{path}: a bag must not exist')
-        check_file(path)
+        common.check_file(path)
     needle = options.needle or (PAPER_NEEDLE if options.model == _MODES else DEFAULT_NEEDLE)
     chosen = options.model or ('steering' if find_needle(needle).bends else _MODES)
     for model, names in _ONLY.items():
@@ -112,13 +142,13 @@ def _run(options: argparse.Namespace) -> int:
                 f'{chosen}, the model of {needle}; try --needle '
                 f'{PAPER_NEEDLE if model == _MODES else DEFAULT_NEEDLE}'
             )
-    return _run_modes(needle, options) if chosen == _MODES else run_steering(needle, options)
+    return _run_modes(needle, options) if chosen == _MODES else _run_steering(needle, options)
 
 
 def _run_modes(needle: str, options: argparse.Namespace) -> int:
     depth = _DEPTH if options.depth is None else options.depth
     force = _FORCE if options.force is None else options.force
-    parameters = NeedleParameters.preset(needle, **constants(options.set))
+    parameters = NeedleParameters.preset(needle, **common.constants(options.set))
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
@@ -128,21 +158,15 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     start = NeedleModel(parameters).state_at(depth, deflection, modal)
     # Loads the machine code, which takes longer than most runs.
     simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
+    accuracy = {'interval': options.interval, 'tolerance': options.tolerance}
     with ProgressLine('simulation', brief=True):
         begin = perf_counter()
-        trajectory = simulate(
-            parameters,
-            start,
-            force,
-            duration=duration,
-            interval=options.interval,
-            tolerance=options.tolerance,
-        )
+        trajectory = simulate(parameters, start, force, duration=duration, **accuracy)
         taken = perf_counter() - begin
     for path in options.output:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
-    print_each('warning', report.warnings(trajectory))
+    common.print_each('warning', report.warnings(trajectory))
     # Decayed values have no significant digits left.
     rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
     text = (
@@ -150,7 +174,7 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
         f'{table(rows, ("quantity", "value"))}\n'
         f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time'
     )
-    print_result(summary, text, options.output, as_json=options.json)
+    common.print_result(summary, text, options.output, as_json=options.json)
     return 0
 
 
@@ -160,4 +184,105 @@ def _pace(ratio: float) -> str:
     return f'{float(f"{times:.2g}"):g} times {word} than'
 
 
-COMMAND = Subcommand(_add_arguments, _run)
+def _changed(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
+    """Return the constants of a needle, changed by ``name=value`` words."""
+    given = common.constants(words)
+    valid = [*NEEDLE_CONSTANTS, *(item.name for item in fields(SteeringParameters))]
+    for key in given:
+        if key not in valid:
+            raise ParameterError(unknown_name(key, valid))
+    needle, steering, _ = find_needle(name).changed(given)
+    return needle, steering
+
+
+def _read_motion(path: Path) -> dict[str, FloatArray]:
+    """Read guide, tilt and roll by depth from a table: ``depth`` and any of `_COLUMNS`."""
+    # Imported here, as the report below: the modal model does not need these 0.5 s.
+    from needle_identification import RecordingError
+    from needle_identification.recordings.tables import column_values, guessed, read_table
+
+    read = read_table(path)
+    names = {name: (name.replace('_', ''),) for name in ('depth', *_COLUMNS)}
+    found = guessed(read.columns, names)
+    if 'depth' not in found or len(found) < 2:
+        raise RecordingError(
+            f'{path} must have the columns depth and any of {", ".join(_COLUMNS)}; it has '
+            f'{", ".join(read.columns)}'
+        )
+    motion = {name: column_values(read, name, column, []) for name, column in found.items()}
+    if not all(np.isfinite(values).all() for values in motion.values()):
+        raise RecordingError(f'{path} has values that are not numbers')
+    if len(motion['depth']) < 1 or not (np.diff(motion['depth']) > 0.0).all():
+        raise RecordingError(f'{path}: depth must increase from row to row')
+    return motion
+
+
+def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
+    from needle_insertion.report import insertion as report
+
+    for path in options.output:
+        if path.suffix not in ('.csv', '.png'):
+            raise ParameterError(f'{path}: output of --model steering must be .csv or .png')
+    needle, steering = _changed(needle_name, options.set)
+    to = _TO if options.to is None else options.to
+    speed = _SPEED if options.speed is None else options.speed
+    if not 0.0 < speed < inf:
+        raise ParameterError(f'--speed must be positive and finite, got {speed!r} m/s')
+    interval = _STEP / speed if options.interval is None else options.interval
+    start = 0.0 if options.depth is None else options.depth
+    if start > needle.length:
+        raise ParameterError(
+            f'--depth must be <= length = {needle.length:g} m, got {start:g} m: lengths without a '
+            'unit are in m, such as 0.05 or 50mm'
+        )
+    if not 0.0 < interval < inf or not start < to < inf or (to - start) / speed > _MOST * interval:
+        raise ParameterError(
+            f'--to must be beyond --depth, {start:g} m, with at most {_MOST} samples of '
+            f'--interval, got {to!r} m and {interval!r} s'
+        )
+    motion = _read_motion(options.motion) if options.motion is not None else {}
+    insertion = Insertion(needle, steering, depth=start, seed=options.seed or 0)
+    recorder = report.InsertionRecord(insertion)
+    with ProgressLine('simulation', brief=True) as show:
+        _insert(recorder, motion, show, to, speed, interval)
+    for path in options.output:
+        report.write(path, recorder)
+    summary = report.summary(recorder)
+    rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
+    text = (
+        f'{needle_name}: inserted from {start:g} m to {to:g} m at {speed:g} m/s\n\n'
+        f'{table(rows, ("quantity", "value"))}'
+    )
+    common.print_result(summary, text, options.output, as_json=options.json)
+    return 0
+
+
+def _insert(
+    recorder: InsertionRecord,
+    motion: Mapping[str, FloatArray],
+    show: Show,
+    to: float,
+    speed: float,
+    interval: float,
+) -> None:
+    """Insert a needle to a depth [m] at a speed [m/s], with samples at intervals [s]."""
+    one = recorder.one
+    begin = one.depth
+    while one.depth < to:
+        show('inserting', (one.depth - begin) / (to - begin))
+        # The first interval accelerates to the speed, the last ends at the target depth.
+        ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
+        at = {key: float(np.interp(ahead, motion['depth'], motion[key])) for key in motion}
+        duration = interval
+        if ahead == to:
+            duration = max(2.0 * (to - one.depth) / (one.velocity + speed), 1e-9)
+        force = one.carry(
+            duration,
+            speed,
+            guide=(at.get('guide_x', 0.0), at.get('guide_z', 0.0)),
+            tilt=(at.get('tilt_x', 0.0), at.get('tilt_z', 0.0)),
+            roll=at.get('roll', 0.0),
+        )
+        recorder.take(force)
+        if ahead == to:
+            break

@@ -5,7 +5,7 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
@@ -28,16 +28,7 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
-from needle_insertion.commands.common import (
-    add_constants,
-    add_needle,
-    check_file,
-    constants,
-    print_each,
-    print_result,
-    Subcommand,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach, evenly
@@ -58,7 +49,7 @@ _DRAWN: Final = 0.5  #: standard deviation of the sampled disturbances, as a fra
 _SHOWN: Final = 4  #: number of needle shapes in the picture
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         'Insert a simulated needle that differs from the nominal model, in steps: measure the '
         'tip, move the guide, insert. For comparison, repeat the insertion with a guide at rest.'
@@ -70,7 +61,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='X,Y,Z',
         help=f'target of the tip: {TARGET_HELP} (default {TARGET})',
     )
-    add_needle(parser, DEFAULT_NEEDLE)
+    common.add_needle(parser, DEFAULT_NEEDLE)
     parser.add_argument(
         '--law',
         default=DEFAULT_LAW,
@@ -79,34 +70,28 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         f'(default {DEFAULT_LAW})',
     )
     words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
-    add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
-    add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
+    common.add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
+    common.add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
     errors = ', '.join(asdict(SteppedTipErrors()))
-    add_constants(parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}')
-    parser.add_argument(
-        '--step',
-        default=STEP_LENGTH,
-        help=f'depth per step (default {1e3 * STEP_LENGTH:g}mm)',
-        **with_unit('m'),
+    common.add_constants(
+        parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}'
     )
-    parser.add_argument(
-        '--limit',
-        default=SIMULATION_LIMITS.guide_limit,
-        help='largest displacement of the guide along x and z '
-        f'(default {1e3 * SIMULATION_LIMITS.guide_limit:g}mm)',
-        **with_unit('m'),
+    limits = SIMULATION_LIMITS
+    most = (
+        f'largest displacement of the guide along x and z (default {1e3 * limits.guide_limit:g}mm)'
     )
+    load = 'largest planned lateral force on the guide (default: no limit)'
+    for name, unit, default, text in (
+        ('step', 'm', STEP_LENGTH, f'depth per step (default {1e3 * STEP_LENGTH:g}mm)'),
+        ('limit', 'm', limits.guide_limit, most),
+        ('load-limit', 'N', limits.load_limit, load),
+    ):
+        parser.add_argument(f'--{name}', default=default, help=text, **common.with_unit(unit))
     parser.add_argument(
         '--turns',
         type=int,
-        default=SIMULATION_LIMITS.turns,
+        default=limits.turns,
         help='largest number of needle rotations (default 0)',
-    )
-    parser.add_argument(
-        '--load-limit',
-        default=SIMULATION_LIMITS.load_limit,
-        help='largest planned lateral force on the guide (default: no limit)',
-        **with_unit('N'),
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
@@ -119,27 +104,20 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _line(line: NeedleShape | NeedlePath, frame: FloatArray) -> FloatArray:
     """Return a needle or its path in the frame of the sensor, as points x, y, z, (k, 3) [m]."""
-    seen = line.deflections + np.outer(line.depths, frame)
-    return np.insert(seen, 1, line.depths, axis=1)
+    shape = line.deflections + np.outer(line.depths, frame)
+    return np.insert(shape, 1, line.depths, axis=1)
 
 
-class _Task(NamedTuple):
-    """Inputs of a steered insertion, from the options."""
-
-    target: FloatArray
-    needle: NeedleParameters
-    steering: SteeringParameters
-    prior: SteeringPrior
-    errors: SteppedTipErrors
-    depths: FloatArray
-
-
-def _task(options: argparse.Namespace) -> _Task:
-    """Parse and check the options."""
+def _task(
+    options: argparse.Namespace,
+) -> tuple[
+    FloatArray, NeedleParameters, SteeringParameters, SteeringPrior, SteppedTipErrors, FloatArray
+]:
+    """Return target, nominal needle, prior, errors of the sensor and depths, from the options."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
-        check_file(options.output)
+        common.check_file(options.output)
     find_law(options.law)
     if options.seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {options.seed}')
@@ -156,17 +134,14 @@ def _task(options: argparse.Namespace) -> _Task:
             f'--step must be in (0, {target[1]:g}] m, the depth of the target, got '
             f'{options.step!r} m'
         )
-    for name in constants(options.set):
+    for name in common.constants(options.set):
         if name not in CONSTANTS:
             raise ParameterError(unknown_name(name, CONSTANTS))
-    given = {**asdict(SteeringPrior()), **constants(options.prior)}
-    return _Task(
-        target,
-        *found.changed(constants(options.set))[:2],
-        from_values(SteeringPrior, given),
-        from_values(SteppedTipErrors, constants(options.sensor)),
-        step_depths(target[1], options.step),
-    )
+    given = {**asdict(SteeringPrior()), **common.constants(options.prior)}
+    needle, steering, _ = found.changed(common.constants(options.set))
+    prior = from_values(SteeringPrior, given)
+    errors = from_values(SteppedTipErrors, common.constants(options.sensor))
+    return target, needle, steering, prior, errors, step_depths(target[1], options.step)
 
 
 def sample_needle(
@@ -182,8 +157,7 @@ def sample_needle(
     return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Steer, write the picture, and print the final tip positions of both needles."""
+def run(options: argparse.Namespace) -> int:
     target, needle, steering, prior, errors, depths = _task(options)
     aim = target[[0, 2]]
     limits = replace(
@@ -230,7 +204,7 @@ def _run(options: argparse.Namespace) -> int:
         'bending length ratio': law.status().get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
-    print_each('warning', found['warnings'])
+    common.print_each('warning', found['warnings'])
     if options.output is not None:
         figure = draw_needle(
             evenly(shapes, min(_SHOWN, len(shapes))),
@@ -245,12 +219,11 @@ def _run(options: argparse.Namespace) -> int:
         f'to {done.load:.1f} N, {done.turns} turns of the needle\n\n'
         f'{_text(found)}'
     )
-    print_result(found, text, filter(None, [options.output]), as_json=options.json)
+    common.print_result(found, text, filter(None, [options.output]), as_json=options.json)
     return 0
 
 
 def _text(found: Mapping[str, Any]) -> str:
-    """Return the final tip positions as a table, without values that the law does not have."""
     rows = [
         (name, f'{1e3 * x:.3f}', f'{1e3 * z:.3f}', '' if miss is None else f'{1e3 * miss:.3f}')
         for name, at, miss in (
@@ -264,6 +237,3 @@ def _text(found: Mapping[str, Any]) -> str:
         for x, z in (at,)
     ]
     return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -11,7 +11,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import check_folder, print_result, Subcommand
+from needle_insertion.commands.common import check_folder, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.text import table
 from needle_ros.errors import JobError, ParameterError
@@ -20,7 +20,7 @@ from needle_ros.process_pool import processes
 _PATIENCE: Final = 10  #: timeout for the answer of a scheduler, and for its first worker [s]
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('study', type=Path, metavar='STUDY.yaml', help='definition of the study')
     parser.add_argument(
         '-o', '--output', type=Path, metavar='DIR',
@@ -40,8 +40,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Compute the missing samples, and write table and page."""
+def run(options: argparse.Namespace) -> int:
     try:
         from needle_insertion.replay.study_sample import replay_sample
         from needle_insertion.report.study_page import write_study
@@ -119,6 +118,3 @@ def _executor(
             raise JobError(f'the scheduler at {scheduler} has no workers') from error
         count = sum(client.nthreads().values())
         yield partial(engine.dask, client), count
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import print_result, Subcommand
+from needle_insertion.commands.common import print_result
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -15,7 +15,7 @@ from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recording of a plant')
     parser.add_argument(
         '--tolerance',
@@ -28,29 +28,22 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
     """Verify each bag and print the results; return 1 if a run differs, 2 if a bag is unusable."""
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
     results: list[Rerun] = []
-    bad = 0
+    bad = False
     for path in tqdm(options.bags, desc='bags', disable=None, delay=2.0):
-        found = _verified(path, options.tolerance)
-        results += found
-        bad += not found
+        try:
+            results += verify(path, options.tolerance)
+        except (NeedleError, OSError) as error:  # noqa: PERF203
+            tqdm.write(f'error: {error}', file=sys.stderr)
+            bad = True
     if results or options.json:
         text = '\n'.join([_table(results), *map(shown, _remarks(results))])
         print_result([one.document for one in results], text, as_json=options.json)
     return 2 if bad else int(any(result.verdict == 'differs' for result in results))
-
-
-def _verified(path: Path, tolerance: float) -> list[Rerun]:
-    """Verify a bag, or print the error and return an empty list."""
-    try:
-        return verify(path, tolerance)
-    except (NeedleError, OSError) as error:
-        tqdm.write(f'error: {error}', file=sys.stderr)
-        return []
 
 
 def _table(results: Sequence[Rerun]) -> str:
@@ -58,7 +51,7 @@ def _table(results: Sequence[Rerun]) -> str:
     for result in results:
         name = shown(result.recorded.path.name)
         for topic, found in result.topics.items():
-            worst = f'{found.difference:.3g} {found.unit} ({found.quantity})'
+            worst = f'{found.largest_difference:.3g} {found.unit} ({found.quantity})'
             rows.append(
                 (
                     name, shown(topic), str(found.compared), worst if found.quantity else '0',
@@ -91,6 +84,3 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'
-
-
-COMMAND = Subcommand(_add_arguments, _run)

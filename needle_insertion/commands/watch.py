@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import print_each, Subcommand, with_unit
+from needle_insertion.commands.common import print_each, with_unit
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 HOST, PORT = '127.0.0.1', 8642
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         'Show needle, forces, limits and node messages on a page in a browser: live, from a bag, '
         'or from two bags in comparison.'
@@ -62,8 +62,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Serve the page until a signal arrives."""
+def run(options: argparse.Namespace) -> int:
     if options.bag is not None and options.control:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:
@@ -122,6 +121,3 @@ async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> No
             making.result()
     finally:
         await server.end()
-
-
-COMMAND = Subcommand(_add_arguments, _run)

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to and from running nodes: targets, and the status of each node."""
+"""Messages to and from running nodes: targets, status of each node, messages on demand."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from time import monotonic
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_ros import contract
-from needle_ros.base_node import profile
+from needle_ros.base_node import message_class, profile
+from needle_ros.contract import Qos, Topic
 from needle_ros.errors import printable
 from needle_ros.requests import RequestStatus
 from needle_ros.status import node_of, NodeStatus, read_status
@@ -64,3 +65,32 @@ def target_message(stamp: int, point: tuple[float, float, float]) -> PointStampe
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
     message.point.x, message.point.y, message.point.z = point
     return message
+
+
+def waiting(
+    node: Node, topic: Topic, qos: Qos, *, raw: bool = True
+) -> Callable[[], Iterator[Any]]:
+    """
+    Subscribe to a topic and return a function that yields the messages since its last call.
+
+    A sensor is subscribed as best effort. The queue holds as many messages as the depth of `qos`.
+    Messages are taken on demand only: a topic of 1 kHz costs no more Python time than a topic that
+    is read 30 times a second. The node must not be spun. `raw` messages are bytes.
+    """
+    made = node.create_subscription(
+        message_class(topic.type_name),
+        topic.name,
+        lambda _: None,
+        profile(qos, request=True),
+        raw=raw,
+    )
+
+    def take() -> Iterator[Any]:
+        for _ in range(qos.depth):
+            with made.handle:
+                taken = made.handle.take_message(made.msg_type, made.raw)
+            if taken is None:
+                return
+            yield taken[0]
+
+    return take

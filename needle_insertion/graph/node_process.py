@@ -65,13 +65,11 @@ class NodeProcess:
 
     @property
     def last_line(self) -> str:
-        """Last line of the node output."""
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
         return lines[-1] if lines else ''
 
     def kill(self) -> None:
-        """Kill the node, as in a crash, and wait for it."""
         self.ended = True
         self.process.kill()
         self.process.wait()

@@ -122,7 +122,6 @@ class Graph:
         return node
 
     def node(self, name: str) -> Node:
-        """Create a plain node in this process, spun by `spin_until`."""
         node: Node = self.add(Node, name)
         return node
 
@@ -210,8 +209,7 @@ class Graph:
 
         The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
         condition is checked after each event, which costs more CPU time. Raises `GraphError` on a
-        timeout, with the awaited event (`what`) and the last log line of each process, and if a
-        process of the graph has ended.
+        timeout, with the awaited event `what`, and if a process of the graph has ended.
         """
         deadline, last = time.monotonic() + timeout, sign()
         with DeferredSignals() as signals:

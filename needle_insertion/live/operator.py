@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.messages import listen_states, State, target_message
-from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
+from needle_insertion.live.requests import CONTROLLER, NODES, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile, steady_timer
 from needle_ros.calls_node import Calls
@@ -34,10 +34,9 @@ class RequestOutcome(NamedTuple):
 
 class Operator:
     """
-    Send requests to nodes of the suite, repeat them until they are answered, collect statuses.
+    Send requests to nodes of the suite, and repeat them until they are answered.
 
-    The owner of `node` spins it. `states` has the latest status of each node by its name without
-    namespace.
+    The owner of `node` spins it. `states` has the latest status of each node by its bare name.
     """
 
     def __init__(self, node: Node) -> None:
@@ -51,10 +50,9 @@ class Operator:
             PointStamped, contract.TARGET.name, profile(contract.TARGET.qos)
         )
         self._clients: dict[tuple[str, str], Client] = {}
-        for requests in REQUESTS.values():
-            for request in requests:
-                kind = Trigger if request.data is None else SetBool
-                self._client(kind, request.node, request.service)
+        for service, data in REQUESTS.values():
+            for name in NODES:
+                self._client(Trigger if data is None else SetBool, name, service)
         self.states = listen_states(node, self._on_state)
         steady_timer(node, _CHECK, self._repeat)
 
@@ -83,11 +81,7 @@ class Operator:
         return STEERING if STEERING in self.states else CONTROLLER
 
     def target(self, x: float, y: float, z: float) -> PendingRequest:
-        """
-        Send a target of the tip in ``needle_entry`` [m]; it is repeated until it has an answer.
-
-        Without the node `steering` only the depth y is used.
-        """
+        """Send a target in ``needle_entry`` [m], of which `controller` uses the depth y only."""
         stamp = nanoseconds(request_stamp(self._node))
         # A stamp identifies the request: simulated time may stand still.
         self._stamp = max(stamp, self._stamp + 1) if stamp else 0
@@ -99,25 +93,18 @@ class Operator:
 
     def ask(self, word: str) -> Future:
         """Call the services of a key of `REQUESTS`; the future has a `RequestOutcome`."""
-        ready = [
-            (request, client)
-            for request in REQUESTS[word]
-            if (client := self._clients[request.node, request.service]).service_is_ready()
-        ]
-        if not ready:
-            services = ' or '.join(f'{one.node}/{one.service}' for one in REQUESTS[word])
-            return _done(RequestOutcome(False, f'no node offers {services}'))
+        service, data = REQUESTS[word]
+        clients = {f'{name}/{service}': self._clients[name, service] for name in NODES}
+        request = Trigger.Request() if data is None else SetBool.Request(data=data)
+        answers = {
+            name: self._calls.call(client, request)
+            for name, client in clients.items()
+            if client.service_is_ready()
+        }
+        if not answers:
+            return _done(RequestOutcome(False, f'no node offers {" or ".join(clients)}'))
         return _gathered(
-            {
-                f'{request.node}/{request.service}': self._calls.call(
-                    client,
-                    Trigger.Request()
-                    if request.data is None
-                    else SetBool.Request(data=request.data),
-                )
-                for request, client in ready
-            },
-            lambda answer: RequestOutcome(answer.success, printable(answer.message)),
+            answers, lambda answer: RequestOutcome(answer.success, printable(answer.message))
         )
 
     def set(self, node: str, name: str, value: Any) -> Future:

@@ -6,7 +6,7 @@ from time import time_ns
 from typing import Final
 
 from needle_controller.hardware import Robot, STAMPS
-from needle_insertion.live.waiting import waiting
+from needle_insertion.graph.messages import waiting
 from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
@@ -103,7 +103,6 @@ class Readings:
         return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
     def reference_rests_at(self, target: float) -> bool:
-        """Return whether the reference rests at a target depth [m]."""
         reference = self.insertion(contract.REFERENCE)
         if reference is None:
             return False
@@ -111,7 +110,6 @@ class Readings:
         return abs(depth - target) < _SAME and abs(velocity) < _SAME
 
     def line(self) -> str:
-        """Return depth, velocity, force and tip deflection as one line of text."""
         words = []
         if (insertion := self.insertion()) is not None:
             words.append(f'depth {1e3 * insertion[0]:.2f} mm')

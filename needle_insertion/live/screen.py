@@ -43,7 +43,6 @@ class Screen:
                         sys.stdout.write('\n')
 
     def complete(self, words: Sequence[str]) -> None:
-        """Complete words with the tab key."""
 
         def complete(begin: str, number: int) -> str | None:
             found = [word for word in words if word.startswith(begin)]
@@ -70,14 +69,12 @@ class Screen:
             return error
 
     def ask(self) -> None:
-        """Request the next line."""
         self._clear()
         self._asked = True
         self._wanted.release()
 
     @property
     def answered(self) -> bool:
-        """Whether the requested line is available."""
         return not self._lines.empty()
 
     def take(self) -> str | None:

@@ -11,9 +11,9 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_controller.hardware import BY_TYPE, HardwareSettings, Robot
+from needle_insertion.graph.lockstep import activate_plant, start_nodes, WARM_UP, Witness
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import activate_plant, start_nodes, WARM_UP, Witness
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
@@ -96,10 +96,8 @@ def run(session: Session) -> int:
                 if not rests:
                     terminal.stop()
         # Nodes that move the needle end first, the recorder last: the bag is complete.
-        for name in _ENDING:
-            for process in processes:
-                if process.name == name:
-                    process.interrupt()
+        for process in sorted(processes, key=lambda one: _ENDING.index(one.name)):
+            process.interrupt()
     if 'recorder' in session.nodes:
         screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
     return 0

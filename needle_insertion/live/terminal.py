@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from functools import partial
 from math import inf
 import re
 import shlex
@@ -93,23 +94,20 @@ class Terminal:
         self._steers = False
 
     def begin(self, nodes: Collection[str]) -> None:
-        """
-        Wait until all nodes report their state, and controller and steering have measurements.
-
-        Earlier requests would be rejected. Raises `GraphError` on a timeout.
-        """
+        """Wait for states and measurements of the nodes: earlier requests would be rejected."""
         for name in nodes:
             self._state(name)
         for name, topic in _NEEDED:
             if name in nodes:
-                self._wait_for(name, topic)
+                accepted = partial(self._has_accepted, name, topic)
+                self._spin_until(accepted, f'{topic}, an input of {name}', _ANSWER)
         self._begun = True
 
-    def _wait_for(self, name: str, topic: str) -> None:
-        def has_accepted() -> bool:
-            return _has_accepted(self._state(name), topic)
-
-        self._spin_until(has_accepted, f'{topic}, an input of {name}', _ANSWER)
+    def _has_accepted(self, node: str, topic: str) -> bool:
+        status = self._state(node).status
+        if not isinstance(status, (ControllerStatus, SteeringStatus)):
+            return False
+        return topic in status.input and status.input[topic].accepted > 0
 
     @property
     def rests(self) -> bool:
@@ -299,11 +297,3 @@ class Terminal:
 def _unfit(word: str, given: Sequence[str]) -> ParameterError:
     takes, _ = WORDS[word]
     return ParameterError(f'{word} takes {takes or "nothing"}, got {" ".join(given) or "nothing"}')
-
-
-def _has_accepted(state: State, topic: str) -> bool:
-    """Return whether a node has accepted a measurement."""
-    status = state.status
-    if not isinstance(status, (ControllerStatus, SteeringStatus)):
-        return False
-    return topic in status.input and status.input[topic].accepted > 0

@@ -82,7 +82,6 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
 
 
 def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
-    """Read the parameters of a plant with their recording times [ns]."""
     found = []
     for received, message in messages:
         # Skip other texts, and other nodes.
@@ -128,11 +127,7 @@ class Rows(NamedTuple):
 
 
 class RecordedRun:
-    """
-    Run of a plant as recorded in a bag.
-
-    Raises `RecordingError` if a parameter is missing or not valid, or measurements are missing.
-    """
+    """Recorded run of a plant; `RecordingError` for invalid parameters or no measurements."""
 
     def __init__(
         self, path: Path, name: str, messages: Mapping[str, _Messages], losses: list[str]
@@ -256,7 +251,6 @@ class RecordedRun:
             yield self._newest(received) + 1, event
 
     def _missing(self, *, has_events: bool) -> Iterator[str]:
-        """Yield notes about missing information."""
         if not has_events:
             yield (
                 f'{self.name}/events is not in the bag: trajectories and changes of parameters '

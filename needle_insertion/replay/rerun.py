@@ -54,15 +54,20 @@ class TopicComparison:
     differing: int
     #: Largest difference, relative to the accepted difference, and in its unit.
     largest: float
-    difference: float
+    largest_difference: float
     #: Of the largest difference, '' if there is no difference.
     quantity: str
     unit: str
     first: dict[str, Any] | None  #: First difference beyond the tolerance.
 
     @property
+    def document(self) -> dict[str, Any]:
+        """Document for JSON."""
+        names = ('compared', 'differing', 'largest_difference', 'quantity', 'unit', 'verdict')
+        return {name.replace('_', ' '): getattr(self, name) for name in names}
+
+    @property
     def verdict(self) -> str:
-        """Verdict: identical, within tolerance or differs."""
         if self.differing:
             return 'differs'
         return 'within tolerance' if self.largest else 'identical'
@@ -108,7 +113,6 @@ class Rerun:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON."""
         recorded = self.recorded
         return {
             'bag': str(recorded.path),
@@ -117,17 +121,7 @@ class Rerun:
             'samples': len(recorded.numbers),
             'first sample': recorded.numbers[0],
             'verdict': self.verdict,
-            'topics': {
-                name: {
-                    'compared': topic.compared,
-                    'differing': topic.differing,
-                    'largest difference': topic.difference,
-                    'quantity': topic.quantity,
-                    'unit': topic.unit,
-                    'verdict': topic.verdict,
-                }
-                for name, topic in self.topics.items()
-            },
+            'topics': {name: topic.document for name, topic in self.topics.items()},
             'first difference': self.first,
             'reason': self.reason,
             'notes': self.notes,
@@ -176,7 +170,6 @@ class Rerun:
         return computed
 
     def _perform(self, plant: PlantRun, event: Event, number: int) -> PlantRun:
-        """Apply an event to the plant, and note it."""
         if event.kind in (CONFIGURED, TIME) and number == 1:
             return plant
         names = ', '.join(sorted(event.content))
@@ -190,7 +183,6 @@ class Rerun:
         return plant
 
     def _compare(self, name: str, computed: FloatArray, tolerance: float) -> TopicComparison:
-        """Compare the recorded messages of a topic with the computed values."""
         rows, quantities = self.recorded.rows[name], self.recorded.topics[name].quantities
         found = computed[rows.numbers]
         # Older versions of the plant did not publish all values.
@@ -219,7 +211,7 @@ class Rerun:
             compared=len(part),
             differing=len(differing),
             largest=largest,
-            difference=float(difference[row, column]),
+            largest_difference=float(difference[row, column]),
             quantity=quantities[column].name if largest else '',
             unit=quantities[column].unit if largest else '',
             first=first,
@@ -243,7 +235,6 @@ class Rerun:
         return np.asarray(tolerance * largest + (1.0 + 1e-6) * resolution)
 
     def _reason(self) -> str:
-        """Return the most probable reason of a difference."""
         recorded, start = self.recorded, self.recorded.numbers[0]
         simulated = recorded.constants.mode == 'simulation'
         differing = {name: topic.differing for name, topic in self.topics.items()}

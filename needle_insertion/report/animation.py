@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from markupsafe import Markup
-import numpy as np
+from needle_insertion.report.insertion import evenly
 
 #: Scripts: drawing (also used by `needle watch`), and player.
 _SCRIPTS: Final = ('needle.js', 'animation.js')
@@ -35,7 +35,10 @@ class Animation:
         """JSON data of the script, escaped so that it cannot close its HTML element."""
         frames = [{key: frame[key] for key in _DRAWN} for frame in self.frames]
         for frame in frames:
-            frame['needle'] = _thinned(frame['needle'])
+            frame['needle'] = [
+                [round(value, 5) for value in evenly(column, min(len(column), _POINTS))]
+                for column in frame['needle']
+            ]
         paths = [frame['path'] for frame in self.frames if frame['path']]
         # The last cut path contains all earlier paths.
         path = paths[-1] if paths else [[], [], []]
@@ -45,7 +48,6 @@ class Animation:
 
     @property
     def script(self) -> Markup:
-        """Script of the animation."""
         folder = Path(__file__).with_name('templates')
         parts = [(folder / name).read_text(encoding='utf-8') for name in _SCRIPTS]
         # Trusted: the scripts are part of this package.
@@ -56,10 +58,3 @@ class Animation:
         """SHA-256 source expression of the script for the content security policy."""
         made = sha256(self.script.encode()).digest()
         return f'sha256-{base64.b64encode(made).decode("ascii")}'
-
-
-def _thinned(line: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Reduce the points of a line, keeping the first and the last."""
-    count = len(line[0])
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _POINTS)).round().astype(int))
-    return [[round(column[k], 5) for k in chosen.tolist()] for column in line]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Content of pages as plain data: pictures, tables and sections."""
+"""Pictures of pages, and tables as files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,6 @@ class Picture:
 
     @cached_property
     def image(self) -> bytes:
-        """PNG data."""
         return png(self.figure)
 
     @property
@@ -56,29 +55,8 @@ class Picture:
 
     @property
     def width(self) -> int:
-        """Width [pixels]."""
         return int.from_bytes(self.image[16:20], 'big')
 
     @property
     def height(self) -> int:
-        """Height [pixels]."""
         return int.from_bytes(self.image[20:24], 'big')
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Grid:
-    """Table; the first cell of a row is its name."""
-
-    caption: str
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportSection:
-    """Heading with paragraphs of plain text, tables and pictures."""
-
-    title: str
-    paragraphs: tuple[str, ...]
-    tables: tuple[Grid, ...] = ()
-    pictures: tuple[Picture, ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import StringIO
 from itertools import product
 from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
@@ -43,7 +44,7 @@ _PANELS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class OperatingPoint:
     """Analysis at an insertion depth [m], tip deflection [m], velocity [m/s] and force [N]."""
 
@@ -67,7 +68,6 @@ class OperatingPoint:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON, in SI units."""
         system, found = self.system, self.result
         return {
             'depth': self.depth,
@@ -111,25 +111,12 @@ def analyze_points(
     force: float = 0.0,
     sliding: str | None = None,
 ) -> list[OperatingPoint]:
-    """
-    Analyze combinations of depth [m], deflection [m] and velocity [m/s], which varies fastest.
-
-    ``force`` [N] inserts; ``sliding`` is as in `linearize`. `NeedleError` for an invalid point.
-    """
+    """Analyze combinations of depth [m], deflection [m] and velocity [m/s], force in N."""
     points = []
     for depth, deflection, speed in product(depths, deflections, speeds):
         state = operating_point(model, depth, deflection, speed)
         system = linearize(model, state, force, sliding=sliding)
-        points.append(
-            OperatingPoint(
-                depth=depth,
-                deflection=deflection,
-                speed=speed,
-                force=force,
-                system=system,
-                result=analyze(system),
-            )
-        )
+        points.append(OperatingPoint(depth, deflection, speed, force, system, analyze(system)))
     return points
 
 
@@ -159,8 +146,8 @@ def draw_map(found: ControllabilityMap) -> Figure:
     figure = Figure(figsize=(13.0, 4.6), layout='constrained')
     order = 2 * (2 + parameters.modes)
     lost = found.rank < order
-    panels = zip(figure.subplots(1, 3, sharey=True), _PANELS, strict=True)
-    for axes, (name, title, unit) in panels:
+    panels = figure.subplots(1, 3, sharey=True)
+    for axes, (name, title, unit) in zip(panels, _PANELS, strict=True):
         shown = np.ma.masked_array(getattr(found, name), lost).T
         axes.set_facecolor('0.75')
         mesh = axes.pcolormesh(
@@ -185,15 +172,11 @@ def write_map(folder: Path, found: ControllabilityMap) -> list[Path]:
     """Write a map as CSV and PNG to a folder; return the files."""
     depths, deflections = np.meshgrid(found.depths, found.deflections, indexing='ij')
     columns = (depths, deflections, *(getattr(found, name) for name in _MAPPED))
-    lines = [','.join(('depth_m', 'tip_deflection_m', *_MAPPED))]
-    lines += [
-        ','.join(f'{value:.6g}' for value in line)
-        for line in zip(*(column.flat for column in columns), strict=True)
-    ]
-    contents = {
-        'controllability.csv': '\n'.join([*lines, '']).encode(),
-        'controllability.png': png(draw_map(found)),
-    }
-    for name, content in contents.items():
-        write_whole(folder / name, content)
-    return [folder / name for name in contents]
+    text = StringIO()
+    heads = ','.join(('depth_m', 'tip_deflection_m', *_MAPPED))
+    rows = np.column_stack([column.ravel() for column in columns])
+    np.savetxt(text, rows, '%.6g', ',', header=heads, comments='')
+    table, drawing = folder / 'controllability.csv', folder / 'controllability.png'
+    write_whole(table, text.getvalue().encode())
+    write_whole(drawing, png(draw_map(found)))
+    return [table, drawing]

@@ -218,12 +218,12 @@ def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
     colors = colormaps['twilight_shifted'](np.linspace(0.1, 0.9, presses.direction.max() + 1))
     for index, color in enumerate(colors):
         of = presses.direction == index
-        way = presses.force[of].mean(axis=0)
+        direction = presses.force[of].mean(axis=0)
         order = np.argsort(force[of])
         above.plot(
             1e3 * np.append(0.0, along[of][order]), np.append(0.0, force[of][order]), 'o-',
             color=color, markersize=4.0, linewidth=1.0,
-            label=f'{round(np.degrees(np.arctan2(way[1], way[0]))) % 360}°',
+            label=f'{round(np.degrees(np.arctan2(direction[1], direction[0]))) % 360}°',
         )  # fmt: skip
         below.plot(*1e3 * presses.displacement[of].T, 'o', color=color, markersize=4.0)
     _ellipses(below, estimate)
@@ -243,8 +243,8 @@ def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
     for one, name, turned, style in zip(
         level.principal, ('stiffest', 'softest'), (0.0, np.pi / 2.0), ('-', '--'), strict=True
     ):
-        way = level.angle.value + turned
-        reach = 1e3 * level.force / one.value * np.array([np.cos(way), np.sin(way)])
+        direction = level.angle.value + turned
+        reach = 1e3 * level.force / one.value * np.array([np.cos(direction), np.sin(direction)])
         axes.plot(
             *np.transpose([-reach, reach]), style, color=_FIT, linewidth=1.2,
             label=f'{name}: {one.value:.0f} N/m',
@@ -276,7 +276,6 @@ def spread_figure(
 
 
 def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Label the axes with typeset symbols, and add a grid."""
     axes.set(xlabel=_typeset(xlabel), ylabel=_typeset(ylabel))
     axes.grid(visible=True, alpha=0.25)
     axes.spines[['top', 'right']].set_visible(False)
@@ -288,7 +287,6 @@ def _typeset(words: str) -> str:
 
 
 def _legend_above(axes: Axes, **options: Any) -> None:
-    """Put the legend above the plot."""
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False,
         borderaxespad=0.2, handletextpad=0.5, **options,
@@ -296,6 +294,5 @@ def _legend_above(axes: Axes, **options: Any) -> None:
 
 
 def _thinned(*signals: FloatArray, most: int = _MOST_POINTS) -> list[FloatArray]:
-    """Reduce the number of samples for drawing."""
     step = max(1, len(signals[0]) // most)
     return [signal[::step] for signal in signals]

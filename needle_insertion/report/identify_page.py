@@ -59,12 +59,17 @@ def write_identified_page(
         name, content = 'friction.html', _friction_content(summary, label)
     else:
         name, content = 'stiffness.html', _stiffness_content(summary, label)
+    drawn = content.pop('figures')
     write_page(
         folder / name,
         name,
+        [Picture(key, '', figure) for key, figure in drawn.items()],
         origin=origin,
         warnings=(short, full if len(full) > len(short) else []),
         name=label[content['shown'].name],
+        recordings=_counted(len(estimates), 'recording'),
+        drawn=_drawn(len(estimates)),
+        predictions=prediction_lines(summary),
         **content,
     )
     return folder / name
@@ -76,11 +81,15 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
     main = [one for one in summary.statistics if one.name in TABLE_1]
     shown = estimates[_typical(one[summary.statistics[0].name].value for one in estimates)]
     values = model_parameters(summary.statistics)
+    names = [label[one.name] for one in estimates]
+    parameters = list(zip(names, map(friction_parameters, estimates), strict=True))
     return {
-        'title': 'Friction between needle and tissue',
-        'introduction': f'Identified from {_counted(len(estimates), "recording")} of force and '
-        'motion of the needle base by regression on F = mu_s sgn(v) + mu_v v, equation (15).',
-        'pictures': _friction_pictures(label, means, shown, estimates),
+        'figures': {
+            'friction_data': figures.friction_data(shown),
+            'friction_residuals': figures.friction_residuals(shown),
+            'friction_each': figures.friction_each(estimates[:_MOST_EACH], names[:_MOST_EACH]),
+            'friction_spread': figures.spread_figure(means, parameters),
+        },
         'cards': [_card(one) for one in main or summary.statistics[:2]],
         'mean_rows': [(*mean_row(one), _published(one)) for one in means],
         'mean_heads': (*MEAN_HEADS, 'Table 1, mean ± STD'),
@@ -92,7 +101,6 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
         ],
         'heads': ('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
         'puncture_rows': puncture_rows(summary),
-        'predictions': prediction_lines(summary),
         'puncture_heads': PUNCTURE_HEADS,
         'values': values,
         'live': [
@@ -126,66 +134,21 @@ def _term_rows(
     ]
 
 
-def _friction_pictures(
-    label: Mapping[str, str],
-    means: Sequence[Statistic],
-    shown: FrictionEstimate,
-    estimates: Sequence[FrictionEstimate],
-) -> list[Picture]:
-    name = label[shown.name]
-    rows = [(label[one.name], friction_parameters(one)) for one in estimates]
-    return [
-        Picture(
-            'friction_data',
-            f'{name}, with mu_s nearest to the median: force over time and against velocity '
-            f'after the low-pass filter, and the fit of {", ".join(shown.terms)} to the samples '
-            f'in steady motion. {np.count_nonzero(~shown.fit.used)} of {len(shown.fit.used)} '
-            'samples are excluded: the needle rests, accelerates or has just turned.',
-            figures.friction_data(shown),
-            f'Two plots of {name}. The force over time follows the strokes of the needle, with '
-            'the fitted force superimposed. Against velocity the force jumps at zero by 2 mu_s '
-            'and rises with slope mu_v.',
-        ),
-        Picture(
-            'friction_residuals',
-            f'{name}: measured minus fitted force, over time, against velocity, as histogram, '
-            'separately for both directions.',
-            figures.friction_residuals(shown),
-            f'Three plots of the residual force of {name}, which has a root mean square of '
-            f'{1e3 * shown.residual:.2g} mN. A good fit leaves noise around zero without a trend.',
-        ),
-        Picture(
-            'friction_each',
-            'Force against velocity of each recording, and its fit. Crosses are samples that are '
-            'excluded from the fit.',
-            figures.friction_each(
-                estimates[:_MOST_EACH], [label[one.name] for one in estimates[:_MOST_EACH]]
-            ),
-            f'Small plots of {_shown_of(len(estimates))}: the force jumps at zero velocity and '
-            'rises linearly.',
-        ),
-        Picture(
-            'friction_spread',
-            'Each recording with its 95 % interval. The line and the band are the mean and its '
-            'interval.',
-            figures.spread_figure(means, rows),
-            f'Dot plots of each parameter over {len(rows)} recordings with intervals.',
-        ),
-    ]
-
-
 def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> dict[str, Any]:
     estimates, levels, result = summary.estimates, summary.levels, summary.tissue_stiffness
     force = next(level.force for level in levels if level[result.name] is result)
     found = [_tissue_stiffness(one, force) for one in estimates]
     shown = estimates[_typical(one.value for one in found)]
     springs = [level.is_spring for estimate in estimates for level in estimate.levels]
-    rows = [(label[one.name], {result.name: k}) for one, k in zip(estimates, found, strict=True)]
+    names = [label[one.name] for one in estimates]
+    rows = [(name, {result.name: k}) for name, k in zip(names, found, strict=True)]
     return {
-        'title': 'Stiffness of the tissue',
-        'introduction': f'Identified from {_counted(len(estimates), "recording")} of presses in '
-        'the plane of deflection by F = K x, with the matrix K of Table 2 of the paper.',
-        'pictures': _stiffness_pictures(summary, force, rows, shown, label[shown.name]),
+        'figures': {
+            'stiffness_levels': figures.stiffness_levels(summary),
+            'stiffness_presses': figures.stiffness_presses(shown),
+            'stiffness_each': figures.stiffness_each(estimates[:_MOST_EACH], names[:_MOST_EACH]),
+            'stiffness_spread': figures.spread_figure([result], rows),
+        },
         'cards': [
             _card(result),
             (
@@ -194,7 +157,7 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
                 'tested by the curl of the force; a spring has a symmetric matrix',
             ),
         ],
-        'predictions': prediction_lines(summary),
+        'force': force,
         'places': _counted(len(estimates), 'place'),
         'heads': ('force', *_ENTRY_HEADS),
         'mean_rows': [
@@ -242,49 +205,6 @@ def _spring_row(level: LevelEstimate) -> tuple[str, ...]:
     )
 
 
-def _stiffness_pictures(
-    summary: StiffnessSummary,
-    force: float,
-    rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]],
-    shown: StiffnessEstimate,
-    name: str,
-) -> list[Picture]:
-    return [
-        Picture(
-            'stiffness_levels',
-            'Entries of the matrix against the force, with 95 % intervals of the mean. Small dots '
-            'are places. Gray is Table 2, mean and STD.',
-            figures.stiffness_levels(summary),
-            'Four plots of the entries of the stiffness matrix against force, with Table 2.',
-        ),
-        Picture(
-            'stiffness_presses',
-            f'{name}, with k_a nearest to the median. Above: force against displacement along '
-            'each direction. Below: rest positions of the end-effector, the fitted ellipse of '
-            'each force level, and the principal axes at '
-            'the largest force.',
-            figures.stiffness_presses(shown),
-            f'Two plots of {name}. Force grows with displacement in each direction. The rest '
-            'positions of a level of force lie on an ellipse.',
-        ),
-        Picture(
-            'stiffness_each',
-            'Rest positions of the end-effector at each place, and the fitted ellipses.',
-            figures.stiffness_each(
-                summary.estimates[:_MOST_EACH], [label for label, _ in rows][:_MOST_EACH]
-            ),
-            f'Small plots of {_shown_of(len(rows))}: points near ellipses.',
-        ),
-        Picture(
-            'stiffness_spread',
-            f'k_a of each place at {force:.2f} N with its 95 % interval. The line and the band '
-            'are the mean and its interval.',
-            figures.spread_figure([summary.tissue_stiffness], rows),
-            f'Dot plot of k_a over {_counted(len(rows), "place")} with intervals.',
-        ),
-    ]
-
-
 # Functions of both pages.
 
 
@@ -307,7 +227,7 @@ def _card(one: Statistic) -> tuple[str, str, str]:
     return what, rounded(one.mean, one.error, one.unit), note
 
 
-def _shown_of(number: int) -> str:
+def _drawn(number: int) -> str:
     shown = _counted(min(number, _MOST_EACH), 'recording')
     return shown if number <= _MOST_EACH else f'the first {shown} of {number}'
 

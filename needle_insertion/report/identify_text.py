@@ -38,10 +38,20 @@ def label_of(one: ParameterEstimate | Statistic) -> str:
     return one.symbol if one.unit == '1' else f'{one.symbol} [{one.unit}]'
 
 
+def title_of(one: ParameterEstimate | Statistic) -> str:
+    """Return name, symbol and unit, such as ``Coulomb friction mu_s [N]``."""
+    return f'{one.name.replace("_", " ").capitalize()} {label_of(one)}'
+
+
+def interval_of(one: ParameterEstimate) -> str:
+    """Return the interval of a parameter; '' if the data do not determine it."""
+    return between(one.interval) if one.determined else ''
+
+
 def mean_row(one: Statistic) -> tuple[str, ...]:
     """Return a row of a table of means, with the heads `MEAN_HEADS`."""
     return (
-        f'{one.name.replace("_", " ").capitalize()} {label_of(one)}',
+        title_of(one),
         measured(one.mean, one.error),
         between(one.interval) if isfinite(one.mean) else '',
         '' if one.deviation is None else spread(one.deviation),
@@ -86,7 +96,6 @@ def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> l
 
 
 def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
-    """Return tables of identified parameters for the terminal."""
     if isinstance(summary, FrictionSummary):
         return _friction_text(summary)
     return _stiffness_text(summary)

@@ -36,14 +36,14 @@ class InsertionRecord:
     """Samples of an insertion, with needle shapes."""
 
     def __init__(self, one: Insertion) -> None:
-        self._one = one
+        self.one = one
         self._rows: list[list[float]] = []
         self._shapes: list[NeedleShape] = []
         self.take(0.0)
 
     def take(self, force: float) -> None:
         """Record a sample; ``force`` is the mean axial force since the previous sample [N]."""
-        one = self._one
+        one = self.one
         (guide_x, guide_z), (tip_x, _, tip_z) = one.needle.guide, one.needle.tip
         force_x, force_z, *torques = one.wrench
         self._rows.append(
@@ -60,19 +60,9 @@ class InsertionRecord:
         return np.array(self._rows)
 
     @property
-    def path(self) -> NeedlePath:
-        """Path cut by the tip."""
-        return self._one.needle.path
-
-    @property
     def shapes(self) -> list[NeedleShape]:
         """Needle shapes at evenly spaced samples, including the last."""
         return evenly(self._shapes, _DRAWN + 1)[1:]
-
-    @property
-    def punctured(self) -> int:
-        """Number of punctured membranes."""
-        return sum(self._one.punctured)
 
 
 def evenly(items: Sequence[_Item], count: int) -> list[_Item]:
@@ -82,9 +72,7 @@ def evenly(items: Sequence[_Item], count: int) -> list[_Item]:
 
 
 def summary(record: InsertionRecord) -> dict[str, float]:
-    """Return the main metrics of an insertion, by name with unit."""
-    rows = record.table
-    column = dict(zip(COLUMNS, rows.T, strict=True))
+    column = dict(zip(COLUMNS, record.table.T, strict=True))
     return {
         'duration [s]': float(column['time [s]'][-1]),
         'depth at the end [m]': float(column['depth [m]'][-1]),
@@ -95,17 +83,17 @@ def summary(record: InsertionRecord) -> dict[str, float]:
         'largest lateral force on the guide [N]': float(
             np.hypot(column['force_x [N]'], column['force_z [N]']).max()
         ),
-        'membranes punctured': float(record.punctured),
+        'membranes punctured': float(sum(record.one.punctured)),
     }
 
 
 def write(path: Path, record: InsertionRecord) -> None:
-    """Write an insertion to a ``.csv`` or ``.png`` file."""
     if path.suffix == '.csv':
         write_whole(path, csv_table(COLUMNS, record.table))
     else:
         shapes = [np.insert(one.deflections, 1, one.depths, axis=1) for one in record.shapes]
-        cut = np.insert(record.path.deflections, 1, record.path.depths, axis=1)
+        cut_path = record.one.needle.path
+        cut = np.insert(cut_path.deflections, 1, cut_path.depths, axis=1)
         write_whole(path, png(draw_needle(shapes, cut)))
 
 
@@ -135,16 +123,9 @@ def draw_needle(
     for k, axes, limit in zip((0, 2), planes, limits.tolist(), strict=True):
         axes.axvspan(0.0, end, color='#f3d9d0', lw=0)
         axes.axvline(0.0, color='#b07060', lw=2.0)
-        for needle in needles:
-            last = needle is needles[-1]
-            axes.plot(
-                1e3 * needle[:, 1],
-                1e3 * needle[:, k],
-                color='tab:blue',
-                lw=2.0 if last else 0.8,
-                alpha=1.0 if last else 0.5,
-                label='needle' if last else None,
-            )
+        for needle in needles[:-1]:
+            axes.plot(*1e3 * needle[:, [1, k]].T, color='tab:blue', lw=0.8, alpha=0.5)
+        axes.plot(*1e3 * needles[-1][:, [1, k]].T, color='tab:blue', lw=2.0, label='needle')
         axes.plot(1e3 * path[:, 1], 1e3 * path[:, k], 'k--', lw=0.8, label='cut path')
         if beside is not None:
             axes.plot(1e3 * beside[:, 1], 1e3 * beside[:, k], color='gray', label='open loop')
@@ -165,17 +146,9 @@ def draw_reach(reach: Reach, target: FloatArray) -> Figure:
     figure = Figure(figsize=(6.0, 6.0), layout='constrained')
     axes = figure.subplots()
     for middle, size, weight in zip(*reach, strict=True):
-        low = 1e3 * (middle - size)
-        shade = min(1.0, 2.0 * weight)
-        axes.add_patch(
-            Rectangle(
-                (low.real, low.imag),
-                2e3 * size.real,
-                2e3 * size.imag,
-                color='tab:blue',
-                alpha=shade,
-            )
-        )
+        low, span = 1e3 * (middle - size), 2e3 * size
+        style = {'color': 'tab:blue', 'alpha': min(1.0, 2.0 * weight)}
+        axes.add_patch(Rectangle((low.real, low.imag), span.real, span.imag, **style))
     axes.plot(*(1e3 * target), 'rx', ms=10.0, mew=2.0, label='target')
     axes.plot(0.0, 0.0, 'k+', ms=10.0, label='axis of the guide')
     axes.set(xlabel='x [mm]', ylabel='z [mm]', title='Reachable tip positions', aspect='equal')

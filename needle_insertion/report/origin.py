@@ -40,14 +40,12 @@ class Origin:
 
     @property
     def failed(self) -> list[str]:
-        """Unusable recordings with reasons."""
         return [
             reason if name in reason else f'{name}: {reason}' for name, reason in self.failures
         ]
 
     @property
     def losses(self) -> list[str]:
-        """Lost or corrected data, as sentences."""
         return [f'{name}: {words}' for name, words in self.lost]
 
     @property
@@ -107,16 +105,16 @@ def identify_all(
 ) -> tuple[list[Any], Origin]:
     """Identify recordings except copies and unusable ones; return estimates and origin."""
     estimates, sources, failures, copies = [], [], [], []
-    seen: dict[bytes, str] = {}
+    known: dict[bytes, str] = {}
     with ProgressLine('identification', brief=True) as show:
         for number, bag in enumerate(bags, 1):
             show(f'recording {number} of {len(bags)}')
             try:
                 recording = read(bag)
-                if recording.digest in seen:
-                    copies.append((recording.name, seen[recording.digest]))
+                if recording.digest in known:
+                    copies.append((recording.name, known[recording.digest]))
                     continue
-                seen[recording.digest] = recording.name
+                known[recording.digest] = recording.name
                 estimates.append(identify(recording))
             except (NeedleError, OSError) as error:
                 failures.append((str(bag), str(error)))

@@ -13,11 +13,10 @@ import re
 from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
-from markupsafe import Markup
+from markupsafe import escape, Markup
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import made
-from needle_insertion.report.symbols import symbols
 from needle_ros.files import write_whole
 
 #: Largest length of a cell with a number; longer text is for example a checksum.
@@ -41,6 +40,34 @@ _VERDICTS: Final = {
     'DOES NOT HOLD': 'FAIL',
 }
 
+#: Symbols in plain text, such as mu_s or q1_dot.
+_GREEK: Final = {'mu': 'μ', 'phi': 'φ', 'tau': 'τ', 'theta': 'θ', 'rho': 'ρ', 'omega': 'ω'}
+_SYMBOL: Final = re.compile(
+    rf'\b({"|".join(_GREEK)}|q(?=\d)|[kfIqcde](?=_))(\d?)(?:_(d?dot))?(?:_(\w{{1,3}}))?\b'
+)
+#: Combining dots, which follow their letter.
+_DOTS: Final = {None: '', 'dot': '\u0307', 'ddot': '\u0308'}
+_POWER: Final = re.compile(r'\^(?:([2-4])(?![\d/])|(-?\d+(?:/\d+)?|T\b))')
+_MICROMETERS: Final = re.compile(r'(?<=\d )um\b')
+
+
+def _symbols(words: str) -> Markup:
+    """Escape a text and typeset its symbols, powers and micrometers."""
+    # `escape` makes the text safe: the substitutions insert only tags, letters and digits.
+    text = _POWER.sub(_power, _SYMBOL.sub(_symbol, str(escape(words))))
+    return Markup(_MICROMETERS.sub('μm', text))  # noqa: S704
+
+
+def _symbol(found: re.Match[str]) -> str:
+    letter, number, dots, index = found.groups()
+    below = f'{number}{"," if number and index else ""}{index or ""}'
+    subscript = f'<sub>{below}</sub>' if below else ''
+    return f'<i>{_GREEK.get(letter, letter)}{_DOTS[dots]}</i>{subscript}'
+
+
+def _power(found: re.Match[str]) -> str:
+    return '⁰¹²³⁴'[int(found[1])] if found[1] else f'<sup>{found[2]}</sup>'
+
 
 def _kind(cell: str) -> str:
     """Return the style class of a table cell, or ''."""
@@ -61,7 +88,6 @@ def _layout(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def _anchor(words: str) -> str:
-    """Return the anchor of a heading."""
     return re.sub(r'\W+', '-', words.lower()).strip('-')
 
 
@@ -87,7 +113,7 @@ TEMPLATES: Final = Environment(
     lstrip_blocks=True,
 )
 TEMPLATES.filters.update(
-    symbols=symbols,
+    symbols=_symbols,
     kind=_kind,
     anchor=_anchor,
     contents=_contents,

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the page of a study."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import ceil, floor, isfinite, log10, nan, sqrt
 from pathlib import Path
 from typing import Final
 
 from matplotlib.figure import Figure as Drawing
 from needle_dynamics import FloatArray
-from needle_insertion.report.content import Grid, Picture, ReportSection
+from needle_insertion.report.content import Picture
 from needle_insertion.report.page import write_page
 from needle_study.engine import Results
 from needle_study.scenario import Metric
@@ -42,8 +42,6 @@ _SHOWN: Final[Mapping[str, tuple[str, float]]] = {
 #: Most samples in quantiles, shares and pictures: bounds the memory of the page.
 _MOST: Final = 2**17
 
-_MISSING: Final = 'Samples without a value of a metric are excluded from it.'
-
 _WORST: Final = 10  #: number of worst samples in the list
 
 
@@ -71,58 +69,6 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     of_bad = {name: picked(table, name, bad) for name in listed}
     units = {name: study.scenario.variables[name].unit for name in drawn}
     units[main] = metrics[main].unit
-    limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
-    sections = [
-        _section(
-            'Probabilities',
-            ('95 % intervals by the method of Wilson.', _MISSING),
-            ('metric', 'probability', '95 % interval', 'samples', 'meaning'),
-            [
-                (name, *_rounded(one, '%'), str(one.samples), metrics[name].meaning)
-                for name, one in probabilities.items()
-                if np.isfinite(one.value)
-            ],
-        ),
-        _section(
-            'Quantiles',
-            ('With distribution-free 95 % intervals.', _MISSING, *limited),
-            ('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
-            quantiles,
-            pictures=(_distribution(main, metrics[main], values),),
-        ),
-    ]
-    if drawn:
-        sections.append(
-            _section(
-                'Sensitivity',
-                (
-                    f'Fraction of the variance of {main} explained by each variable alone.',
-                    'The remainder to 100 % is noise, and interactions of variables.',
-                    'Correlated variables share a part of their fractions.',
-                    *limited,
-                ),
-                ('variable', main, 'meaning'),
-                [
-                    (name, _share(shares[name]), study.scenario.variables[name].meaning)
-                    for name in order
-                ],
-                'Shares of the variance',
-                _map(main, metrics[main], values, most, study),
-            )
-        )
-    sections.append(
-        _section(
-            'Worst samples',
-            ('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
-            ('sample', *(_head(name, units[name]) for name in listed)),
-            [
-                (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
-                for place, number in enumerate(bad)
-            ],
-            f'Samples with the largest {main}',
-        )
-    )
-    pictures = [one for section in sections for one in section.pictures]
     hit = probabilities.get('hit')
     cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
     if hit is not None:
@@ -131,30 +77,34 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     value, ends = _rounded(quantile(values, 0.5), units[main])
     unit, _ = _shown(units[main])
     cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
+    pictures = [_distribution(main, metrics[main], values)]
+    if drawn:
+        pictures += _map(main, metrics[main], values, most, study)
     write_page(
         path,
         'study.html',
         pictures,
-        title='Study',
-        introduction='Simulated insertions of a population of needles with uncertain parameters.',
         cards=cards,
-        sections=sections,
+        main=main,
+        limit=_MOST if study.samples > _MOST else 0,
+        probabilities=[
+            (name, *_rounded(one, '%'), str(one.samples), metrics[name].meaning)
+            for name, one in probabilities.items()
+            if np.isfinite(one.value)
+        ],
+        quantile_heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
+        quantiles=quantiles,
+        shares=[
+            (name, _share(shares[name]), study.scenario.variables[name].meaning) for name in order
+        ],
+        worst_heads=('sample', *(_head(name, units[name]) for name in listed)),
+        worst=[
+            (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
+            for place, number in enumerate(bad)
+        ],
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
     return cards
-
-
-def _section(
-    title: str,
-    paragraphs: tuple[str, ...],
-    heads: tuple[str, ...],
-    rows: Sequence[tuple[str, ...]],
-    caption: str = '',
-    pictures: tuple[Picture, ...] = (),
-) -> ReportSection:
-    """Return a section with one table; its caption is the title unless given."""
-    grid = Grid(caption=caption or title, heads=heads, rows=tuple(rows))
-    return ReportSection(title=title, paragraphs=paragraphs, tables=(grid,), pictures=pictures)
 
 
 def _shown(unit: str) -> tuple[str, float]:
@@ -178,14 +128,8 @@ def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
     form = f'.{min(9, max(1, 1 - floor(log10(wide))))}f' if wide > 0.0 else '.4g'
     sign = unit if unit == '%' else ''
     ends = [f'{end:{form}}{sign}' for end in (low, high) if isfinite(end)]
-    match isfinite(low), isfinite(high):
-        case True, True:
-            return f'{value:{form}}{sign}', ' to '.join(ends)
-        case True, False:
-            return f'{value:{form}}{sign}', f'≥ {ends[0]}'
-        case False, True:
-            return f'{value:{form}}{sign}', f'≤ {ends[0]}'
-    return f'{value:{form}}{sign}', 'too few samples'
+    bound = '' if len(ends) == 2 else '≥ ' if isfinite(low) else '≤ '
+    return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else 'too few samples'
 
 
 def _share(part: float) -> str:
@@ -213,17 +157,17 @@ def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
 
 def _map(
     name: str, figure: Metric, values: FloatArray, over: dict[str, FloatArray], study: Study
-) -> tuple[Picture, ...]:
+) -> list[Picture]:
     """Draw the median of a metric over two variables, if both vary."""
     if len(over) < 2:
-        return ()
+        return []
     inside = np.isfinite(values)
     count = max(1, min(_CELLS, floor(sqrt(inside.sum() / _MEAN))))
     heads, edges, cells = list[str](), list[FloatArray](), np.zeros(len(values), dtype=np.int16)
     for one, of in over.items():
         low, high = np.quantile(of, [0.005, 0.995])
         if low == high or not inside.any():
-            return ()
+            return []
         at = np.linspace(low, high, count + 1)
         # The last edge belongs to the last cell.
         place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
@@ -243,4 +187,4 @@ def _map(
     drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
     axes.set(xlabel=heads[0], ylabel=heads[1])
     words = f'Median {name} over the two most influential variables. White: too few samples.'
-    return (Picture('map', words, drawing),)
+    return [Picture('map', words, drawing)]

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Format tables and checks as text for the terminal."""
+"""Format tables and paragraphs as text for the terminal."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 import re
 from textwrap import fill, wrap
@@ -43,7 +42,6 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def filled(text: str) -> str:
-    """Wrap a paragraph to the width of a table."""
     return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
@@ -72,21 +70,3 @@ def _folded(cell: str, width: int) -> list[str]:
 
 def _total(widths: Sequence[int]) -> int:
     return sum(widths) + 2 * (len(widths) - 1)
-
-
-CHECK_HEADS: Final = ('check', 'expected', 'found', 'verdict')  #: heads of the rows of `Check.row`
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """Check of a quantity: expected and actual value with units, and verdict."""
-
-    what: str
-    wanted: str
-    found: str
-    passed: bool
-
-    @property
-    def row(self) -> tuple[str, str, str, str]:
-        """Cells of a table, with the verdict 'pass' or 'FAIL'."""
-        return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'

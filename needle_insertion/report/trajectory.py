@@ -27,7 +27,6 @@ _SOON: Final = 0.02
 
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
-    """Return the main metrics of a trajectory, by name with unit."""
     model = NeedleModel(trajectory.parameters)
     states, tips = trajectory.states, trajectory.tip_deflection
     at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]
@@ -77,7 +76,10 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
 def write(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a ``.csv`` or ``.png`` file, or as a bag to a new folder."""
     if path.suffix == '.csv':
-        write_whole(path, _csv(trajectory))
+        names = NeedleModel(trajectory.parameters).coordinate_names
+        heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
+        columns = (trajectory.time, trajectory.states, trajectory.tip_deflection)
+        write_whole(path, csv_table(heads, np.column_stack(columns)))
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
@@ -88,16 +90,7 @@ def write(path: Path, trajectory: Trajectory) -> None:
             _write_bag(bag, trajectory)
 
 
-def _csv(trajectory: Trajectory) -> bytes:
-    """Return time, state and tip deflection of each sample, in SI units."""
-    names = NeedleModel(trajectory.parameters).coordinate_names
-    heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
-    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
-    return csv_table(heads, rows)
-
-
 def _figure(trajectory: Trajectory) -> Figure:
-    """Draw the trajectory, with the time at which the hub reaches the skin."""
     from matplotlib.figure import Figure
 
     result = Figure(figsize=(9.0, 9.0), layout='constrained')
@@ -109,7 +102,6 @@ def _figure(trajectory: Trajectory) -> Figure:
 
 
 def _write_bag(bag: BagWriter, trajectory: Trajectory) -> None:
-    """Write the topics of the plant, stamped with the simulated time."""
     states, depths, tips = trajectory.states, trajectory.depth, trajectory.tip_deflection
     m = states.shape[1] // 2
     forces = np.append(trajectory.forces, trajectory.forces[-1])

@@ -10,7 +10,9 @@ declares, do not verify checksums, send outdated data, and print tracebacks.
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from errno import EADDRINUSE, EINPROGRESS
+from ipaddress import AddressValueError, IPv4Address
 import os
 import select
 import socket
@@ -18,9 +20,9 @@ from time import monotonic
 from typing import Final
 
 from needle_insertion.slicer.frames import Frame, Frames
-from needle_insertion.slicer.settings import LinkSettings
-from needle_ros.errors import MessageError
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.settings import check_constants, choice, constant, text
 
 _RETRY: Final = 1.0  #: time between attempts to listen or to connect [s]
 _PATIENCE: Final = 5.0  #: timeout of a peer that accepts no byte [s]
@@ -34,7 +36,33 @@ _MOST_WAITING: Final = 1 << 18
 _SYSTEM_BUFFER: Final = 1 << 16
 
 #: Largest number of additional peers that are rejected in a call of `poll`.
-_MOST_STRANGERS: Final = 8
+_MOST_REJECTED: Final = 8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSettings:
+    """Role and address of the connection, and the limit of targets."""
+
+    role: str = choice('server', ('server', 'client'), 'the server waits, the client connects')
+    host: str = text(
+        '127.0.0.1', 'IPv4 address: as server, address of this machine to listen on (0.0.0.0: all '
+        'addresses); as client, address of the peer',
+    )  # fmt: skip
+    port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0, whole=True)
+    reach: float = constant(
+        0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        try:
+            # A name lookup can block.
+            IPv4Address(self.host)
+        except AddressValueError as error:
+            raise ParameterError(
+                f'host must be an IPv4 address such as 127.0.0.1, got {self.host!r}'
+            ) from error
+        object.__setattr__(self, 'port', int(self.port))
 
 
 class Connection:
@@ -48,7 +76,7 @@ class Connection:
         steady: Callable[[], float] = monotonic,
     ) -> None:
         #: Address of the peer, '' without a connection; reason why no connection is possible.
-        self.peer = self.complaint = ''
+        self.peer = self.error = ''
         #: Number of messages that were dropped because the peer reads too slowly.
         self.left_out = 0
         self._settings, self._wanted = settings, wanted
@@ -72,7 +100,7 @@ class Connection:
         if self.peer:
             return f'connected with {self.peer}'
         verb = 'waits for a peer on' if self._settings.role == 'server' else 'tries to connect to'
-        return self.complaint or f'{verb} {self.place}'
+        return self.error or f'{verb} {self.place}'
 
     def poll(self) -> list[Frame]:
         """Restore the connection if necessary, send queued data, and return received messages."""
@@ -102,11 +130,9 @@ class Connection:
         return True
 
     def close(self) -> None:
-        """Close the connection and the listening socket."""
-        for one in (self._socket, self._listener):
-            if one is not None:
-                one.close()
-        self._forget()
+        self._drop()
+        if self._listener is not None:
+            self._listener.close()
         self._listener, self._tried = None, -_RETRY
 
     # Connection.
@@ -119,7 +145,6 @@ class Connection:
         return True
 
     def _listen(self) -> None:
-        """Open the port if it is not open."""
         if self._listener is not None or not self._is_time():
             return
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -128,19 +153,18 @@ class Connection:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
             listener.setblocking(False)
             listener.bind((self._settings.host, self._settings.port))
-            listener.listen(_MOST_STRANGERS)
+            listener.listen(_MOST_REJECTED)
         except OSError as error:
             listener.close()
             why = 'the port is in use' if error.errno == EADDRINUSE else _words(error)
-            self._complain(f'cannot listen on {self.place}: {why}')
+            self._report(f'cannot listen on {self.place}: {why}')
             return
-        self._listener, self.complaint = listener, ''
+        self._listener, self.error = listener, ''
         self._events.add(Severity.INFO, f'listens on {self.place}')
 
     def _accept(self) -> None:
-        """Accept the first peer and reject all others."""
         listener = self._listener
-        for _ in range(_MOST_STRANGERS):
+        for _ in range(_MOST_REJECTED):
             if listener is None:
                 return
             try:
@@ -157,7 +181,7 @@ class Connection:
                 )
             else:
                 accepted.setblocking(False)
-                self._greet(accepted, f'{host}:{port}')
+                self._establish(accepted, f'{host}:{port}')
 
     def _connect(self) -> None:
         """Start a connection, or check its progress."""
@@ -178,17 +202,17 @@ class Connection:
             if not ready.poll(0):
                 if self._steady() - self._tried > _PATIENCE:
                     self._drop()
-                    self._complain(f'cannot connect to {self.place}: no answer')
+                    self._report(f'cannot connect to {self.place}: no answer')
                 return
             found = coming.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if found:
             self._drop()
-            self._complain(f'cannot connect to {self.place}: {os.strerror(found).lower()}')
+            self._report(f'cannot connect to {self.place}: {os.strerror(found).lower()}')
         else:
-            self.complaint = ''
-            self._greet(coming, self.place)
+            self.error = ''
+            self._establish(coming, self.place)
 
-    def _greet(self, connection: socket.socket, peer: str) -> None:
+    def _establish(self, connection: socket.socket, peer: str) -> None:
         """Initialize an established connection."""
         self._socket, self.peer = connection, peer
         self._frames = Frames(self._wanted, self._events.reject)
@@ -202,10 +226,10 @@ class Connection:
             )
         self._events.add(Severity.INFO, f'connected with {peer}', 'connected')
 
-    def _complain(self, line: str) -> None:
+    def _report(self, line: str) -> None:
         """Log the reason why no connection is possible, once."""
-        if line != self.complaint:
-            self.complaint = line
+        if line != self.error:
+            self.error = line
             self._events.add(
                 Severity.ERROR, f'{line}; tries again every {_RETRY:g} s', 'no connection'
             )
@@ -234,7 +258,6 @@ class Connection:
         return found
 
     def _flush(self) -> None:
-        """Send queued data without blocking."""
         while self._socket is not None and self._out:
             try:
                 sent = self._socket.send(self._out)
@@ -249,20 +272,15 @@ class Connection:
             self._moved = self._steady()
 
     def _lose(self, why: str) -> None:
-        """Log and close a lost connection."""
         self._events.add(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
     def _drop(self) -> None:
         if self._socket is not None:
             self._socket.close()
-        self._forget()
-
-    def _forget(self) -> None:
         self._socket, self.peer = None, ''
         self._out.clear()
 
 
 def _words(error: OSError) -> str:
-    """Return the system's description of an error."""
     return (error.strerror or str(error)).lower()

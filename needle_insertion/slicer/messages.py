@@ -80,12 +80,7 @@ class Interpreter:
         return point
 
     def shape(self, shape: Shape, number: int) -> list[bytes]:
-        """
-        Return a POINT message with the shape, from the guide to the tip, and its STRING header.
-
-        The string has time, number of the shape, number of points, frame and source, separated by
-        semicolons.
-        """
+        """Return a POINT message with the shape, from guide to tip, and its STRING header."""
         time = _seconds(shape.stamp)
         count = len(shape.points)
         points = PointMessage(
@@ -125,7 +120,6 @@ def _millimeters(at: FloatArray) -> str:
 
 
 def _message(frame: Frame) -> Any:
-    """Parse a message with pyigtl."""
     header, body = frame.data[: HEADER.size], frame.data[HEADER.size :]
     # pyigtl does not verify the checksum.
     if HEADER.unpack(header)[-1] != CRC64(body):

@@ -93,12 +93,12 @@ def _quaternion(given: ArrayLike) -> FloatArray:
     return np.array(given, dtype=np.float64)
 
 
-def _along(way: FloatArray) -> FloatArray:
+def _along(direction: FloatArray) -> FloatArray:
     """Return the shortest rotation from y to a direction: quaternion x, y, z, w."""
-    length = float(np.linalg.norm(way))
+    length = float(np.linalg.norm(direction))
     if length == 0.0:
         return np.array([0.0, 0.0, 0.0, 1.0])
-    x, y, z = way / length
+    x, y, z = direction / length
     # Half the angle from y, about the normal of both; for opposite directions any normal.
     turn = np.array([z, 0.0, -x, 1.0 + y]) if y > -1.0 else np.array([1.0, 0.0, 0.0, 0.0])
     return np.asarray(turn / np.linalg.norm(turn))

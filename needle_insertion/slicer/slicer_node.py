@@ -14,10 +14,9 @@ from typing import Any, Final, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.graph.messages import target_message
-from needle_insertion.slicer.link import Connection
+from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
-from needle_insertion.slicer.settings import LinkSettings
 from needle_insertion.slicer.states import NodeStates
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
@@ -100,13 +99,11 @@ class SlicerNode(BaseNode):
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
 
     def cleanup(self) -> None:
-        """Discard the connection."""
         if self._link is not None:
             self._link.close()
         self._link = self._interpreter = None
 
     def activate(self) -> None:
-        """Open the connection and start its timer."""
         self._due = monotonic()
         self._timer = steady_timer(self, _CHECK, self._tick)
 
@@ -116,7 +113,6 @@ class SlicerNode(BaseNode):
             self._link.close()
 
     def about(self) -> str:
-        """Describe the connection and the topics."""
         return (
             f'{self._link.state if self._link is not None else ""}; publishes '
             f'{contract.TARGET.name} and {contract.TIP_POSE.name}, subscribes to '
@@ -128,7 +124,6 @@ class SlicerNode(BaseNode):
 
     @contextmanager
     def _rejecting(self, topic: Topic) -> Iterator[None]:
-        """Report an invalid message of a topic."""
         try:
             yield
         except MessageError as error:
@@ -176,7 +171,6 @@ class SlicerNode(BaseNode):
     # Messages of the peer.
 
     def _tick(self) -> None:
-        """Receive messages of the peer, and send shape and state."""
         link, interpreter = self._link, self._interpreter
         if link is None or interpreter is None:
             return
@@ -196,7 +190,6 @@ class SlicerNode(BaseNode):
         self.publish_events(self._events)
 
     def _repeat_target(self) -> None:
-        """Publish the target again until it is answered, and report a rejection."""
         if self._sending is None:
             return
         pending, message = self._sending
@@ -209,7 +202,6 @@ class SlicerNode(BaseNode):
             self._target.publish(message)
 
     def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
-        """Publish the newest target."""
         newest = None
         for frame in frames[-_AT_ONCE:]:
             try:
@@ -276,12 +268,12 @@ class SlicerNode(BaseNode):
             f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
             f'{contract.TIP_DEFLECTION.name} received'
         )
-        broken = SlicerPhase.ERROR if link.complaint else SlicerPhase.WAITING
+        broken = SlicerPhase.ERROR if link.error else SlicerPhase.WAITING
         phase = SlicerPhase.CONNECTED if link.peer else broken
         status = SlicerStatus(
             phase=phase,
             peer=link.peer,
-            error=link.complaint,
+            error=link.error,
             shape_source=source,
             shapes=self._shapes,
             shape_rate=self._rate.rate(self._steady_ns()),
@@ -290,7 +282,7 @@ class SlicerNode(BaseNode):
             rejected=self._events.rejected,
             last_rejection=self._events.last_rejection,
         )
-        severity = Severity.ERROR if link.complaint else Severity.INFO
+        severity = Severity.ERROR if link.error else Severity.INFO
         return Diagnosis(severity, f'{link.state}; shape: {shown}', status)
 
 

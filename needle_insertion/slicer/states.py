@@ -31,7 +31,6 @@ class NodeStates:
             self._states[name] = now, level, message
 
     def mark_changed(self, now: float) -> None:
-        """Request a transmission."""
         self._changed = now
 
     def is_due(self, peer: str, now: float) -> bool:

@@ -50,11 +50,9 @@ class Live:
             await asyncio.sleep(due - monotonic())
 
     def reader(self) -> LiveReader:
-        """Return the interface of a new reader."""
         return LiveReader(self)
 
     async def newer(self, number: int) -> None:
-        """Wait for a frame newer than ``number``."""
         async with self._changed:
             await self._changed.wait_for(lambda: self.number > number)
 
@@ -81,7 +79,6 @@ class LiveReader:
         return '{' + ','.join(parts) + '}'
 
     def take(self, message: dict[str, Any]) -> None:
-        """Raise `ParameterError`: live frames have no playback."""
         raise ParameterError(f'the live page accepts "seen" and "ask" only, got {sorted(message)}')
 
 
@@ -133,6 +130,5 @@ class RecordedReader:
         return _json(content)
 
     def take(self, message: dict[str, Any]) -> None:
-        """Process a playback message; see `PagePlayback.take`."""
         self._playback.take(message)
         self._asked.set()

@@ -195,7 +195,6 @@ class ShownRecording:
         return time
 
     def _take(self, name: str, message: Recorded) -> None:
-        """Store the content of a message."""
         data = message.data
         time = self._newest if self._header else self._time(message.received)
         if name in self._readers:
@@ -268,7 +267,6 @@ class Comparison:
         return needle
 
     def content(self) -> dict[str, Any]:
-        """Return name, words, first and last time, and signals, for JSON."""
         signals = {
             name: [[round(time + self.shift, 6) for time in times if time is not None], values]
             for name, (times, values) in self.recording.signals().items()

@@ -127,7 +127,6 @@ class Server:
 
     @property
     def words(self) -> list[str]:
-        """Lines to print at the start."""
         lines = [f'page: {self.address}']
         if self.token:
             lines.append('this address permits motion of the needle: do not share it')
@@ -230,7 +229,6 @@ class Server:
         return socket
 
     async def _take(self, connection: _Connection, message: WSMessage) -> None:
-        """Process a message, or answer with the error."""
         try:
             content = _message(message)
             if 'ask' in content:
@@ -274,13 +272,11 @@ class _Connection:
         self._ahead = 0
 
     def acknowledge(self, number: int) -> None:
-        """Process the acknowledgement of frames."""
         for _ in range(min(number, self._ahead)):
             self._ahead -= 1
             self._credit.release()
 
     async def send(self) -> None:
-        """Send frames until the connection ends."""
         while True:
             await self._credit.acquire()
             self._ahead += 1
@@ -305,7 +301,6 @@ class _Connection:
         task.add_done_callback(self.asking.discard)
 
     async def answer(self, *, success: bool, words: str, asked: str = '') -> None:
-        """Send the result of a message."""
         answer = {'asked': asked, 'success': success, 'words': printable(words)}
         await self._put(json.dumps({'answer': answer}))
 
@@ -319,7 +314,6 @@ class _Connection:
 
 
 def _break_off(request: web.Request) -> None:
-    """Abort the connection of a request."""
     if request.transport is not None:
         request.transport.abort()
 
@@ -334,7 +328,6 @@ def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.Stream
 
 
 def _message(message: WSMessage) -> dict[str, Any]:
-    """Parse a message as a JSON object."""
     try:
         content = json.loads(message.data, parse_constant=_no_number)
     except (ValueError, TypeError, RecursionError):

@@ -49,7 +49,6 @@ def _joint(topic: contract.Topic, joint: str, part: int = 0) -> Signal:
 
 
 def _axis(topic: contract.Topic, axis: int) -> Signal:
-    """Return a number of a vector as a signal."""
     return Signal(topic.name, lambda reading: number(reading.values[0][axis]))
 
 
@@ -212,7 +211,6 @@ class View:
         return self._vector(contract.TARGET.name) if not statuses else None
 
     def _hit_probability(self) -> float | None:
-        """Return the hit probability of the steered insertion."""
         statuses = [status for _, _, status in self._nodes.values()]
         found = [one.hit_probability for one in statuses if isinstance(one, SteeringStatus)]
         return next((number(one) for one in found if one is not None), None)
@@ -266,14 +264,8 @@ class View:
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
                     'last_rejection': printable(rejection),
-                    **_progress(typed),
                 }
             )
+            if isinstance(typed, SteeringStatus) and typed.steps:
+                nodes[-1] |= {'step': typed.step, 'steps': typed.steps}
         return sorted(nodes, key=lambda node: (-node['level'], node['name']))
-
-
-def _progress(status: NodeStatus | None) -> dict[str, int]:
-    """Return completed and all steps of a steered insertion; empty for other nodes."""
-    if not isinstance(status, SteeringStatus) or not status.steps:
-        return {}
-    return {'step': status.step, 'steps': status.steps}

@@ -11,8 +11,8 @@ import os
 from time import monotonic
 from typing import Any, Final
 
+from needle_insertion.graph.messages import waiting
 from needle_insertion.live.operator import Operator
-from needle_insertion.live.waiting import waiting
 from needle_insertion.watch.recorded import STREAMS
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import View
@@ -73,7 +73,6 @@ class WatchNode(Node):
     def _listen(
         self, topic: Topic, qos: Qos, take: Callable[[Any, float], None], *, raw: bool = True
     ) -> None:
-        """Subscribe to a topic and register the callback for its messages."""
         self._takers.append((waiting(self, topic, qos, raw=raw), take))
 
     def _configured(self, node: str, data: bytes, _now: float) -> None:
@@ -105,7 +104,6 @@ class Buttons:
         self._executor.add_node(self._node)
 
     def spin(self) -> None:
-        """Process answers of nodes."""
         for _ in range(_EVENTS):
             self._executor.spin_once(timeout_sec=0.0)
 
@@ -119,7 +117,6 @@ class Buttons:
         return pending.outcome
 
     async def _spin_until(self, done: Callable[[], bool], what: str, timeout: float = inf) -> None:
-        """Spin the node until a request is answered."""
         end = monotonic() + timeout
         while not done():
             if monotonic() > end:
@@ -128,7 +125,6 @@ class Buttons:
             self.spin()
 
     async def ask(self, what: str) -> tuple[bool, str]:
-        """Call the services of a request in `REQUESTS`; return success and the answers."""
         answer = self._operator.ask(what)
         # Ends without an answer, too.
         await self._spin_until(answer.done, what)
@@ -136,7 +132,6 @@ class Buttons:
         return bool(success), str(words)
 
     def end(self) -> None:
-        """Destroy the node."""
         self._executor.remove_node(self._node)
         self._executor.shutdown()
         self._node.destroy_node()

@@ -74,13 +74,13 @@ def _linearization() -> Finding:
     model = needle('paper_si', 'complete')
     there = _first_frequency(model, DEPTH)
 
-    def change(way: float) -> float:
-        return there / _first_frequency(model, DEPTH + way) - 1.1
+    def change(advance: float) -> float:
+        return there / _first_frequency(model, DEPTH + advance) - 1.1
 
-    way = float(brentq(change, 1e-5, 0.1))
+    advance = float(brentq(change, 1e-5, 0.1))
     return finding(
-        {'way_mm': 1e3 * way, 'insertion_mm': 1e3 * (model.parameters.length - DEPTH)},
-        always=way > model.parameters.length - DEPTH,
+        {'way_mm': 1e3 * advance, 'insertion_mm': 1e3 * (model.parameters.length - DEPTH)},
+        always=advance > model.parameters.length - DEPTH,
         sometimes=True,
     )
 
@@ -90,8 +90,8 @@ def _friction_length() -> Finding:
     p = NeedleParameters.preset('paper_mm')
     # F = (mu_s + mu_v v) s / l without inertia; the integral of ds / v with a = F l / mu_s.
     a = FORCE * p.length / p.coulomb_friction
-    way = a * log((a - DEPTH) / (a - p.length)) - (p.length - DEPTH)
-    per_length = p.viscous_friction / p.coulomb_friction * way
+    advance = a * log((a - DEPTH) / (a - p.length)) - (p.length - DEPTH)
+    per_length = p.viscous_friction / p.coulomb_friction * advance
     constant = hub_time(open_loop('paper_mm', 'complete', 0.0))
     return finding(
         {'constant': constant, 'per_length': per_length},

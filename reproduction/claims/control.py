@@ -7,46 +7,34 @@ from needle_controller import Axis, LoopRun, Pid, PidGains
 from needle_controller.stability import stability_limit
 from needle_dynamics import NeedleParameters
 import numpy as np
+from reproduction import runs
 from reproduction.claims.claim import Finding, finding
-from reproduction.runs import (
-    base_alone,
-    CASES,
-    closed_loop,
-    DEFLECTION,
-    DEPTH,
-    hub_time,
-    INVERSE_DYNAMICS_KP,
-    INVERSE_DYNAMICS_KV,
-    LAWS,
-    open_loop,
-    PID_KP,
-    PID_KV,
-    READINGS,
-    RunOutcome,
-)
 
 
 def _with_hub(law: str, factors: tuple[float, float] = (1.0, 1.0)) -> LoopRun:
     """Return a closed loop of figure 7 or 8 with 0.3 N s/mm."""
-    return closed_loop(law, 'paper_mm', 'complete', hub_stop=True, factors=factors)
+    return runs.closed_loop(law, 'paper_mm', 'complete', hub_stop=True, factors=factors)
 
 
 def _error_equation() -> Finding:
     """Compare the error of inverse dynamics with the exact solution of its equation."""
-    run = closed_loop('inverse_dynamics', 'paper_si', 'complete')
+    run = runs.closed_loop('inverse_dynamics', 'paper_si', 'complete')
     early = run.time <= 20.0
-    times, start = run.time[early], run.model.state_at(DEPTH, DEFLECTION)
+    times, start = run.time[early], run.model.state_at(runs.DEPTH, runs.DEFLECTION)
     error = 0.0
     for k in (0, 2, 3):
-        damping = 0.5 * INVERSE_DYNAMICS_KV[k]
-        w = sqrt(INVERSE_DYNAMICS_KP[k] - damping**2)
+        damping = 0.5 * runs.INVERSE_DYNAMICS_KV[k]
+        w = sqrt(runs.INVERSE_DYNAMICS_KP[k] - damping**2)
         exact = np.exp(-damping * times) * (np.cos(w * times) + damping / w * np.sin(w * times))
         error = max(error, float(np.abs(run.states[early, k] / start[k] - exact).max()))
     p = run.model.parameters
     return finding(
         {
             'error': error,
-            'pushed_mn': 1e3 * p.moving_mass * INVERSE_DYNAMICS_KP[0] * (p.length - DEPTH),
+            'pushed_mn': 1e3
+            * p.moving_mass
+            * runs.INVERSE_DYNAMICS_KP[0]
+            * (p.length - runs.DEPTH),
             'friction': p.coulomb_friction,
         },
         always=False,
@@ -57,15 +45,15 @@ def _error_equation() -> Finding:
 def _positive_definite() -> Finding:
     """Test stability by the poles of the sampled loop."""
     p = NeedleParameters.preset('paper_mm')
-    gains = PidGains(kp=PID_KP, ki=0.0, kd=PID_KV, tolerance=0.0)
+    gains = PidGains(kp=runs.PID_KP, ki=0.0, kd=runs.PID_KV, tolerance=0.0)
     slow, fast = (
         stability_limit(Pid(axis=Axis.insertion(p), gains=gains, period=1.0 / rate), 1).radius
         for rate in (1e3, 1e6)
     )
     # The textbook form holds the force of the last sample for a period of 1 ms.
     decay = exp(-p.viscous_friction / p.moving_mass * 1e-3)
-    textbook = decay - (1.0 - decay) * PID_KV / p.viscous_friction
-    ends = [RunOutcome.of(_with_hub(law)).final for law in LAWS]
+    textbook = decay - (1.0 - decay) * runs.PID_KV / p.viscous_friction
+    ends = [runs.RunOutcome.of(_with_hub(law)).final for law in runs.LAWS]
     return finding(
         {'at_1_khz': slow, 'at_1_mhz': fast, 'textbook': textbook},
         always=max(slow, fast) < 1.0,
@@ -76,7 +64,8 @@ def _positive_definite() -> Finding:
 def _same_inputs() -> Finding:
     """Test the inputs by the forces at the start of figures 6 to 8."""
     inverse, pid = (
-        closed_loop(law, 'paper_si', 'complete', hub_stop=True).forces[0, 2:] for law in LAWS
+        runs.closed_loop(law, 'paper_si', 'complete', hub_stop=True).forces[0, 2:]
+        for law in runs.LAWS
     )
     return finding(
         {
@@ -91,7 +80,6 @@ def _same_inputs() -> Finding:
 
 
 def _turns(run: LoopRun) -> int:
-    """Count sign changes of the tip deflection above rounding."""
     tip = run.tip_deflection
     tip = tip[np.abs(tip) > 1e-9]
     return int(np.count_nonzero(np.diff(np.sign(tip))))
@@ -99,14 +87,14 @@ def _turns(run: LoopRun) -> int:
 
 def _tip_varies() -> Finding:
     """Test figure 4 by the peak of the tip deflection."""
-    found = [RunOutcome.of(open_loop(*case)) for case in CASES]
+    found = [runs.RunOutcome.of(runs.open_loop(*case)) for case in runs.CASES]
     return finding(
         {
-            'turns': _turns(open_loop(*CASES[0])),
+            'turns': _turns(runs.open_loop(*runs.CASES[0])),
             'peak_mm': 1e3 * found[0].peak,
             'peak_ms': 1e3 * found[0].peak_time,
         },
-        always=all(abs(one.peak) > DEFLECTION for one in found),
+        always=all(abs(one.peak) > runs.DEFLECTION for one in found),
     )
 
 
@@ -116,10 +104,12 @@ def _smoother() -> Finding:
     def rate(run: LoopRun) -> float:
         return _turns(run) / float(run.time[-1])
 
-    free_run = open_loop('paper_mm', 'complete')
-    free, controlled = rate(free_run), max(rate(_with_hub(law)) for law in LAWS)
-    alone = min(rate(base_alone(law, 'paper_mm')) for law in LAWS)
-    peaks = [1e3 * abs(RunOutcome.of(run).peak) for run in (free_run, *map(_with_hub, LAWS))]
+    free_run = runs.open_loop('paper_mm', 'complete')
+    free, controlled = rate(free_run), max(rate(_with_hub(law)) for law in runs.LAWS)
+    alone = min(rate(runs.base_alone(law, 'paper_mm')) for law in runs.LAWS)
+    peaks = [
+        1e3 * abs(runs.RunOutcome.of(run).peak) for run in (free_run, *map(_with_hub, runs.LAWS))
+    ]
     return finding(
         {
             'free': free,
@@ -135,14 +125,15 @@ def _smoother() -> Finding:
 def _zero_deflection() -> Finding:
     """Test the remaining deflection under inverse dynamics."""
     modal = max(
-        RunOutcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
-        for case in CASES
+        runs.RunOutcome.of(runs.closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
+        for case in runs.CASES
         for hub in (False, True)
     )
     alone = min(
-        RunOutcome.of(base_alone('inverse_dynamics', reading)).final for reading in READINGS
+        runs.RunOutcome.of(runs.base_alone('inverse_dynamics', reading)).final
+        for reading in runs.READINGS
     )
-    pid = RunOutcome.of(_with_hub('pid')).final
+    pid = runs.RunOutcome.of(_with_hub('pid')).final
     return finding(
         {'modal_nm': 1e9 * modal, 'alone_mm': 1e3 * alone, 'pid_nm': 1e9 * pid},
         always=alone < 1e-6,
@@ -153,12 +144,12 @@ def _zero_deflection() -> Finding:
 def _fully_inserted() -> Finding:
     """Test the target state by the insertion depth."""
     free, held = (
-        closed_loop('inverse_dynamics', 'paper_si', 'complete', hub_stop=hub)
+        runs.closed_loop('inverse_dynamics', 'paper_si', 'complete', hub_stop=hub)
         for hub in (False, True)
     )
-    deepest, stopped = RunOutcome.of(free).deepest, RunOutcome.of(held).deepest
+    deepest, stopped = runs.RunOutcome.of(free).deepest, runs.RunOutcome.of(held).deepest
     return finding(
-        {'deepest_cm': 100.0 * deepest, 'arrival': hub_time(held)},
+        {'deepest_cm': 100.0 * deepest, 'arrival': runs.hub_time(held)},
         always=deepest <= 0.2,
         sometimes=stopped <= 0.2,
     )
@@ -167,7 +158,7 @@ def _fully_inserted() -> Finding:
 def _minimum_deflection() -> Finding:
     """Compare the PID gains with four other pairs of gains by the peak deflection."""
     pairs = (1.0, 1.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)
-    peaks = {pair: 1e3 * abs(RunOutcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
+    peaks = {pair: 1e3 * abs(runs.RunOutcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
     best = min(peaks, key=lambda pair: peaks[pair])
     paper = peaks[1.0, 1.0]
     return finding(

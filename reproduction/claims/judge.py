@@ -6,9 +6,9 @@ from importlib.resources import files
 from types import ModuleType
 from typing import Any
 
-from needle_insertion.report.content import Grid, ReportSection
 from reproduction.claims import analysis, assumptions, control, identified, mismatch, needle
 from reproduction.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
+from reproduction.content import Grid, ReportSection
 from reproduction.mismatch import Mismatch
 import yaml
 
@@ -16,12 +16,7 @@ import yaml
 def judge_claims(
     tables: Tables, study: Mismatch, progress: Callable[[], object] | None = None
 ) -> list[Claim]:
-    """
-    Compute the verdict on every claim, in the order of the paper; deterministic.
-
-    ``tables`` are the statistics of Tables 1 and 2; ``study`` is the mismatch study; ``progress``
-    is called after each claim.
-    """
+    """Compute the verdict on every claim, in the order of the paper, with progress after each."""
     found = []
     for entry in _entries():
         found.append(Claim(**entry) if 'test' in entry else _judged(entry, tables, study))

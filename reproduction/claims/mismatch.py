@@ -12,11 +12,7 @@ from reproduction.runs import closed_loop, DEFLECTION, DEPTH, LAWS, needle, pape
 
 
 def _informed(study: Mismatch) -> Finding:
-    """
-    Test whether a model-based law performs better with and without mismatch.
-
-    Both laws are as in the paper, without integral.
-    """
+    """Test whether a model-based law performs better; both laws are without integral."""
     model = needle('paper_mm', 'complete')
     friction = 0.99 * model.parameters.coulomb_friction
     nominal = NeedleModel(replace(model.parameters, coulomb_friction=friction))

@@ -6,25 +6,15 @@ from math import pi, sqrt
 
 from needle_dynamics import FloatArray, Integrator, mode_shapes, NeedleModel, NeedleParameters
 import numpy as np
+from reproduction import runs
 from reproduction.claims.claim import Finding, finding
-from reproduction.runs import (
-    CASES,
-    DEFLECTION,
-    DEPTH,
-    FORCE,
-    hub_time,
-    needle,
-    open_loop,
-    READINGS,
-    RunOutcome,
-)
 from scipy.linalg import eigh
 
 
 @cache
 def _bias(formulation: str) -> tuple[FloatArray, FloatArray]:
     """Return N along the open loop (0.3 N s/m), with the rates and with zero rates."""
-    run = open_loop('paper_si', formulation)
+    run = runs.open_loop('paper_si', formulation)
     moving = run.states[run.states[:, 0] > 0.0][::5]
     still = moving.copy()
     still[:, 4:] = 0.0
@@ -34,8 +24,8 @@ def _bias(formulation: str) -> tuple[FloatArray, FloatArray]:
 
 def _zero_rows() -> Finding:
     """Test the rows of N for d and theta."""
-    model = needle('paper_si', 'complete')
-    straight = model.state_at(DEPTH)
+    model = runs.needle('paper_si', 'complete')
+    straight = model.state_at(runs.DEPTH)
     straight[4:6] = -1.0, 1.0
     whole, _ = _bias('complete')
     largest = float(np.abs(whole[:, :2]).max())
@@ -63,12 +53,12 @@ def _independence() -> Finding:
     """Test the effect of an initial deflection on d."""
 
     def apart(reading: str, formulation: str) -> float:
-        bent, straight = (open_loop(reading, formulation, w) for w in (DEFLECTION, 0.0))
+        bent, straight = (runs.open_loop(reading, formulation, w) for w in (runs.DEFLECTION, 0.0))
         return float(np.abs(bent.states[:, 0] - straight.states[:, 0]).max())
 
-    printed = max(apart(reading, 'as_printed') for reading in READINGS)
-    si, mm = (apart(reading, 'complete') for reading in READINGS)
-    part = max(si, mm) / (NeedleParameters().length - DEPTH)
+    printed = max(apart(reading, 'as_printed') for reading in runs.READINGS)
+    si, mm = (apart(reading, 'complete') for reading in runs.READINGS)
+    part = max(si, mm) / (NeedleParameters().length - runs.DEPTH)
     return finding(
         {'printed': printed, 'si_mm': 1e3 * si, 'mm_mm': 1e3 * mm, 'percent': 100.0 * part},
         always=0.0 < printed < 1e-2,
@@ -81,19 +71,20 @@ def _two_modes_cause() -> Finding:
 
     def path(modes: int, deflection: float) -> FloatArray:
         p = NeedleParameters(modes=modes, minimum_depth=0.0195)
-        integrator = Integrator(p, NeedleModel(p).state_at(DEPTH, deflection))
+        integrator = Integrator(p, NeedleModel(p).state_at(runs.DEPTH, deflection))
         found = []
         for _ in range(20):
-            integrator.advance(1e-3, FORCE)
+            integrator.advance(1e-3, runs.FORCE)
             found.append(integrator.state[0])
         return np.array(found)
 
     one, two, three = (
-        1e3 * float(np.abs(path(n, DEFLECTION) - path(n, 0.0)).max()) for n in (1, 2, 3)
+        1e3 * float(np.abs(path(n, runs.DEFLECTION) - path(n, 0.0)).max()) for n in (1, 2, 3)
     )
     si, mm = (
-        hub_time(open_loop(reading, 'complete', 0.0)) - hub_time(open_loop(reading, 'complete'))
-        for reading in READINGS
+        runs.hub_time(runs.open_loop(reading, 'complete', 0.0))
+        - runs.hub_time(runs.open_loop(reading, 'complete'))
+        for reading in runs.READINGS
     )
     return finding(
         {'one_mm': one, 'two_mm': two, 'three_mm': three, 'si_ms': 1e3 * si, 'mm_ms': 1e3 * mm},
@@ -103,27 +94,29 @@ def _two_modes_cause() -> Finding:
 
 def _deflection_changes() -> Finding:
     """Test whether only an initial deflection grows during insertion."""
-    peaks = {case: abs(RunOutcome.of(open_loop(*case)).peak) for case in CASES}
+    peaks = {case: abs(runs.RunOutcome.of(runs.open_loop(*case)).peak) for case in runs.CASES}
     straight = max(
-        float(np.abs(open_loop(reading, 'complete', 0.0).tip_deflection).max())
-        for reading in READINGS
+        float(np.abs(runs.open_loop(reading, 'complete', 0.0).tip_deflection).max())
+        for reading in runs.READINGS
     )
     peak = peaks['paper_si', 'complete']
     return finding(
         {
             'peak_mm': 1e3 * peak,
-            'grown': peak / DEFLECTION,
+            'grown': peak / runs.DEFLECTION,
             'printed_mm': 1e3 * peaks['paper_si', 'as_printed'],
         },
-        always=straight == 0.0 and min(peaks.values()) > DEFLECTION,
+        always=straight == 0.0 and min(peaks.values()) > runs.DEFLECTION,
     )
 
 
 def _spring_at_the_tip() -> Finding:
     """Compare a spring at the tip with the tissue by the energy in the mode shapes."""
-    model = needle('paper_si', 'complete')
-    at = model.modes.integrals(DEPTH)
-    shapes = eigh(model.stiffness_matrix(DEPTH), model.parameters.linear_density * at.gram)[1].T
+    model = runs.needle('paper_si', 'complete')
+    at = model.modes.integrals(runs.DEPTH)
+    shapes = eigh(model.stiffness_matrix(runs.DEPTH), model.parameters.linear_density * at.gram)[
+        1
+    ].T
     tissue = np.array([shape @ at.gram @ shape for shape in shapes])
     tip = (shapes @ at.value) ** 2
     ratio = float(tip[1] / tip[0] * tissue[0] / tissue[1])
@@ -132,7 +125,7 @@ def _spring_at_the_tip() -> Finding:
 
 def _two_modes() -> Finding:
     """Compare two modes with the exact clamped beam on an elastic foundation."""
-    model = needle('paper_si', 'complete')
+    model = runs.needle('paper_si', 'complete')
     p = model.parameters
     decay = (p.tissue_stiffness / (4.0 * p.bending_stiffness)) ** 0.25
     roots = mode_shapes(p.length, 2).arguments
@@ -171,8 +164,8 @@ def _axis_of_rotation() -> Finding:
 def _friction_matters() -> Finding:
     """Compare the duration of an insertion with and without friction."""
     p = NeedleParameters()
-    free = sqrt(2.0 * (p.length - DEPTH) * p.moving_mass / FORCE)
-    si, mm = (hub_time(open_loop(reading, 'complete', 0.0)) for reading in READINGS)
+    free = sqrt(2.0 * (p.length - runs.DEPTH) * p.moving_mass / runs.FORCE)
+    si, mm = (runs.hub_time(runs.open_loop(reading, 'complete', 0.0)) for reading in runs.READINGS)
     return finding(
         {'none_ms': 1e3 * free, 'si_ms': 1e3 * si, 'mm_s': mm}, always=min(si, mm) > 1.1 * free
     )
@@ -182,9 +175,9 @@ def _transients() -> Finding:
     """Test static models by the decay time of a deflection."""
     p = NeedleParameters.preset('phantom')
     fade = p.linear_density * 2.0 / p.tissue_damping
-    rings = RunOutcome.of(open_loop('paper_mm', 'complete')).final
+    rings = runs.RunOutcome.of(runs.open_loop('paper_mm', 'complete')).final
     return finding(
         {'rings_mm': 1e3 * rings, 'fade_ms': 1e3 * fade},
         always=False,
-        sometimes=rings > DEFLECTION,
+        sometimes=rings > runs.DEFLECTION,
     )

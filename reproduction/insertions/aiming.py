@@ -11,22 +11,23 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
+from needle_insertion.graph.lockstep import RunSample, WARM_UP
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle, evenly
-from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
+from reproduction.content import Check
 from reproduction.insertions import bending
 from reproduction.insertions.bending import read_needles, replay_check
 from reproduction.insertions.insertion import RATE, SETTLING
+from reproduction.insertions.simulated_run import SimulatedRun
 
 #: Target of the tip, x, y, z [m], and insertion depth at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
@@ -129,7 +130,6 @@ class Aimed:
 
     @property
     def miss(self) -> float:
-        """Distance of the tip from the target [m]."""
         return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
 
     @property
@@ -196,7 +196,6 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
 
 
 def animate_aiming(bag: Path) -> Animation:
-    """Return an animation of the steered needle with some 80 frames."""
     recording = ShownRecording(bag)
     times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
     frames = [recording.view(time).frame(time) for time in times]

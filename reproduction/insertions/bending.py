@@ -18,9 +18,9 @@ from needle_identification import (
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle, evenly
-from needle_insertion.report.text import Check
 from needle_ros.errors import NeedleError
 import numpy as np
+from reproduction.content import Check
 from reproduction.insertions.insertion import record_insertion
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -39,7 +39,7 @@ PLANT: Final[dict[str, object]] = {
 #: Moving joints, and their trajectory: times [s] and positions [m, rad]. The guide is displaced
 #: early, and the needle is rotated by half a turn in the middle of the insertion.
 JOINTS: Final = ('guide_x', 'roll')
-COURSE: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
+MOTION: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
 
 LEAST_DEFLECTION: Final = 2e-3  #: Least distance of the tip of a bending needle from the axis [m].
 
@@ -51,14 +51,14 @@ DRAWN: Final = 5  #: Number of needles in the picture.
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
     """Insert a bending needle with a moving guide and record everything."""
-    course = JointTrajectory(
+    motion = JointTrajectory(
         joint_names=list(JOINTS),
         points=[
             JointTrajectoryPoint(positions=list(at), time_from_start=Duration(sec=time))
-            for time, at in COURSE
+            for time, at in MOTION
         ],
     )
-    record_insertion('adaptive', bag, logs, show, PLANT, course, lockstep=lockstep)
+    record_insertion('adaptive', bag, logs, show, PLANT, motion, lockstep=lockstep)
 
 
 def bending_checks(bag: Path) -> list[Check]:
@@ -99,17 +99,12 @@ def replay_check(bag: Path, what: str) -> Check:
 
 
 def draw_bending(bag: Path) -> Figure:
-    """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
     return draw_needle(evenly(needles, DRAWN), path)
 
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
-    """
-    Read the shapes of the needle, each (k, 3) [m], and the path that it cut, (m, 3) [m].
-
-    The shapes are at successive times, without the straight part of the needle outside.
-    """
+    """Read the shapes of the needle inside, each (k, 3) [m], and its cut path, (m, 3) [m]."""
     needles, path = [], None
     for _, message in read_topic(bag, '/needle_shape'):
         points = np.array([(point.x, point.y, point.z) for point in message.points])

@@ -9,12 +9,13 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
+from needle_insertion.graph.lockstep import WARM_UP
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import SimulatedRun, WARM_UP
 from needle_insertion.progress import Show
-from needle_insertion.report.text import Check
 from needle_ros.timing import seconds
 import numpy as np
+from reproduction.content import Check
+from reproduction.insertions.simulated_run import SimulatedRun
 from trajectory_msgs.msg import JointTrajectory
 
 #: Insertion depth at the start and at the end [m], speed [m/s], sample rate [Hz].
@@ -48,7 +49,7 @@ def record_insertion(
     logs: Path,
     show: Show,
     plant: Mapping[str, object] | None = None,
-    course: JointTrajectory | None = None,
+    motion: JointTrajectory | None = None,
     *,
     lockstep: bool = True,
 ) -> None:
@@ -56,7 +57,7 @@ def record_insertion(
     Insert the simulated needle to the target under a control law and record everything.
 
     `plant` holds parameters of the plant, of which ``model.*`` also go to the controller; default
-    is the needle of the paper, bent at the start. `course` moves the guide of a steered needle
+    is the needle of the paper, bent at the start. `motion` moves the guide of a steered needle
     from the time of the target on. Raises `GraphError` if a node fails.
     """
     given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
@@ -73,12 +74,11 @@ def record_insertion(
             START_DEPTH,
             (0.0, TARGET_DEPTH, 0.0),
             lambda sample: sample.time < end,
-            course,
+            motion,
         )
 
 
 def read_insertion(law: str, bag: Path) -> RecordedInsertion:
-    """Read a recording of `record_insertion`."""
 
     def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
         pairs = [(seconds(m.header.stamp), value(m)) for _, m in read_topic(bag, f'/{topic}')]

@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.image import imread
 from needle_dynamics import analyze, linearize, NeedleError, NeedleModel, NeedleParameters
 from needle_dynamics.linearization import operating_point
-from needle_insertion.commands.analyze import COMMAND
+from needle_insertion.commands import analyze as command
 from needle_insertion.report import controllability
 import numpy as np
 from numpy.testing import assert_array_equal
@@ -22,9 +22,9 @@ import pytest
 
 def run(*words: str) -> int:
     parser = argparse.ArgumentParser()
-    COMMAND.add_arguments(parser)
+    command.add_arguments(parser)
     options = parser.parse_args(words)
-    return COMMAND.run(options)
+    return command.run(options)
 
 
 def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:

@@ -19,8 +19,9 @@ from needle_dynamics import ParameterError
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page
-from needle_insertion.report.text import Check, CHECK_HEADS, table
+from needle_insertion.report.text import table
 import pytest
+from reproduction.content import Check, CHECK_HEADS
 from reproduction.insertions.aiming import animate_aiming
 from support.pages import look_at
 from support.watched import TARGET, write_watched

@@ -10,13 +10,13 @@ from typing import Any
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
 from needle_insertion.report import controllability
-from needle_insertion.report.content import ReportSection
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
 from reproduction import figures, identified, mismatch, results
 from reproduction.claims import judge
 from reproduction.command import RESULTS
+from reproduction.content import ReportSection
 from reproduction.identified import IdentifiedTable, identify_table, PublishedValue
 from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import _stiffness, Coverage, TruthComparison

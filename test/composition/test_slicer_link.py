@@ -13,9 +13,8 @@ from typing import Any
 
 from benchmarks.igtl_peer import free_port
 from needle_insertion.slicer.frames import HEADER
-from needle_insertion.slicer.link import Connection
+from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.messages import is_wanted, TARGET
-from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.event_log import EventLog
 import numpy as np
 import pyigtl
@@ -213,11 +212,11 @@ def test_port_in_use_is_reported_and_retried(stack: ExitStack) -> None:
     assert [line for line in desk.lines if 'the port is in use' in line] == [
         f'cannot listen on 127.0.0.1:{desk.port}: the port is in use; tries again every 1 s'
     ]
-    assert desk.link.complaint == desk.link.state
+    assert desk.link.error == desk.link.state
     other.close()
     desk.ahead += 1.5
     desk.until(lambda: desk.said('listens on'), 'the port')
-    assert desk.link.complaint == ''
+    assert desk.link.error == ''
     visitor(desk, stack)
 
 

@@ -29,8 +29,8 @@ from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, NEEDLES
 from needle_identification import Bag, read_topic
 from needle_identification.bags.messages import deserialize, encode
 from needle_identification.recorder_node import is_hidden
+from needle_insertion.graph.lockstep import RunSample
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.graph.simulated_run import RunSample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import ControllerStatus, node_of, SteeringPhase, SteeringStatus
@@ -39,6 +39,7 @@ import numpy as np
 import pytest
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from reproduction.insertions.simulated_run import SimulatedRun
 from rosgraph_msgs.msg import Clock
 from scipy.integrate import solve_ivp
 from sensor_msgs.msg import JointState
