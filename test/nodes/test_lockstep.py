@@ -241,8 +241,9 @@ def test_tracking_at_1_khz_agrees_with_the_continuous_loop(tmp_path: Path, prese
     error = np.array([message.position[0] for message in errors])
     time = stamps - 1.0 / RATE
     within = time <= DURATION
-    # The probe is not part of the loop and misses messages on a busy machine.
-    assert within.sum() > 0.9 * RATE * DURATION
+    # The probe is not part of the loop and misses messages on a busy machine. The time constant of
+    # the closed loop is 1 s, so that half of the 1000 samples per second show every phase.
+    assert within.sum() > 0.5 * RATE * DURATION
     deviation = np.abs(error[within] / exact(time[within]) - 1.0)
     assert deviation.max() < 0.1, f'at {time[deviation.argmax()]:.3f} s'
 
