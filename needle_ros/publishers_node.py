@@ -35,7 +35,9 @@ def request_stamp(node: Node) -> Time:
     The node switches to simulated time if a ``/clock`` exists. Before the first ``/clock`` message
     the stamp is zero, which means the time of arrival.
     """
-    if node.count_publishers(contract.CLOCK.name) and not node.get_parameter('use_sim_time').value:
+    # `count_publishers` does not follow a remapping.
+    clocks = node.get_publishers_info_by_topic(contract.CLOCK.name)
+    if clocks and not node.get_parameter('use_sim_time').value:
         node.set_parameters([Parameter('use_sim_time', value=True)])
     stamp: Time = node.get_clock().now().to_msg()
     return stamp
