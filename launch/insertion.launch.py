@@ -130,12 +130,16 @@ def start(context: LaunchContext) -> list[Action]:
     if given['bag']:
         names.append('recorder')
         values['recorder']['path'] = str(Path(given['bag']).expanduser())
+    clock = []
     if values['plant'].get('lockstep') or given['real_time_factor']:
+        # Each plant has its own time.
+        clock.append(('/clock', 'clock'))
         values['plant']['publish_clock'] = True
         for name in ('controller', 'steering'):
             values[name].setdefault('use_sim_time', True)
     common = {
         'namespace': given['namespace'],
+        'remappings': clock,
         'on_exit': ended,
         # On SIGTERM, launch leaves its nodes running.
         'additional_env': {'NEEDLE_END_WITH_PARENT': '1'},

@@ -10,11 +10,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
-from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
+from needle_controller.steering.insertion_record import SteeringRecord
 from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.record_file import RecordFile
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.compiled_node import CompiledNode

@@ -457,6 +457,7 @@ class PlantNode(ModelNode):
             saturated=samples.saturated,
             sensor_fault='' if samples.fault is None else self.text('fault.kind'),
             faulty_topic='' if samples.fault is None else samples.faulty,
+            other_clock=samples.other_clock,
             lockstep_nodes=clock.participants + len(clock.recorded),
             requests=self._trajectories.requests.status(),
         )
@@ -476,6 +477,9 @@ class PlantNode(ModelNode):
             return Diagnosis(Severity.ERROR, f'{status.commanders} nodes command', status)
         if status.exhausted:
             return Diagnosis(Severity.ERROR, _exhausted(self._run), status)
+        if other := status.other_clock:
+            line = f'{other} publishes {contract.CLOCK.name}, too: remap it in each namespace'
+            return Diagnosis(Severity.ERROR, f'{line}, -r /clock:=clock', status)
         warnings = []
         if status.phase is PlantPhase.PAUSED:
             warnings.append(f'paused at {status.time:.6f} s')

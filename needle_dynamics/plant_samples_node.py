@@ -56,6 +56,17 @@ class SamplePublishers:
         self._clock = self._node.publisher(contract.CLOCK, always=True)
 
     @property
+    def other_clock(self) -> str:
+        """Name of another node that publishes the same time; empty without one."""
+        if self._clock is None:
+            return ''
+        # Not this plant before a restart, which stays in the graph for 20 s.
+        own = self._node.get_fully_qualified_name()
+        publishers = self._node.get_publishers_info_by_topic(contract.CLOCK.name)
+        names = (f'{one.node_namespace.rstrip("/")}/{one.node_name}' for one in publishers)
+        return next((name for name in names if name != own), '')
+
+    @property
     def topics(self) -> tuple[str, ...]:
         return tuple(self._publish)
 

@@ -26,8 +26,10 @@ def _name(node: BaseNode, lease: Topic) -> str:
 
 def request_stamp(node: Node) -> Time:
     """Return the stamp of a request that is sent now, in simulated time if there is a clock."""
-    # Before the first message of /clock it is zero, which means the time of arrival.
-    if node.count_publishers(contract.CLOCK.name) and not node.get_parameter('use_sim_time').value:
+    # `count_publishers` does not follow a remapping. Before the first message of /clock the stamp
+    # is zero, which means the time of arrival.
+    clocks = node.get_publishers_info_by_topic(contract.CLOCK.name)
+    if clocks and not node.get_parameter('use_sim_time').value:
         node.set_parameters([Parameter('use_sim_time', value=True)])
     stamp: Time = node.get_clock().now().to_msg()
     return stamp

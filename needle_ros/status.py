@@ -249,6 +249,7 @@ class PlantStatus(NodeStatus):
     saturated: int = entry(0, '', 'sensor readings at the end of their range')
     sensor_fault: str = entry('', '', 'simulated fault of a sensor')
     faulty_topic: str = entry('', '', 'topic with this fault')
+    other_clock: str = entry('', '', 'other node that publishes the time of this plant')
     lockstep_nodes: int = entry(0, '', 'nodes in lock-step')
     requests: RequestStatus = entry(RequestStatus, '', 'requests and their acknowledgement')
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-import json
-import os
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.continuous import ContinuousInsertion
@@ -16,8 +13,7 @@ from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.motion_control import LAGGING
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
-from needle_ros.errors import JobError, MessageError, ParameterError
-from needle_ros.files import write_whole
+from needle_ros.errors import JobError, MessageError
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import Authority
 import numpy as np
@@ -153,35 +149,3 @@ class RecordKeeper:
             ended=ended,
             state=state,
         )
-
-
-class RecordFile:
-    """
-    File with the record of a node on a domain, and with the source of its measurements.
-
-    The source identifies the process of the robot: with another one, the needle may be another.
-    """
-
-    def __init__(self, node: str, domain: int) -> None:
-        home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
-        name = node.strip('/').replace('/', '.')
-        self._path = home / 'needle_insertion' / f'{name}.{domain}.json'
-
-    def write(self, record: str, source: str) -> None:
-        """Replace the file, or raise `ParameterError`."""
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ParameterError(f'{self._path} cannot be written: {error.strerror}') from error
-        write_whole(self._path, json.dumps({'source': source, 'record': record}).encode())
-
-    def read(self) -> tuple[SteeringRecord, str] | None:
-        """Return the record and its source; None without a file, `MessageError` if invalid."""
-        try:
-            content = json.loads(self._path.read_bytes())
-            record = SteeringRecord.from_values(json.loads(content['record']))
-            return record, str(content['source'])
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            raise MessageError(f'{self._path} cannot be read: {error}') from error

@@ -68,4 +68,10 @@ class ThreadJob(Job[_Result]):
             Job._start(self)
 
         # A daemon: the end of the process does not wait for it.
-        Thread(target=run, name='plan', daemon=True).start()
+        self._thread = Thread(target=run, name='job', daemon=True)
+        self._thread.start()
+
+    def wait(self, timeout: float) -> bool:
+        """Wait for the end of the job, at most `timeout` [s]; return whether it has ended."""
+        self._thread.join(timeout)
+        return self.done

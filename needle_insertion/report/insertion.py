@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, TYPE_CHECKING, TypeVar
 
 from needle_dynamics import FloatArray, Insertion
-from needle_dynamics.steering.needle import NeedlePath, NeedleShape
+from needle_dynamics.steering.needle import NeedleShape
 from needle_insertion.report.content import csv_table, png
 from needle_ros.files import write_whole
 import numpy as np

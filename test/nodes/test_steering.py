@@ -5,7 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import json
+import os
+from pathlib import Path
 import re
+from threading import Timer
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -312,6 +315,36 @@ def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
 
     bench.until(rests, 'rest')
     assert depth - 1e-3 <= still[-1] <= depth + 4e-3
+
+
+@pytest.mark.requirement('S-340')
+def test_blocked_disk_does_not_delay_a_stop(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The record is written to a FIFO without a reader; the needle is inserted, and stopped."""
+    folder = tmp_path / 'ros/needle_insertion'
+    folder.mkdir(parents=True)
+    bench = Bench(ros_graph, speed=0.01)
+    name = f'steering.{bench.steering.context.get_domain_id()}.json'
+    draft = folder / f'{name}.{os.getpid()}.tmp'
+    os.mkfifo(draft)
+
+    def respond() -> None:
+        draft.read_bytes()
+
+    # A node that waits for the disk would wait as long as this thread.
+    disk = Timer(120.0, respond)
+    disk.daemon = True
+    disk.start()
+    bench.aim()
+    bench.until(lambda: 0.012 < bench.at('insertion') < 0.019, 'the second step')
+    answer = bench.stop.call_async(Trigger.Request())
+    bench.until(answer.done, 'the answer')
+    assert answer.result().success
+    assert bench.status.phase is SteeringPhase.STOPPED
+    assert disk.is_alive(), 'the node has waited for the disk'
+    disk.cancel()
+    respond()
+    bench.until((folder / name).is_file, 'the record')
+    assert json.loads(json.loads((folder / name).read_text())['record'])['ended']
 
 
 def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:

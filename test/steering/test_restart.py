@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 import json
+import os
+from pathlib import Path
+import time
 from typing import Any
 
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
 from needle_controller.steering.insertion_record import SteeringRecord
 from needle_controller.steering.motion import JointMotion
-from needle_ros.errors import MessageError
+from needle_controller.steering.record_file import RecordFile
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 import numpy as np
@@ -231,3 +236,52 @@ def test_invalid_record_is_an_error() -> None:
     for values in ({}, {'point': [0.0, 0.0, 0.0]}, {'other': 1}):
         with pytest.raises(MessageError, match='not a record of an insertion'):
             SteeringRecord.from_values(values)
+
+
+@pytest.fixture
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the path of the file of node `steering` on domain 47."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    path = tmp_path / 'needle_insertion' / 'steering.47.json'
+    path.parent.mkdir()
+    return path
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Wait for a thread; fail after a minute."""
+    end = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.mark.requirement('S-340')
+def test_newest_record_is_written_when_a_blocked_disk_responds(written: Path) -> None:
+    """A writer of a FIFO without a reader waits, as for a disk without a response."""
+    file = RecordFile('/steering', 47)
+    draft = written.with_name(f'{written.name}.{os.getpid()}.tmp')
+    os.mkfifo(draft)
+    for record in 'abc':
+        with pytest.raises(ParameterError, match=r'is not written within 0\.05 s'):
+            file.write(record, 'robot')
+    disk = os.open(draft, os.O_RDONLY | os.O_NONBLOCK)
+    until(written.is_file)
+    os.close(disk)
+    assert json.loads(written.read_text()) == {'source': 'robot', 'record': 'c'}
+    # The disk responds: an error or a record is known at the end of the call.
+    file.write('d', 'robot')
+    assert json.loads(written.read_text())['record'] == 'd'
+    written.unlink()
+    written.mkdir()
+    with pytest.raises(ParameterError, match='it is not the name of a file'):
+        file.write('e', 'robot')
+
+
+@pytest.mark.requirement('S-340')
+def test_record_of_a_blocked_disk_is_an_error(written: Path) -> None:
+    os.mkfifo(written)
+    with pytest.raises(MessageError, match=r'is not read within 0\.05 s'):
+        RecordFile('/steering', 47).read()
+    # The thread ends.
+    with written.open('w'):
+        pass
