@@ -39,13 +39,11 @@ class RecordFile:
         A file that is not replaced within 0.05 s is an error, too; its thread continues.
         """
         with self._lock:
-            busy = self._writer is not None
             self._next = json.dumps({'source': source, 'record': record}).encode()
             if self._writer is None:
                 self._writer = ThreadJob(self._write)
             writer = self._writer
-        # A disk that did not respond to the record before is not waited for again.
-        if busy or not writer.wait(_LONGEST):
+        if not writer.wait(_LONGEST):
             raise ParameterError(f'{self._path} is not written within {_LONGEST:g} s')
         writer.result()
 

@@ -317,7 +317,7 @@ def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
     assert depth - 1e-3 <= still[-1] <= depth + 4e-3
 
 
-@pytest.mark.requirement('S-340')
+@pytest.mark.requirement('S-280')
 def test_blocked_disk_does_not_delay_a_stop(ros_graph: RosGraph, tmp_path: Path) -> None:
     """The record is written to a FIFO without a reader; the needle is inserted, and stopped."""
     folder = tmp_path / 'ros/needle_insertion'

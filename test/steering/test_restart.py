@@ -255,7 +255,7 @@ def until(condition: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.requirement('S-340')
+@pytest.mark.requirement('S-280')
 def test_newest_record_is_written_when_a_blocked_disk_responds(written: Path) -> None:
     """A writer of a FIFO without a reader waits, as for a disk without a response."""
     file = RecordFile('/steering', 47)
@@ -277,7 +277,7 @@ def test_newest_record_is_written_when_a_blocked_disk_responds(written: Path) ->
         file.write('e', 'robot')
 
 
-@pytest.mark.requirement('S-340')
+@pytest.mark.requirement('S-280')
 def test_record_of_a_blocked_disk_is_an_error(written: Path) -> None:
     os.mkfifo(written)
     with pytest.raises(MessageError, match=r'is not read within 0\.05 s'):
