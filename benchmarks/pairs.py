@@ -60,6 +60,8 @@ class Pair:
     """
     A plant and a controller as processes, and a measuring node in this process.
 
+    `parameters` are parameters of both nodes of this package.
+
     Attributes
     ----------
     node : rclpy.node.Node
@@ -69,8 +71,8 @@ class Pair:
 
     """
 
-    def __init__(self, name: str, graph: Graph) -> None:
-        self.graph = graph
+    def __init__(self, name: str, graph: Graph, **parameters: object) -> None:
+        self.graph, self._parameters = graph, parameters
         self.node = graph.node(f'watch_{PAIRS.index(name)}')
         self.pids: dict[str, int] = {}
         self._kill: dict[str, Callable[[], None]] = {}
@@ -85,7 +87,7 @@ class Pair:
         """Start ``plant`` or ``controller``."""
         if self._executor is None:
             given = self._plant if what == 'plant' else {}
-            node = self.graph.start(what, {'autostart': False, **given})
+            node = self.graph.start(what, {'autostart': False, **self._parameters, **given})
             self.pids[what], self._kill[what] = node.process.pid, node.kill
         else:
             bare = self.start_bare(_ROLES[what], self._executor)
