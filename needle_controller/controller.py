@@ -392,7 +392,7 @@ class Controller:
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
             )
         loop, depth, velocity = self._insertion, measured.depth, measured.velocity
-        sample = measured.time, depth, velocity, measured.force
+        sample = measured.time, velocity, measured.force
         if self._hold.measure(sample, age, loop.law.axis.coulomb):
             (loop.unwind if self._hold.missing else loop.stop)()
         now = self.guide.at(measured.time, depth, velocity)

@@ -2,9 +2,10 @@
 """Base class of nodes that call compiled functions."""
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 from typing import Any, ClassVar
 
-from needle_dynamics.compiled.cache import prepare, reports, where_kept
+from needle_dynamics.compiled.cache import other_compilations, prepare, reports, where_kept
 from needle_ros.base_node import BaseNode
 from needle_ros.preparation import imports, PreparationProgress
 
@@ -28,12 +29,13 @@ class CompiledNode(BaseNode):
         #: Functions that were compiled or loaded while the node was active.
         self.late: list[str] = []
         super().__init__(name, **node_options)
-        self._listening = reports(self._on_function)
-        self._listening.__enter__()
+        self._listening = ExitStack()
+        self._listening.enter_context(reports(self._on_function))
 
     def preparation(self) -> Iterable[PreparationProgress]:
         """Import modules, then load or compile kernels."""
         yield from imports(self.IMPORTS)
+        self._listening.enter_context(other_compilations(self._on_other_function))
         for step in prepare(self.KERNELS):
             yield PreparationProgress(*step)
         if self._compiled:
@@ -51,7 +53,12 @@ class CompiledNode(BaseNode):
                 self.get_logger().info('compiling functions for this machine ...')
             self._compiled += 1
 
+    def _on_other_function(self, function: str, loaded: bool, prepared: bool) -> None:
+        """Report a function of the user; before activation Numba compiles its own, too."""
+        if self.is_active:
+            self._on_function(function, loaded, prepared)
+
     def destroy_node(self) -> None:
         """Destroy the node and stop listening to compilations."""
-        self._listening.__exit__(None, None, None)
+        self._listening.close()
         super().destroy_node()

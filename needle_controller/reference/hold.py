@@ -31,8 +31,8 @@ class ReferenceHold:
         self._error, self._reports, self.missing = 0.0, False, False
 
     def measure(self, sample: tuple[float, ...], age: float, friction: float) -> bool:
-        """Process time, depth, velocity and force of an age [s]; return whether to restart."""
-        guide, missing, (time, depth, velocity, reported) = self._guide, self.missing, sample
+        """Process time, velocity and force of an age [s]; return whether to restart."""
+        guide, missing, (time, velocity, reported) = self._guide, self.missing, sample
         # Measurements that are always late or rare are no gap.
         before, self._late = self._late, max(time - guide.now, age)
         gap = self._late > max(self._gap, _PERIODS * before)

@@ -15,7 +15,7 @@ Numba is imported when the first function is prepared or called, not before.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cached_property, update_wrapper
 from importlib import import_module
 import sys
@@ -24,6 +24,7 @@ from typing import Any, cast, Final, TypeVar
 from needle_dynamics.compiled.store import (
     FOLDER_VARIABLE,
     folders,
+    is_preparing,
     LISTENERS,
     preparing,
     Store,
@@ -197,6 +198,25 @@ def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
         yield
     finally:
         LISTENERS.remove(listener)
+
+
+def other_compilations(
+    listener: Callable[[str, bool, bool], None],
+) -> AbstractContextManager[object]:
+    """Call the listener, as `reports` does, before Numba compiles a function that is no kernel."""
+    from numba.core.event import Event, install_listener, Listener
+
+    class Compilations(Listener):  # type: ignore[misc]
+        def on_start(self, event: Event) -> None:
+            dispatcher = event.data['dispatcher']
+            if not isinstance(dispatcher._cache, Store):
+                listener(dispatcher.py_func.__qualname__, False, is_preparing())
+
+        def on_end(self, event: Event) -> None:
+            pass
+
+    listening: AbstractContextManager[object] = install_listener('numba:compile', Compilations())
+    return listening
 
 
 def announce_compilation() -> None:

@@ -112,6 +112,11 @@ def preparing() -> Iterator[None]:
         _PREPARED.now = False
 
 
+def is_preparing() -> bool:
+    """Return whether this thread is inside `preparing`."""
+    return getattr(_PREPARED, 'now', False)
+
+
 class Store:
     """Machine code of one function, with the interface of Numba's caches."""
 
@@ -156,7 +161,7 @@ class Store:
             if found is not None:
                 _unlock(folder, name)
         for listener in tuple(LISTENERS):
-            listener(self._name, found is not None, getattr(_PREPARED, 'now', False))
+            listener(self._name, found is not None, is_preparing())
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:

@@ -22,8 +22,9 @@ from needle_dynamics.compiled.store import SUFFIX
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
+from needle_ros.contract import JOINT_COMMANDS, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.status import SteeringPhase, SteeringStatus
+import numba
 from numba.core.event import install_recorder
 import pytest
 from rclpy.node import Node
@@ -194,6 +195,19 @@ def test_plant_preloads_mode_robot(rig: Callable[..., Rig], plant: dict[str, Any
     one.done(one.operator.set('plant', 'model.coulomb_friction', 0.6))
 
 
+def test_plant_preloads_joint_commands(rig: Callable[..., Rig]) -> None:
+    """The needle follows the positions of a driver."""
+    one = rig(plant={'mode': 'robot', **STEERED})
+    driver = one.user.create_publisher(JointState, JOINT_COMMANDS.name, COMMAND)
+    goal = one.depth + 1e-3
+
+    def arrived() -> bool:
+        driver.publish(JointState(name=['insertion'], position=[goal]))
+        return abs(one.depth - goal) < 1e-4
+
+    one.until(arrived, 'the commanded position')
+
+
 def test_plant_preloads_mode_indenter(rig: Callable[..., Rig]) -> None:
     """The end-effector presses in both directions."""
     one = rig(plant={'mode': 'indenter', **RATE})
@@ -292,6 +306,20 @@ def test_configure_compiles_nothing_after_the_preparation(ros_graph: RosGraph, k
         blocked = thread_time() - begun
     assert not compilations.buffer
     assert blocked < LONGEST_BLOCK
+
+
+def test_late_compilation_of_a_users_function_is_an_error(ros_graph: RosGraph) -> None:
+    """A law of the user may call a function that only Numba knows."""
+    node = ros_graph.add(PlantNode, parameters=RATE)
+
+    @numba.njit
+    def users_law(depth: float) -> float:
+        return 2.0 * depth
+
+    assert users_law(0.5) == 1.0
+    (name,) = node.late
+    assert name.endswith('users_law')
+    node.late.clear()
 
 
 def _answers(graph: RosGraph, user: Node, name: str) -> Callable[[], list[str]]:
