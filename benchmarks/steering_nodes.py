@@ -418,7 +418,7 @@ class SimulatedSteering(GraphNode):
         else:
             node, status = content
             if status.takes:
-                self._act(loop.hear(node, status, now))
+                self._act(loop.receive(node, status, now))
 
     def obey(self, now: int) -> None:
         self._act(self.loop.obey(now))

@@ -257,7 +257,7 @@ class SteeringNode(CompiledNode):
     def _take_answers(self, receiver: str, answers: RequestStatus) -> None:
         """Process the answers of a receiver of the motions."""
         if self._loop is not None and self.is_active:
-            self._act(self._loop.hear(receiver, answers, self.now()))
+            self._act(self._loop.receive(receiver, answers, self.now()))
 
     def _on_request(self, word: str) -> tuple[bool, str]:
         if self._loop is None:

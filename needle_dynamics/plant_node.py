@@ -287,9 +287,9 @@ class PlantNode(ModelNode):
         if self._commanders.changed:
             # The match event may be pending: no command of a second node may act.
             self._check_commanders()
-        counts, complaint = offer(plant_run, self._time.simulated(self.now()))
-        if complaint:
-            self.get_logger().error(printable(complaint), throttle_duration_sec=1.0)
+        counts, refusal = offer(plant_run, self._time.simulated(self.now()))
+        if refusal:
+            self.get_logger().error(printable(refusal), throttle_duration_sec=1.0)
         if counts and self._time.awaited is not None:
             self._time.answered(plant_run.commands.newest.stamp)
             self._on_timer()
@@ -393,7 +393,7 @@ class PlantNode(ModelNode):
         several = self._commanders.update(new)
         # A publisher may have appeared and disappeared while this process was blocked.
         if several:
-            self._run.commands.hush(self._time.simulated(self.now()))
+            self._run.commands.ignore(self._time.simulated(self.now()))
         count = self._commanders.count()
         if self._run.commands.count_commanders(count):
             if self._run.commands.duplicates:

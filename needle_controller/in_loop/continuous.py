@@ -236,7 +236,7 @@ class _Pieces:
         if what == 'leaves its range':
             depth = self.plant.parameters.length - end[0]
             raise InsertionDepthError(
-                f'inserted length {depth:.6g} m left its range at {time:g} s'
+                f'insertion depth {depth:.6g} m left its range at {time:g} s'
             )
         if what == 'touches the hub':
             end[0] = 0.0

@@ -269,7 +269,7 @@ def run_batch(
 def _setpoints(reference: Reference, period: float, count: int) -> FloatArray:
     """Return position, velocity and acceleration of a reference at multiples of a period."""
     times = np.arange(count, dtype=np.float64) * period
-    # At rest after the end.
+    # The reference rests after its end.
     moving = int(np.searchsorted(times, reference.duration))
     result = np.empty((count, 3))
     result[moving:] = reference.at(reference.duration + 1.0)

@@ -174,7 +174,7 @@ class Observer:
         if not needle.minimum_depth <= depth <= needle.maximum_depth + slack:
             low = self.model.parameters.minimum_depth
             raise InsertionDepthError(
-                f'inserted length {depth:.6g} m is outside [{low:g}, {needle.maximum_depth:g}] m '
+                f'insertion depth {depth:.6g} m is outside [{low:g}, {needle.maximum_depth:g}] m '
                 '(minimum_depth to the hub); the estimate is held'
             )
         if self._origin is None:

@@ -280,7 +280,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.events.add(Severity.ERROR, f'stopped: {why}')
         return self._motions.stop(now) if moves else None
 
-    def hear(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
+    def receive(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
         """Process the status of another node by name: its answers to the motions."""
         refusal = self._motions.monitor.process(node, status)
         if refusal is None:

@@ -122,7 +122,7 @@ class GuardedLaw:
             )
         raise SteeringFaultError(
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
-            'than the needle was inserted: it slips, or the sensor measures another needle'
+            'than the needle was inserted: the needle slips, or the sensor measures another needle'
         )
 
     def _check_sensor(self, tip: FloatArray | None) -> None:

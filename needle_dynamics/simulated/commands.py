@@ -62,7 +62,7 @@ class Commands:
         self.acting = self.newest = AppliedForces()
         #: Number of nodes that publish commands in addition to the first, and of all of them.
         self.duplicates = self._number = 0
-        self._quiet = 0
+        self._ignored_until = 0
         #: Stamps of the samples to which a command may respond, and whether commands do.
         self._samples: dict[int, None] = {}
         self._answers = False
@@ -130,16 +130,16 @@ class Commands:
 
     def may_move(self, now: int) -> bool:
         """Return whether commands may act at a time [ns], with a single sender."""
-        return not (self.stopped or self.duplicates) and now >= self._quiet
+        return not (self.stopped or self.duplicates) and now >= self._ignored_until
 
     def stop(self) -> None:
         """End the force; no command acts while `stopped`."""
         self.stopped = True
         self.newest = AppliedForces(self.newest.stamp)
 
-    def hush(self, now: int) -> None:
+    def ignore(self, now: int) -> None:
         """Ignore commands for the timeout; a short-lived node may have sent some."""
-        self._quiet = now + round(self._timeout)
+        self._ignored_until = now + round(self._timeout)
         self._answers = False
         self.newest = AppliedForces(self.newest.stamp)
 

@@ -89,8 +89,8 @@ class PlantRun:
         self.commanded = set()
         try:
             asked = self._joint_commands.read(reading, self._positions(), now)
-            counts, complaint = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
-            if counts and not complaint and commands.may_move(now):
+            counts, refusal = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
+            if counts and not refusal and commands.may_move(now):
                 for goals, within in asked.motions:
                     content = {
                         'joints': list(goals),
@@ -104,7 +104,7 @@ class PlantRun:
         except ParameterError as error:
             commands.refuse()
             return True, f'{JOINT_COMMANDS.name}: {error}; no force is applied'
-        return counts, complaint
+        return counts, refusal
 
     def followed(self) -> dict[str, FollowedJoint]:
         """Return reference and measurement of each joint that follows trajectories."""

@@ -54,7 +54,7 @@ class Insertion(Displayed):
     """
     Time simulation of a steered needle: axial dynamics and quasi-static lateral bending.
 
-    The axial dynamics include mass, friction that may grow with the inserted length, and at the
+    The axial dynamics include mass, friction that may grow with insertion depth, and at the
     tip the cutting force and membranes that resist until they are punctured. The lateral motion is
     a `SteeredNeedle`: lateral mass and damping are neglected, because their transients decay
     within a few tens of milliseconds at the speeds of an insertion.

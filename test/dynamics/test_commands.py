@@ -178,7 +178,7 @@ def test_no_command_acts_for_the_timeout_after_a_short_lived_publisher() -> None
     """Its commands may arrive late, and expire within the timeout."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
-    commands.hush(NOW)
+    commands.ignore(NOW)
     assert commands.newest == AppliedForces(NOW)
     for k, acts in ((1, False), (99, False), (100, True)):
         at = NOW + k * PERIOD
@@ -234,7 +234,7 @@ def test_force_without_the_stamp_of_a_sample_is_rejected() -> None:
     assert commands.refused == 2
     # A release of the force is always accepted: a stop command needs no sample.
     assert commands.offer(0, '', 0.0, 0.0, NOW + PERIOD + 40) == (True, '')
-    for change in (lambda: commands.count_commanders(0), lambda: commands.hush(NOW + PERIOD)):
+    for change in (lambda: commands.count_commanders(0), lambda: commands.ignore(NOW + PERIOD)):
         commands.hold(NOW + 2 * PERIOD)
         commands.offer(NOW + 2 * PERIOD, '', 1.0, 0.0, NOW + 2 * PERIOD + 10)
         assert not commands.offer(0, '', 9.0, 0.0, NOW + 2 * PERIOD + 20)[0]

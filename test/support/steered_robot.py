@@ -127,7 +127,7 @@ class Robot:
         """Publish the status of all nodes with joints."""
         for name, log in self.logs.items():
             status = log.status()
-            hear = partial(self.loop.hear, name)
+            hear = partial(self.loop.receive, name)
             self.post('diagnostics', partial(self.take, hear, status))
 
     def request(self, word: str) -> bool:
