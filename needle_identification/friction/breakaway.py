@@ -29,7 +29,7 @@ _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='
 def breakaway_force(
     design: Design, parameters: Sequence[ParameterEstimate]
 ) -> ParameterEstimate | None:
-    """Return the mean force [N] at which a resting needle began to move under a rising force, if any."""
+    """Return the mean rising force [N] at which a resting needle began to move, if any."""
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
     found = []

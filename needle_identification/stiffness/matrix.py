@@ -234,7 +234,7 @@ def spring_estimates(
 
 def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[float, float]:
     """Return the 95 % interval of the magnitude of a signed quantity."""
-    # The interval contains each magnitude for which the measured value is among the nearest 95 % of values.
+    # A magnitude is in the interval if the measured value is among its nearest 95 % of values.
     if error <= ROUNDING * value:
         return value, value
     found = value / error
