@@ -46,21 +46,28 @@ MISTAKES = [
 ]
 
 
-def command(ros_graph: RosGraph, folder: Path, *words: str) -> tuple[list[str], dict[str, str]]:
+def command(
+    ros_graph: RosGraph, folder: Path, *words: str, rate: float | None = 200.0
+) -> tuple[list[str], dict[str, str]]:
     """Return the command line, and the environment with the domain of the test."""
     line = [sys.executable, '-m', 'needle_insertion.cli', 'run', '-o', str(folder), *words]
     # Below the default rate, because tests run in parallel.
     nodes = ('controller',) if '--hardware' in words else ('plant', 'controller')
-    for node in nodes:
-        line += ['-p', f'{node}.rate=200']
+    for node in nodes if rate else ():
+        line += ['-p', f'{node}.rate={rate}']
     return line, {**ros_graph.environment}
 
 
 def told(
-    ros_graph: RosGraph, folder: Path, script: Sequence[str], *words: str
+    ros_graph: RosGraph,
+    folder: Path,
+    script: Sequence[str],
+    *words: str,
+    rate: float | None = 200.0,
+    longest: float = _LONGEST,
 ) -> tuple[int, str, str]:
     """Run a script; return status, output and errors."""
-    line, environment = command(ros_graph, folder, *words)
+    line, environment = command(ros_graph, folder, *words, rate=rate)
     process = subprocess.Popen(
         line,
         env=environment,
@@ -75,7 +82,7 @@ def told(
     process.stdin = None
     begin = time.monotonic()
     # Nodes of this process continue meanwhile.
-    while process.poll() is None and time.monotonic() - begin < _LONGEST:
+    while process.poll() is None and time.monotonic() - begin < longest:
         ros_graph.executor.spin_once(timeout_sec=0.05)
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
@@ -121,6 +128,26 @@ def test_script_inserts_changes_the_law_and_retracts(ros_graph: RosGraph, tmp_pa
     (run,) = verify(bag)
     assert run.verdict == 'identical'
     assert (tmp_path / 'run' / 'logs' / 'plant.log').is_file()
+
+
+def test_session_of_the_readme_is_reproduced(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """In simulated time, at the default rate; only the last measurements depend on the machine."""
+    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+    (line,) = re.findall(r'^needle run(.*)$', page, re.MULTILINE)
+    (session,) = re.findall(r'^```console\n(needle> .*?)```', page, re.MULTILINE | re.DOTALL)
+    script = re.findall(r'^needle> (.*)$', session, re.MULTILINE)
+    status, said, complained = told(
+        ros_graph, tmp_path / 'run', script, *line.split(), rate=None, longest=400.0
+    )
+    assert (status, complained) == (0, ''), said
+
+    def fixed(line: str) -> str:
+        return re.sub(r'[-+]?\d+\.\d+', '#', line) if line.startswith('depth') else line
+
+    # Lines of the page are wrapped with an indentation.
+    shown = re.sub(r'\n +', ' ', session).splitlines()
+    printed = said.splitlines()[-len(shown) - 1 : -1]
+    assert [*map(fixed, printed)] == [*map(fixed, shown)]
 
 
 def test_script_ends_at_a_rejected_target(ros_graph: RosGraph, tmp_path: Path) -> None:
