@@ -18,7 +18,7 @@ from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict
-from needle_ros.status import ControllerPhase, SteeringPhase, SteeringStatus
+from needle_ros.status import CommissioningPhase, ControllerPhase, SteeringPhase, SteeringStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -245,6 +245,35 @@ def test_steered_controller_follows_the_node(ros_graph: RosGraph, continuous: bo
     assert 'joint_trajectory' not in controller.diagnose().status.last_rejection
     # At the end of the last path, not at a target.
     assert bench.at('insertion') == pytest.approx(TARGET[1], abs=3e-4)
+
+
+def test_first_motion_is_checked_before_a_steered_insertion(ros_graph: RosGraph) -> None:
+    """The first motion of `steering` waits for the check of the controller."""
+    time: dict[str, Any] = {'use_sim_time': True}
+    bench = Bench(ros_graph, mode='simulation', rate=50.0, **time)
+    facts = {'positions': [0.0, 0.1], 'depths': [0.0, 0.1], 'start_depth': PLANT['depth']}
+    controller = ros_graph.add(
+        ControllerNode,
+        parameters={
+            **time,
+            'steered': True,
+            'rate': 200.0,
+            'reference.speed': 0.05,
+            'reference.acceleration': 1.0,
+            'needle': 'bending_35mm',
+            'hardware.command_topic': 'wrench_command',
+            **{f'hardware.commissioning.{name}': value for name, value in facts.items()},
+        },
+    )
+    bench.takers = 2
+    bench.until(
+        lambda: controller.diagnose().status.phase is not ControllerPhase.WAITING, 'the controller'
+    )
+    assert controller.diagnose().status.commissioning is CommissioningPhase.WAITING
+    bench.aim()
+    assert bench.end() is SteeringPhase.DONE, bench.said
+    assert controller.diagnose().status.commissioning is CommissioningPhase.PASSED
+    assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
 
 
 def test_steered_controller_ignores_targets(ros_graph: RosGraph) -> None:
