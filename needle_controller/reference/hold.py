@@ -32,7 +32,7 @@ class ReferenceHold:
 
     def measure(self, sample: tuple[float, ...], age: float, friction: float) -> bool:
         """Process time, depth, velocity and force of an age [s]; return whether to restart."""
-        guide, missing, (time, depth, velocity, reported) = self._guide, self.missing, sample
+        guide, missing, (time, _, velocity, reported) = self._guide, self.missing, sample
         # Measurements that are always late or rare are no gap.
         before, self._late = self._late, max(time - guide.now, age)
         gap = self._late > max(self._gap, _PERIODS * before)
