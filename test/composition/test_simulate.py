@@ -50,7 +50,7 @@ def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
         ['--set', 'modes=3', '--set', 'minimum_depth=0.02'],
     ):
         assert main([*SHORT, '--json', *change]) == 0
-        ends.append(json.loads(capsys.readouterr().out)['inserted length at the end [m]'])
+        ends.append(json.loads(capsys.readouterr().out)['depth at the end [m]'])
     assert len(set(ends)) == 3
 
 
