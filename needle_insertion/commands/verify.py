@@ -65,11 +65,11 @@ def _table(results: Sequence[Rerun]) -> str:
 
 
 def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
-    shared: dict[str, list[str]] = {}
+    shared: dict[str, dict[Path, str]] = {}
     for result in results:
         name = result.recorded.path.name
         for note in result.notes:
-            shared.setdefault(note, []).append(name)
+            shared.setdefault(note, {})[result.recorded.path] = name
         if result.first is not None:
             at = result.first
             seconds, rest = divmod(at['stamp'], NANOSECONDS)
@@ -80,7 +80,7 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
             )
     for note, names in shared.items():
         more = f' and {len(names) - 2} more' if len(names) > 2 else ''
-        yield f'{", ".join(names[:2])}{more}: {note}'
+        yield f'{", ".join(list(names.values())[:2])}{more}: {note}'
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'

@@ -35,7 +35,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
         'duration [s]': float(trajectory.time[-1]),
         **({'hub at the skin after [s]': float(at_hub[0])} if at_hub.size else {}),
         'insertion depth at the end [m]': float(trajectory.depth[-1]),
-        'insertion speed at the end [m/s]': float(-states[-1, model.coordinates]),
+        'insertion velocity at the end [m/s]': float(-states[-1, model.coordinates]),
         'largest tip deflection [m]': float(np.abs(tips).max()),
         'tip deflection at the end [m]': float(tips[-1]),
         'energy at the start [J]': model.energy(states[0]),

@@ -628,6 +628,23 @@ def test_unusable_bags_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture
     assert '1 runs: 1 identical' in captured.out
 
 
+def test_note_on_two_runs_names_their_bag_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / 'bag'
+    with BagWriter(path) as bag:
+        for name in ('/left', '/right'):
+            for topic, kind in KINDS.items():
+                bag.add_topic(name + topic, kind)
+            for message in simulated():
+                bag.write(name + message.topic, message.data, message.received)
+        bag.write('/left/wrench_command', b'', BEGIN)
+    assert main(['verify', str(path)]) == 0
+    *_, note, total = capsys.readouterr().out.splitlines()
+    assert note == 'bag: 1 messages of /left/wrench_command are invalid'
+    assert total == '2 runs: 2 identical'
+
+
 def test_missing_parameters_are_named(tmp_path: Path) -> None:
     messages = without_events(simulated())
     values = configuration()

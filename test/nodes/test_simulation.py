@@ -8,9 +8,11 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from builtin_interfaces.msg._time import Time
 from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
+from needle_controller.controller_node import ControllerNode
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.event_log import Severity
 from needle_ros.status import PlantPhase, PlantStatus
 import numpy as np
 import pytest
@@ -213,6 +215,46 @@ def test_lockstep_plant_waits_and_reports_the_reason(ros_graph: RosGraph) -> Non
     bench.force = 0.0
     bench.further(20)
     assert stamp_ns(bench.states[-1]) > 15 * PERIOD
+
+
+@pytest.mark.parametrize('remaps', [[], ['--ros-args', '-r', '/clock:=clock']])
+def test_two_plants_with_their_own_time_need_two_clocks(
+    ros_graph: RosGraph, remaps: list[str]
+) -> None:
+    """On one topic each plant reports the other; on two, each controller has its plant's time."""
+    times: dict[str, dict[str, object]] = {
+        'left': {'lockstep': True},
+        'right': {'publish_clock': True, 'real_time_factor': 0.1},
+    }
+    plants, controllers = {}, {}
+    for name, own in times.items():
+        options = {'namespace': name, 'cli_args': remaps}
+        plants[name] = ros_graph.add(PlantNode, parameters={**RATE, **own}, **options)
+        controllers[name] = ros_graph.add(
+            ControllerNode, parameters={**RATE, 'use_sim_time': True}, **options
+        )
+    if not remaps:
+        ros_graph.spin_until(
+            lambda: all(one.diagnose().status.other_clock for one in plants.values()), 'the others'
+        )
+        for name, other in zip(plants, ('/right/plant', '/left/plant'), strict=True):
+            report = plants[name].diagnose()
+            line = f'{other} publishes /clock, too: remap it in each namespace, -r /clock:=clock'
+            assert (report.severity, report.message) == (Severity.ERROR, line)
+        return
+
+    def behind(name: str) -> float:
+        """Return the periods from the time of a controller to the time of its plant."""
+        time = 1e-9 * controllers[name].get_clock().now().nanoseconds
+        return float(plants[name].diagnose().status.time - time) * RATE['rate']
+
+    ros_graph.spin_until(lambda: plants['left'].diagnose().status.time > 1.0, 'a second')
+    reports = {name: plant.diagnose() for name, plant in plants.items()}
+    assert {one.status.other_clock for one in reports.values()} == {''}
+    assert Severity.ERROR not in {one.severity for one in reports.values()}
+    assert all(one.diagnose().severity is Severity.INFO for one in controllers.values())
+    # The other time is 90 % of a second away, 180 periods.
+    assert all(abs(behind(name)) < 20.0 for name in times)
 
 
 def test_maximum_speed_exceeds_real_time(ros_graph: RosGraph) -> None:
