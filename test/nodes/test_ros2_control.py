@@ -328,9 +328,10 @@ def test_commanded_run_is_reproduced_by_replay(
         ros_graph,
         tmp_path,
         kinds[mode],
-        # This process keeps up on a busy machine, and the plant waits for the recorder.
+        # The recorder keeps up on a busy machine: its queue of 50 samples lasts for 2 s.
         **{
             'rate': 100.0,
+            'real_time_factor': 0.25,
             'publish_clock': True,
             'paused': True,
             **(STEERED if mode == 'steered' else {'mode': mode, 'depth': 0.02}),

@@ -192,16 +192,21 @@ def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path
             'hardware.commissioning.start_depth': 0.02,
         }.items()
     ]
-    script = ['target 22mm', 'wait 100']
-    status, said, complained = told(
-        ros_graph, tmp_path / 'run', script, '--hardware', '--no-recording', *words
-    )
+    words += ['--hardware', '--no-recording']
+
+    def answered(folder: Path) -> tuple[int, str, str]:
+        """Repeat a session in which a busy machine has delayed the measurements."""
+        for _ in range(5):
+            ended = told(ros_graph, folder, ['target 22mm', 'wait 100'], *words)
+            if 'target rejected: joint_states is stale' not in ended[2]:
+                break
+        return ended
+
+    status, said, complained = answered(tmp_path / 'run')
     assert (status, complained) == (0, ''), said
     assert re.search(r'^controller: first motion passed moved -0\.\d+ mm, \d+ ms late', said, re.M)
     # The needle is no longer where it was measured.
-    status, said, complained = told(
-        ros_graph, tmp_path / 'again', script, '--hardware', '--no-recording', *words
-    )
+    status, said, complained = answered(tmp_path / 'again')
     assert status == 1
     # The robot rests within the tolerance of the control law.
     refusal = r'first motion refused: the insertion depth is 0\.02[12]\d* m, measured 0\.02 m'
