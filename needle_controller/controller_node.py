@@ -222,7 +222,8 @@ class ControllerNode(ModelNode):
             facts = self.settings('hardware.commissioning.', CommissioningSettings)
             self._driver.configure(controller, facts, limits)
             robot = self._driver.robot
-        self._supervisor.configure(controller, limits, observed, robot)
+        simulated = bool(self.get_parameter('use_sim_time').value)
+        self._supervisor.configure(controller, limits, observed, robot, simulated=simulated)
         self._connect()
         if feedback == 'ground_truth':
             self.listen(contract.GROUND_TRUTH, self._passing(self._supervisor.truth))

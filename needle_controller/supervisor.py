@@ -68,8 +68,10 @@ class Supervisor(StateMachine[ForceCommand]):
         limits: SafetyLimits,
         observed: ObserverSettings | None = None,
         robot: Robot | None = None,
+        *,
+        simulated: bool = False,
     ) -> None:
-        """Set controller, sensors of the observer, and robot; a latched stop stays."""
+        """Set controller, sensors, robot and kind of time (`Safety`); a latched stop stays."""
         observer = None
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
@@ -86,6 +88,7 @@ class Supervisor(StateMachine[ForceCommand]):
             expected=tuple(noise),
             noise=noise,
             wrench_frame=(robot.settings.wrench_frame if robot is not None else '') or BASE,
+            simulated=simulated,
         )
         self.safety.stop = stop
 

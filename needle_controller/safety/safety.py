@@ -25,7 +25,8 @@ class Safety:
     Conditions for a force command: valid inputs, limits, no latched stop, one publisher per topic.
 
     `expected` are the topics that must be published continuously, `noise` is the noise of the
-    sensor values by topic, and `wrench_frame` the frame of the force sensor.
+    sensor values by topic, and `wrench_frame` the frame of the force sensor. With `simulated` time
+    a message may arrive before the /clock of its stamp.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class Safety:
         expected: Sequence[str] = (),
         noise: Mapping[str, Sequence[float]] | None = None,
         wrench_frame: str = BASE,
+        simulated: bool = False,
     ) -> None:
         self.limits = limits
         self.stop: str | None = None  #: Reason of the latched stop.
@@ -58,7 +60,7 @@ class Safety:
             'tip_deflection': (limits.sensor_timeout, (ENTRY,), (limits.tip_jump,)),
         }
         # A stamp in the future would make the stamps of the true source late.
-        ahead = 1.0 / settings.rate
+        ahead = settings.measurement_timeout if simulated else 1.0 / settings.rate
         self.streams = {
             name: InputMonitor(
                 name, timeout, frames=frames, jumps=jumps, noise=noise.get(name, ()), ahead=ahead

@@ -33,12 +33,14 @@ class Loop:
         target: float | None = 0.1,
         observed: ObserverSettings | None = None,
         limits: SafetyLimits | None = None,
+        simulated: bool = False,
     ) -> None:
         self.seconds = 0.0
         self.supervisor = Supervisor(steady=lambda: self.seconds)
         self.now = 100 * SECOND
         limits = limits or SafetyLimits(tracking_error=0.1)
-        self.supervisor.configure(Controller(PHANTOM), limits, observed)
+        controller = Controller(PHANTOM)
+        self.supervisor.configure(controller, limits, observed, simulated=simulated)
         self.supervisor.retract_depth = 0.01
         self.supervisor.activate(self.now, {TOPIC: 1})
         self.depth = 0.02
@@ -311,6 +313,25 @@ def test_response_monitor_ignores_robots_without_force_or_in_motion(moves: bool)
 
 
 @pytest.mark.requirement('S-051', 'S-066')
+@pytest.mark.requirement('S-281')
+@pytest.mark.parametrize('lag', [1, 2, 50])
+def test_late_clock_does_not_change_the_commands(lag: int) -> None:
+    """With simulated time: a /clock is lost, or processed after the samples."""
+    late, punctual = Loop(simulated=True), Loop(simulated=True)
+    for k in range(300):
+        # /clock is `lag` periods late in a part of the motion.
+        behind = lag * PERIOD if 100 <= k < 200 else 0
+        late.now -= behind
+        answer, expected = late.measure(1e-5, 1e-2, late=-behind), punctual.measure(1e-5, 1e-2)
+        late.now += behind
+        assert answer == expected
+    assert late.supervisor.fault is None
+    real = Loop()
+    for _ in range(100):
+        real.measure(1e-5, 1e-2)
+    assert real.measure(1e-5, 1e-2, late=-2 * PERIOD) == ForceCommand(real.now)
+
+
 def test_repeated_measurement_gets_the_same_command() -> None:
     """The reference is not published again; after a stop the command is zero."""
     loop = Loop()

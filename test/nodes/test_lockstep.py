@@ -113,14 +113,14 @@ def drive(
         )
         if bag is not None:
             graph.spin_until(lambda: records_all(probe), 'the recorder')
+        graph.wait_active(probe, 'controller')
         message = PointStamped()
         message.point.y = target
-
-        def aims() -> bool:
-            aim.publish(message)
-            return health.get('/controller', ControllerStatus()).target == target
-
-        graph.spin_until(aims, 'the target')
+        # Once: a repetition may be executed in motion.
+        aim.publish(message)
+        graph.spin_until(
+            lambda: health.get('/controller', ControllerStatus()).target == target, 'the target'
+        )
         if course is not None:
             # For the plant, and for the controller, which ignores it.
             graph.spin_until(lambda: move.get_subscription_count() >= 2, 'the subscribers')
