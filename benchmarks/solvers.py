@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Open-loop run of the paper: the integrator of this package and SciPy solvers, at equal error.
+Open-loop run of the paper: the integrator of this package and other solvers, at equal error.
 
 Each solver is timed for the final state only, with the loosest setting on a fine grid that meets
-the error. The error of the SciPy solvers is evaluated at their own steps, without interpolation.
+the error. The error of the other solvers is evaluated at their own steps, of `odeint` on a grid.
 The integrator of this package does not report its steps; its error is evaluated over runs to each
 time of a grid, each in one call like the timed run.
 """
@@ -13,10 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast, Final, TypeVar
+from math import sqrt
+from typing import Any, cast, Final, NamedTuple
 from unittest import mock
 import warnings
 
+from benchmarks.dop853 import build_solver, compiled
 from benchmarks.measure import Bar, geometric, least_times, number, seconds
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
@@ -28,17 +30,19 @@ from needle_dynamics.compiled.integrals import (
     two_modes,
 )
 from needle_dynamics.compiled.modal_flow import rotate_two
-import numba
 import numpy as np
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import odeint, quad, solve_ivp
 
 #: Open-loop run of the paper: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
 FORCE, DEPTH, DEFLECTION, DURATION = 3.0, 0.02, 5e-4, 0.0285
 
-#: Error of all solvers, over the peak of the tip deflection.
+#: Error of all solvers, over the peak of the tip deflection; first of the table of all.
 ACCURACY: Final = 1e-3
+ACCURACIES: Final = (ACCURACY, 1e-2, 1e-4, 1e-5, 1e-6)
 
-METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
+#: Solvers that run in one compiled call, except for the right-hand side of `odeint`.
+ODEINT, COMPILED = 'odeint (LSODA)', 'DOP853, compiled'
+METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA', ODEINT)
 
 #: Grids of settings, from loose to tight: ratio of neighbors.
 _TOLERANCE_RATIO: Final = 10.0**-0.125
@@ -46,6 +50,11 @@ _STEP_RATIO: Final = 2.0**-0.0625
 
 #: Sampling interval of our error [s]; several samples in a period of each mode.
 _GRID: Final = 1e-5
+#: The same at smaller errors, with more steps.
+_COARSE_GRID: Final = 1e-4
+
+#: Most stored steps.
+_STORED: Final = 20_000
 
 #: Absolute over relative tolerance, if not proportional to the peak of each state.
 _ABSOLUTE: Final = 1e-4
@@ -54,27 +63,23 @@ _NODES: Final = 16
 
 RightHandSide = Callable[[float, FloatArray], FloatArray]
 
-_Function = TypeVar('_Function', bound=Callable[..., object])
+
+class _Data(NamedTuple):
+    """Constants of a run, and memory for the integrals of the modes."""
+
+    force: float
+    constants: tuple[float, float, float, float, float, float, float, float]
+    series: FloatArray
+    terms: FloatArray
+    work: FloatArray
+    grids: FloatArray
+    rows: FloatArray
 
 
-def _compiled(function: _Function) -> _Function:
-    # Not cached on disk: Numba does not detect a change of `two_modes`.
-    return cast(_Function, numba.njit(error_model='numpy')(function))
-
-
-@_compiled
-def _derivative(
-    x: FloatArray,
-    force: float,
-    constants: tuple[float, float, float, float, float, float, float, float],
-    series: FloatArray,
-    terms: FloatArray,
-    work: FloatArray,
-    grids: FloatArray,
-    rows: FloatArray,
-    out: FloatArray,
-) -> None:
+@compiled
+def _derivative(x: FloatArray, data: _Data, out: FloatArray) -> None:
     """Write the time derivative of the state to ``out``, without torque."""
+    force, constants, series, terms, work, grids, rows = data
     length, rho, ei, ka, ca, mass, coulomb, viscous = constants
     depth, reach = length - x[0], length * (terms.shape[0] - 1) / TERMS_PER_LENGTH
     # A trial state of a solver may be outside the range or nan.
@@ -111,8 +116,12 @@ def _derivative(
     out[7] = (g[0, 0] * f2 - g[0, 1] * f1) / determinant
 
 
-def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
-    """Return the compiled equations of motion for a constant insertion force [N]."""
+#: Compiled DOP853 for the compiled equations of motion.
+_dop853 = build_solver(_derivative)
+
+
+def _data(model: NeedleModel, force: float) -> _Data:
+    """Return the constants of a run with a constant insertion force [N]."""
     p = model.parameters
     constants = (
         p.length,
@@ -126,10 +135,16 @@ def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
     )
     tables = model.modes.tables
     work, grids, rows = np.empty(tables.series.shape[1]), np.empty((2, 2, 2)), np.empty((4, 2))
+    return _Data(force, constants, tables.series, tables.terms, work, grids, rows)
+
+
+def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
+    """Return the compiled equations of motion for a constant insertion force [N]."""
+    data = _data(model, force)
 
     def right_hand_side(_time: float, x: FloatArray) -> FloatArray:
         out = np.empty(8)
-        _derivative(x, force, constants, tables.series, tables.terms, work, grids, rows, out)
+        _derivative(x, data, out)
         return out
 
     return right_hand_side
@@ -222,6 +237,14 @@ class Candidate:
     run: Callable[[RightHandSide], Any]
 
 
+class Run(NamedTuple):
+    """Steps of a run, shape (n,), its states, shape (8, n), and calls of the right-hand side."""
+
+    t: FloatArray
+    y: FloatArray
+    nfev: int
+
+
 class OpenLoopCase:
     """Open-loop run with its reference solution, and the search for settings."""
 
@@ -230,6 +253,7 @@ class OpenLoopCase:
         self.model = NeedleModel(self.parameters)
         self.start = self.model.state_at(DEPTH, DEFLECTION)
         self.right_hand_side = compiled_right_hand_side(self.model, FORCE)
+        self._data = _data(self.model, FORCE)
         # A peer of the reference at a tenth of its tolerance differs by 3e-11 of the peak.
         reference = solve_ivp(
             self.right_hand_side,
@@ -258,10 +282,36 @@ class OpenLoopCase:
         return float(np.abs(self._tips(states) - exact).max() / self.peak)
 
     def solve(
-        self, method: str, relative: float, absolute: Any, right_hand_side: RightHandSide
-    ) -> Any:
-        """Run a SciPy solver of `METHODS` with tolerances for `solve_ivp`."""
-        return solve_ivp(
+        self,
+        method: str,
+        relative: float,
+        absolute: FloatArray,
+        right_hand_side: RightHandSide,
+        *,
+        steps: bool = True,
+    ) -> Run:
+        """Run `COMPILED` or one of `METHODS`; return all `steps` or the final state."""
+        if method == COMPILED:
+            times, states = np.empty(_STORED * steps), np.empty((_STORED * steps, 8))
+            state = self.start.copy()
+            count = _dop853(state, DURATION, relative, absolute, self._data, times, states)
+            found = min(max(count, 1), len(times))
+            return Run(times[:found], states[:found].T, 12 * count)
+        if method == ODEINT:
+            samples = round(DURATION / _GRID) if steps else 1
+            grid = np.linspace(0.0, DURATION, samples + 1)
+            values, given = odeint(
+                right_hand_side,
+                self.start,
+                grid,
+                tfirst=True,
+                rtol=relative,
+                atol=absolute,
+                mxstep=_STORED,
+                full_output=True,
+            )
+            return Run(grid, values.T, int(given['nfe'][-1]))
+        solution = solve_ivp(
             right_hand_side,
             (0.0, DURATION),
             self.start,
@@ -269,6 +319,7 @@ class OpenLoopCase:
             rtol=relative,
             atol=absolute,
         )
+        return Run(solution.t, solution.y, solution.nfev)
 
     def integrate(self, step: float, duration: float, *, graded: bool) -> FloatArray:
         """Run our integrator from the start in one call; `graded` steps grow with depth."""
@@ -276,9 +327,9 @@ class OpenLoopCase:
         integrator.advance(duration, FORCE)
         return integrator.state
 
-    def own_error(self, step: float, *, graded: bool) -> float:
-        """Return the error of our integrator over runs to each time of the grid."""
-        count = round(DURATION / _GRID)
+    def own_error(self, step: float, *, graded: bool, spacing: float) -> float:
+        """Return the error of our integrator over runs to each time of a grid [s]."""
+        count = round(DURATION / spacing)
         time = np.linspace(0.0, DURATION, count + 1)[1:]
         states = [self.integrate(step, end, graded=graded) for end in time]
         return self.error(time, np.array(states).T)
@@ -297,55 +348,60 @@ class OpenLoopCase:
             self.integrate(step, DURATION, graded=graded)
         return call.call_count
 
-    def ours(self, *, graded: bool) -> Candidate:
-        """Return our integrator at the longest step that meets the error."""
+    def ours(self, *, graded: bool, accuracy: float = ACCURACY) -> Candidate:
+        """Return our integrator at the longest step that meets an error."""
 
         def run(_unused: RightHandSide) -> None:
             # It has its own equations.
             self.integrate(step, DURATION, graded=graded)
 
-        for step in geometric(3e-5, 1e-6, _STEP_RATIO):
-            error = self.own_error(step, graded=graded)
-            if error <= ACCURACY:
+        spacing = _GRID if accuracy >= ACCURACY else _COARSE_GRID
+        # Second order: from a larger step than the error requires.
+        longest = 3e-5 * sqrt(accuracy / ACCURACY)
+        for step in geometric(longest, 1e-3 * longest, _STEP_RATIO):
+            error = self.own_error(step, graded=graded, spacing=spacing)
+            if error <= accuracy:
                 return Candidate(
                     f'Integrator, {"graded" if graded else "uniform"}',
                     f'step {step:.3g} s{", growing with depth" if graded else ""}',
                     error,
-                    self.steps(step, graded=graded),
+                    self.steps(step, graded=graded) if accuracy >= ACCURACY else 0,
                     run,
                 )
         raise RuntimeError('the integrator does not reach the accuracy')
 
-    def scipy(self, method: str) -> Candidate:
-        """Return a SciPy solver of `METHODS` at the loosest tolerances that meet the error."""
+    def other(self, method: str, accuracy: float = ACCURACY) -> Candidate:
+        """Return one of `METHODS` or `COMPILED` at the loosest tolerances that meet an error."""
         found = []
-        for name, weights in (('1e-4 rtol', _ABSOLUTE), ('rtol x peaks', self._peaks)):
-            for relative in geometric(0.1, 1e-9, _TOLERANCE_RATIO):
+        for name, weights in (('1e-4 rtol', np.full(8, _ABSOLUTE)), ('rtol x peaks', self._peaks)):
+            for relative in geometric(0.1, 1e-11, _TOLERANCE_RATIO):
                 run = partial(self.solve, method, relative, relative * weights)
                 with warnings.catch_warnings():
                     # LSODA warns on failure, which is also in the error.
                     warnings.simplefilter('ignore')
                     solution = run(self.right_hand_side)
                     error = self.error(solution.t, solution.y)
-                if error <= ACCURACY:
+                if error <= accuracy:
                     setting = f'rtol {relative:.2g}, atol {name}'
-                    spent = min(seconds(partial(run, self.right_hand_side)) for _ in range(3))
-                    found.append(
-                        (spent, Candidate(f'SciPy {method}', setting, error, solution.nfev, run))
-                    )
+                    timed = partial(run, steps=False)
+                    spent = min(seconds(partial(timed, self.right_hand_side)) for _ in range(3))
+                    label = method if method in (ODEINT, COMPILED) else f'SciPy {method}'
+                    candidate = Candidate(label, setting, error, solution.nfev, timed)
+                    found.append((spent, candidate))
                     break
         return min(found, key=lambda item: item[0])[1]
 
 
 def compare(tick: Tick) -> Answer:
-    """Compare our integrator with SciPy solvers on the open-loop run."""
+    """Compare our integrator with other solvers on the open-loop run."""
     tick('reference')
     case = OpenLoopCase()
     ours, uniform = case.ours(graded=True), case.ours(graded=False)
     candidates = []
     for method in METHODS:
         tick(f'tolerance of {method}')
-        candidates.append(case.scipy(method))
+        candidates.append(case.other(method))
+    peer = case.other(COMPILED)
     user = user_right_hand_side(case.model, FORCE)
     adaptive = user_right_hand_side(case.model, FORCE, adaptive=True)
 
@@ -353,7 +409,7 @@ def compare(tick: Tick) -> Answer:
     compiled_times = least_times(
         {
             item.name: partial(item.run, case.right_hand_side)
-            for item in (ours, uniform, *candidates)
+            for item in (ours, uniform, *candidates, peer)
         }
         | {'making': partial(Integrator, case.parameters, case.start, graded=True)},
         15,
@@ -381,11 +437,9 @@ def compare(tick: Tick) -> Answer:
         )
 
     rows = [row(ours, own, 'own'), row(uniform, compiled_times[uniform.name], 'own')]
-    rows += [row(item, compiled_times[item.name], 'compiled') for item in candidates]
+    rows += [row(item, compiled_times[item.name], 'compiled') for item in (peer, *candidates)]
     rows += [row(item, user_times[item.name], 'NumPy, Gauss') for item in candidates]
     rows.append(row(first, adaptive_time, 'NumPy, quad'))
-    fastest = min(compiled_times[item.name] for item in candidates)
-    beside = compiled_times[uniform.name]
     section = PageSection(
         'Open-loop run',
         (
@@ -404,17 +458,36 @@ def compare(tick: Tick) -> Answer:
         f'{ACCURACY:.1%} of its peak.\n\n'
         f'- Of our {number(own * 1e6)} us, {number(compiled_times["making"] * 1e6)} us are spent '
         f'on making the integrator.\n'
-        f'- The bars are on graded steps, which grow with depth. Beside uniform steps, the '
-        f'default, the best of SciPy takes {number(fastest / beside)} times as long with the '
-        f'compiled right-hand side, and {number(user_times[first.name] / beside)} times with '
-        f'NumPy.',
+        f'- Ours is on graded steps, which grow with depth; uniform steps are the default.\n'
+        f'- The right-hand side of odeint and of the SciPy solvers is called from Python or '
+        f'through it, 3 us or more each; DOP853, compiled, is one call.',
     )
-    bars = [
-        Bar(f'open loop, {what}', spent / own, limit, 'x ours', at_least=True)
-        for what, spent, limit in (
-            ('best SciPy, compiled right-hand side', fastest, 100.0),
-            ('best SciPy, NumPy and Gauss nodes', user_times[first.name], 1000.0),
-            ('the same solver, NumPy and quad', adaptive_time, 1000.0),
+    second, bars = precision(case, tick)
+    return [section, second], bars
+
+
+def precision(case: OpenLoopCase, tick: Tick) -> tuple[PageSection, list[Bar]]:
+    """Compare the times at several errors with the solvers that run in one call."""
+    rows, bars = [], []
+    for accuracy in sorted(ACCURACIES, reverse=True):
+        tick(f'error {accuracy:g}')
+        items = [case.ours(graded=True, accuracy=accuracy)]
+        items += [case.other(method, accuracy) for method in (COMPILED, ODEINT)]
+        times = least_times(
+            {item.name: partial(item.run, case.right_hand_side) for item in items}, 9
         )
-    ]
-    return [section], bars
+        own, *others = (times[item.name] for item in items)
+        figures = (f'{number(spent * 1e3)}' for spent in (own, *others))
+        rows.append((f'{accuracy:g}', *figures, f'{number(min(others) / own)} x'))
+        for at, limit in ((ACCURACY, 2.0), (min(ACCURACIES), 1.0)):
+            if accuracy == at:
+                ratio = min(others) / own
+                what = f'open loop, best of the others at an error of {accuracy:g}'
+                bars.append(Bar(what, ratio, limit, 'x ours', at_least=True))
+    return PageSection(
+        'Work and precision',
+        ('error / peak', 'ours [ms]', f'{COMPILED} [ms]', f'{ODEINT} [ms]', 'best of them / ours'),
+        rows,
+        'The same run, with graded steps, the compiled right-hand side, and each solver at the '
+        'loosest setting that meets the error. Ours is of second order.',
+    ), bars
