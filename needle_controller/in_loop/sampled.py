@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, repeat
 from math import isfinite
-import os
 from typing import Protocol
 
 from needle_controller.compiled.loop import run_loop
@@ -17,6 +16,7 @@ from needle_controller.laws.law import Law
 from needle_controller.reference.setpoint import Reference
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.progress import Progress, progress_of
+from needle_dynamics.simulated.batch import number_of_runs, thread_count
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -209,12 +209,7 @@ def run_batch(
     each_law = [laws] if isinstance(laws, Law) else list(laws)
     each = [plants] if isinstance(plants, NeedleParameters) else list(plants)
     starts = np.atleast_2d(np.array(states, dtype=float))
-    sizes = {len(each_law), len(each), len(starts)} - {1}
-    if len(sizes) > 1 or 0 in sizes:
-        raise ShapeError(
-            f'laws, plants and states must be for the same number of runs, got {len(each_law)}, '
-            f'{len(each)} and {len(starts)}'
-        )
+    runs = number_of_runs(laws=len(each_law), plants=len(each), states=len(starts))
     periods = {law.period for law in each_law}
     if len(periods) > 1:
         raise ParameterError(f'laws must have the same period, got {sorted(periods)} s')
@@ -224,7 +219,7 @@ def run_batch(
             f'duration must be finite and >= {period:g} s, step > 0, delay and late >= 0, got '
             f'{duration!r}, {step!r}, {delay!r} and {late!r}'
         )
-    count, runs = round(duration / period), sizes.pop() if sizes else 1
+    count = round(duration / period)
     # Setpoint of a command: the reference at the time of its effect.
     motion = _setpoints(reference, period, count + delay + 1)
     setpoints, goal = motion[delay:-1], np.ascontiguousarray(motion[: count + 1, 0])
@@ -254,7 +249,7 @@ def run_batch(
             )  # fmt: skip
             advance()
 
-    workers = min(workers or os.cpu_count() or 1, runs)
+    workers = thread_count(workers, runs)
     with progress_of(progress, runs, 'runs') as each_run, ThreadPoolExecutor(workers) as pool:
         # The first run compiles the loop before the threads need it.
         run(range(1), each_run)

@@ -131,22 +131,18 @@ def simulate_batch(
         for values in (floats('forces', forces), floats('torques', torques))
     )
     count = count_of(duration, interval)
-    sizes = {len(each), len(starts), len(pushes), len(turns)} - {1}
-    shaped = (
-        starts.ndim == 2
-        and starts.size > 0
-        and all(values.ndim == 2 and values.shape[1] in (1, count) for values in (pushes, turns))
+    runs = number_of_runs(
+        parameters=len(each), states=len(starts), forces=len(pushes), torques=len(turns)
     )
-    if len(sizes) > 1 or 0 in sizes or not shaped:
+    inputs_fit = all(v.ndim == 2 and v.shape[1] in (1, count) for v in (pushes, turns))
+    if starts.ndim != 2 or not starts.size or not inputs_fit:
         raise ShapeError(
-            f'parameters, states and inputs must have the same number of runs, inputs constant or '
-            f'for {count} intervals, got {len(each)} parameters, states {starts.shape}, '
-            f'forces {pushes.shape}, torques {turns.shape}'
+            f'forces and torques must be constant or for {count} intervals, got states '
+            f'{starts.shape}, forces {pushes.shape}, torques {turns.shape}'
         )
     if not (np.isfinite(pushes).all() and np.isfinite(turns).all()):
         raise ParameterError('forces and torques must be finite')
     step = checked_step(step)
-    runs = sizes.pop() if sizes else 1
     _check(each, starts)
     inputs = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
     ends = np.array(np.broadcast_to(starts, (runs, starts.shape[1])))
@@ -155,6 +151,15 @@ def simulate_batch(
         kept, completed = _take(each, ends, inputs, keep=keep, workers=workers, progress=advance)
     time = np.arange(count + 1, dtype=np.float64) * interval
     return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
+
+
+def number_of_runs(**counts: int) -> int:
+    """Return the number of runs of a batch; each input is for one run or for all."""
+    found = {*counts.values()} - {1}
+    if len(found) > 1 or 0 in found:
+        given = ', '.join(f'{count} {name}' for name, count in counts.items())
+        raise ShapeError(f'all inputs must be for the same number of runs or for one, got {given}')
+    return found.pop() if found else 1
 
 
 def thread_count(workers: int | None, runs: int) -> int:

@@ -8,7 +8,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cut import insert, NO_FORCES
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.progress import Progress, progress_of
-from needle_dynamics.simulated.batch import thread_count
+from needle_dynamics.simulated.batch import number_of_runs, thread_count
 from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
 from needle_dynamics.steering.parameters import noise_cell, SteeringParameters
@@ -75,13 +75,9 @@ def insert_batch(
     poses = _poses(depths, guides, tilts, rolls)
     each = [needles] if isinstance(needles, NeedleParameters) else list(needles)
     beyond = [steering] if isinstance(steering, SteeringParameters) else list(steering)
-    sizes = {len(each), len(beyond), len(poses), len(seeds)} - {1}
-    if len(sizes) > 1 or 0 in sizes:
-        raise ShapeError(
-            f'needles, steering, poses and seeds must be for one number of runs, got {len(each)}, '
-            f'{len(beyond)}, {len(poses)} and {len(seeds)}'
-        )
-    runs = sizes.pop() if sizes else 1
+    runs = number_of_runs(
+        needles=len(each), steering=len(beyond), poses=len(poses), seeds=len(seeds)
+    )
     cell = noise_cell(beyond[0])
     if any(noise_cell(one) != cell for one in beyond):
         raise ParameterError('path_noise_length must be the same for all runs')
