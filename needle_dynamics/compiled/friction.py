@@ -22,6 +22,11 @@ COULOMB: Final = 0
 STRIBECK: Final = 1
 TANH: Final = 2
 
+#: Largest change of dry friction in a part of a step, relative to static friction, and relative to
+#: Coulomb friction under a smooth law.
+_CHANGE, _SMOOTH_CHANGE = 1e-3, 1e-2
+_SHORTEST: Final = 2e-3  #: shortest part that is divided, over the step
+
 
 class FrictionConstants(NamedTuple):
     """Constants of a friction law; see `needle_dynamics.friction.Friction`."""
@@ -136,18 +141,62 @@ def friction_flow(
     Return velocity [m/s] and displacement [m] of the insertion axis after a step, for every law.
 
     Coulomb friction is exact. Other laws with static friction use the level of dry friction in the
-    middle of the step, which is of second order. Smooth laws are stiff: they take two implicit
+    middle of a part of the step, which is of second order; a part is so short that this level is
+    nearly constant. Smooth laws are stiff: they take two implicit
     stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977), or one stage of
     first order where the two stages would add energy or overshoot the steady velocity.
     """
     if f.law == COULOMB:
         return slide(u, drive, mass, f.coulomb, f.viscous, h, f.withdrawal)
-    bearable = dry_friction(f, f.coulomb, 0.0)[0]
-    if bearable > 0.0:
-        level = dry_friction(f, f.coulomb, abs(u))[0]
-        half, _ = slide(u, drive, mass, level, f.viscous, 0.5 * h, f.withdrawal, bearable / level)
-        level = dry_friction(f, f.coulomb, abs(half))[0]
-        return slide(u, drive, mass, level, f.viscous, h, f.withdrawal, bearable / level)
+    return _divided_flow(f, mass, u, drive, h)
+
+
+@compiled
+def _divided_flow(
+    f: FrictionConstants, mass: float, u: float, drive: float, h: float
+) -> tuple[float, float]:
+    """Return velocity and displacement after a step in parts of nearly constant dry friction."""
+    static = dry_friction(f, f.coulomb, 0.0)[0]
+    largest = _CHANGE * static if static > 0.0 else _SMOOTH_CHANGE * f.coulomb
+    distance, rest, part = 0.0, h, h
+    while rest > 0.0:
+        part = min(part, rest)
+        if static > 0.0:
+            end, way, change = _sticking_flow(f, mass, u, drive, part)
+        else:
+            end, way, change = _smooth_flow(f, mass, u, drive, part)
+        if change > largest and part > _SHORTEST * h:
+            # Thirds: runs with steps of h and h / 2 have different parts, and their difference
+            # contains the error of the parts.
+            part /= 3.0
+            continue
+        u = end
+        distance += way
+        rest -= part
+        part *= 3.0
+    return u, distance
+
+
+@compiled
+def _sticking_flow(
+    f: FrictionConstants, mass: float, u: float, drive: float, h: float
+) -> tuple[float, float, float]:
+    """Return velocity, displacement and change of friction of a law with static friction."""
+    static = dry_friction(f, f.coulomb, 0.0)[0]
+    level = dry_friction(f, f.coulomb, abs(u))[0]
+    half, _ = slide(u, drive, mass, level, f.viscous, 0.5 * h, f.withdrawal, static / level)
+    middle = dry_friction(f, f.coulomb, abs(half))[0]
+    end, way = slide(u, drive, mass, middle, f.viscous, h, f.withdrawal, static / middle)
+    last = dry_friction(f, f.coulomb, abs(end))[0]
+    change = max(abs(middle - level), abs(last - middle))
+    return end, way, max(change, static - min(level, last)) if u * end < 0.0 else change
+
+
+@compiled
+def _smooth_flow(
+    f: FrictionConstants, mass: float, u: float, drive: float, h: float
+) -> tuple[float, float, float]:
+    """Return velocity, displacement and change of friction of a smooth law."""
     part = 1.0 - sqrt(0.5)
     first = _implicit_stage(f, mass, u, drive, part * h)
     end = _implicit_stage(f, mass, u + (1.0 - part) / part * (first - u), drive, part * h)
@@ -157,7 +206,9 @@ def friction_flow(
     if lost < 0.0 or turned:
         end = _implicit_stage(f, mass, u, drive, h)
         step = h * end
-    return end, step
+    before = dry_friction(f, f.coulomb, abs(u))[0]
+    after = dry_friction(f, f.coulomb, abs(end))[0]
+    return end, step, abs(before - after) if u * end >= 0.0 else before + after
 
 
 @compiled

@@ -97,6 +97,28 @@ def test_default_run_meets_its_error_estimate(name: str) -> None:
     assert apart(run, fine) < run.error
 
 
+@pytest.mark.parametrize('preset_name', ['paper_si', 'phantom'])
+@pytest.mark.parametrize('speed', [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('tip', [1e-4, 1e-3])
+def test_error_includes_the_time_scale_of_friction(
+    preset_name: str, speed: float, tip: float
+) -> None:
+    """
+    Static friction decreases to Coulomb friction within a small part of a step.
+
+    The reference has even steps, of a fiftieth of the time in which friction changes the velocity
+    by `stribeck_speed`, or of an eighth of the shortest step.
+    """
+    p = preset(preset_name, friction_law='stribeck', breakaway_friction=1.5, stribeck_speed=speed)
+    start = NeedleModel(p).state_at(0.05, tip)
+    run = simulate(p, start, 2.0, duration=0.03)
+    scale = p.moving_mass * speed / (0.5 * p.coulomb_friction)
+    step = min(float(run.steps.min()) / 8.0, scale / 50.0)
+    fine = simulate(p, start, 2.0, duration=0.03, step=step)
+    # The error of the reference is of second order in the ratio of the steps: 1/64 of the error.
+    assert apart(run, fine) < 1.02 * run.error
+
+
 @pytest.mark.parametrize('name', ['phantom', 'paper_si, layers', 'phantom, sampled often'])
 def test_smaller_tolerances_are_met(name: str) -> None:
     fine = go(name, tolerance=1e-8)

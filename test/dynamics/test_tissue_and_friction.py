@@ -580,7 +580,8 @@ def test_every_friction_law_is_of_second_order(
     )
     assert np.all(solved.y[4] * sign < -0.1)
     errors = []
-    for step in (1.6e-5, 8e-6, 4e-6, 2e-6):
+    # Longer steps are divided for Stribeck friction, which makes their error smaller.
+    for step in (8e-6, 4e-6, 2e-6):
         it = Integrator(p, start, step)
         it.advance(6e-3, 1.2 * sign)
         errors.append(np.abs((it.state - solved.y[:, -1])[[0, 4]]))
