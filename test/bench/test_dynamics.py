@@ -64,7 +64,7 @@ def test_force_below_friction_causes_no_motion_in_any_solver() -> None:
 
 
 def test_run_error_is_relative_tip_error(open_loop: OpenLoopCase) -> None:
-    run = open_loop.solve('DOP853', 1e-8, 1e-12, open_loop.right_hand_side)
+    run = open_loop.solve('DOP853', 1e-8, np.full(8, 1e-12), open_loop.right_hand_side)
     assert open_loop.error(run.t, run.y) < 1e-6
     wrong = run.y.copy()
     wrong[2:4] *= 1.01

@@ -53,8 +53,10 @@ def bars(modules: Sequence[str]) -> Iterator[tuple[str, str]]:
             if isinstance(item, ast.Call) and ast.unparse(item.func) == 'Bar':
                 figure, _, limit, *unit = item.args
                 value = limit.value if isinstance(limit, ast.Constant) else None
-                known = isinstance(value, float) and all(isinstance(u, ast.Constant) for u in unit)
-                yield pattern(figure), rf'[<>]= {value:g}( .+)?' if known else ANY
+                shown = ANY
+                if isinstance(value, float) and all(isinstance(u, ast.Constant) for u in unit):
+                    shown = rf'[<>]= {value:g}( .+)?'
+                yield pattern(figure), shown
 
 
 def rows(name: str) -> list[tuple[str, str]]:

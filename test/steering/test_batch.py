@@ -120,7 +120,11 @@ def test_wrong_shapes_are_rejected(shape: tuple[int, ...]) -> None:
         ({'rolls': [0.0, 1.0, 2.0]}, ShapeError, r'rolls must have shape \(2,\) or \(runs, 2\)'),
         ({'guides': [0.0, np.inf]}, ParameterError, 'guides must be finite'),
         ({'seeds': ()}, ShapeError, 'got 1 needles, 1 steering, 1 poses, 0 seeds'),
-        ({'seeds': (1, 2), 'needles': [NEEDLE] * 3}, ShapeError, 'got 3 needles, 1 steering, 1 poses, 2 seeds'),
+        (
+            {'seeds': (1, 2), 'needles': [NEEDLE] * 3},
+            ShapeError,
+            'got 3 needles, 1 steering, 1 poses, 2 seeds',
+        ),
         ({'workers': 0}, ParameterError, 'workers must be an integer >= 1, got 0'),
         (
             {'steering': [STEERING, SteeringParameters(path_noise_length=1e-3)]},
