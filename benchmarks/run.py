@@ -23,6 +23,7 @@ Question: TypeAlias = Callable[[Tick], Answer]
 #: Modules of each benchmark, each with a function `compare`; safety, graph and slicer need ROS.
 MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
+    'honesty': ('honesty',),
     'identification': ('identification',),
     'calibration': ('calibration', 'noises'),
     'damage': ('damage',),
@@ -48,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument('-o', '--output', type=Path, metavar='FILE', help='write the page, too')
     add = partial(names.add_parser, parents=[output])
     add('dynamics', help='the integrator compared with SciPy, MuJoCo and PyElastica')
+    honesty = add('honesty', help='the error stated by simulate, compared with the true error')
+    honesty.add_argument('--needles', type=int, metavar='N', help='needles of each friction law')
     add('identification', help='time from a bag to a result, compared with other readers')
     calibration = add('calibration', help='coverage and efficiency of the estimates')
     calibration.add_argument(
