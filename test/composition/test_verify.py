@@ -794,9 +794,10 @@ def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
     exact(result)
     assert result.recorded.numbers[0] > 100
     said = [re.sub(r' (before|from) sample \d+.*', '', note) for note in result.notes]
-    # A stall of a busy machine also counts as a pause.
+    # A stall of a busy machine also counts as a pause, and in real time it can lose samples.
     pause = 'time was paused, or samples were given up,'
-    assert [note for note in said if note != pause] == [
+    inputs = [note for note in said if note != pause and not note.startswith('the recorder lost ')]
+    assert inputs == [
         'the sensor was zeroed (~/tare)',
         'joint_trajectory',
         'model.coulomb_friction changed',
