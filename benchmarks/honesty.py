@@ -32,15 +32,18 @@ _FINEST: Final = 5e-9  #: shortest step of a reference [s]
 #: Least travel to which an error refers, relative to the length; see `Trajectory.error`.
 _TRAVEL: Final = 1e-4
 
-#: Smallest error that is compared: references with a quarter of the step differ by up to 1e-7.
+#: Smallest error that is compared: references with a quarter of the step differ by about 1e-7.
 _SMALLEST: Final = 1e-6
+
+#: Speed in which the friction of the law of a user decays [m/s].
+_OWN_SPEED: Final = 1e-3
 
 _LAWS: Final = ('coulomb', 'stribeck', 'tanh', 'own')
 
 
 def _own(coulomb: float, speed: float) -> float:
-    """Return the friction of a law of a user: static friction 1.5 times, decaying in 1 mm/s."""
-    return coulomb * (1.0 + 0.5 * exp(-speed / 1e-3))
+    """Return the friction of a law of a user: static friction is 1.5 times Coulomb friction."""
+    return coulomb * (1.0 + 0.5 * exp(-speed / _OWN_SPEED))
 
 
 def draw(law: str, number: int) -> Iterator[tuple[NeedleParameters, float, float, float]]:
@@ -80,9 +83,8 @@ def ratios(law: str, number: int) -> FloatArray:
         except NeedleError:
             # The needle reaches its hub.
             continue
-        speed = {'stribeck': p.stribeck_speed, 'tanh': p.smoothing_speed, 'own': 1e-3}.get(
-            law, 1.0
-        )
+        scales = {'stribeck': p.stribeck_speed, 'tanh': p.smoothing_speed, 'own': _OWN_SPEED}
+        speed = scales.get(law, 1.0)
         scale = p.moving_mass * speed / p.coulomb_friction
         step = min(float(run.steps.min()) / 8.0, max(scale / 40.0, _FINEST))
         fine = simulate(p, start, force, duration=_DURATION, step=step)
@@ -115,6 +117,6 @@ def compare(tick: Tick, needles: int = 250) -> Answer:
         'Presets paper_si and phantom, straight and bent, 2 to 8 cm inserted, '
         f'{_DURATION * 1e3:g} ms, default tolerance. Speed scales of 0.1 mm/s to 0.5 m/s, and '
         '1 mm/s in the law of a user. Runs that reach the hub are left out. Errors below '
-        f'{_SMALLEST:g} are not compared: those of the references are up to 1e-7.',
+        f'{_SMALLEST:g} are not compared: references differ by about 1e-7.',
     )
     return [section], bars

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from benchmarks.honesty import difference
 from needle_dynamics import (
     InsertionDepthError,
     Integrator,
@@ -71,15 +72,6 @@ def go(name: str, **options: Any) -> Trajectory:
     return simulate(parameters, start, force, duration=duration, interval=interval, **options)
 
 
-def apart(one: Trajectory, exact: Trajectory) -> float:
-    """Return the relative difference of two runs, in peak tip deflection and in travel."""
-    tips, depths = exact.tip_deflection, exact.depth
-    # Least travel as in `Trajectory.error`.
-    way = max(np.abs(depths - depths[0]).max(), 1e-4 * exact.parameters.length)
-    tip = np.abs(one.tip_deflection - tips).max() / np.abs(tips).max()
-    return float(max(tip, np.abs(one.depth - depths).max() / way))
-
-
 @pytest.mark.parametrize('name', CASES)
 def test_default_run_meets_its_error_estimate(name: str) -> None:
     """
@@ -94,7 +86,7 @@ def test_default_run_meets_its_error_estimate(name: str) -> None:
     assert np.isnan(fine.error)
     # At second order a third of the estimate; measured 0.02 to 0.34 of it, and 0.75 where few
     # samples resolve the vibration.
-    assert apart(run, fine) < run.error
+    assert difference(run, fine) < run.error
 
 
 @pytest.mark.parametrize('preset_name', ['paper_si', 'phantom'])
@@ -116,7 +108,7 @@ def test_error_includes_the_time_scale_of_friction(
     step = min(float(run.steps.min()) / 8.0, scale / 50.0)
     fine = simulate(p, start, 2.0, duration=0.03, step=step)
     # The error of the reference is of second order in the ratio of the steps: 1/64 of the error.
-    assert apart(run, fine) < 1.02 * run.error
+    assert difference(run, fine) < 1.02 * run.error
 
 
 @pytest.mark.parametrize('name', ['phantom', 'paper_si, layers', 'phantom, sampled often'])
@@ -126,7 +118,7 @@ def test_smaller_tolerances_are_met(name: str) -> None:
     for tolerance in (1e-2, 1e-4, 1e-6):
         run = go(name, tolerance=tolerance)
         assert run.error <= tolerance
-        assert apart(run, fine) < run.error + 1e-8
+        assert difference(run, fine) < run.error + 1e-8
 
 
 def test_default_run_needs_few_steps() -> None:
