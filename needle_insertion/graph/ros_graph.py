@@ -86,8 +86,11 @@ class Graph:
         try:
             for node in self._nodes:
                 self.executor.remove_node(node)
-                node.destroy_node()
+            # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
+            self.executor.spin_until_future_complete(Future(), timeout_sec=0.0)
             self.executor.shutdown()
+            for node in self._nodes:
+                node.destroy_node()
             self.context.try_shutdown()
             self._nodes.clear()
             self._life_cycles.clear()

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 import signal
 from threading import Timer
+import weakref
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.plant_node import PlantNode
@@ -36,6 +37,17 @@ def test_graph_leaves_no_nodes_or_threads(tmp_path: Path) -> None:
             use(graph)
         counts.append(threads())
     assert counts[2] <= counts[0]
+
+
+def test_queued_task_does_not_keep_the_nodes(tmp_path: Path) -> None:
+    """The servers of a kept node would answer, or fail to answer, clients of the next graph."""
+    with Graph(tmp_path) as graph:
+        node = graph.node('user')
+        graph.executor.create_task(node.get_name)
+        kept = weakref.ref(node), weakref.ref(graph.context)
+        del node
+    del graph.context
+    assert [one() for one in kept] == [None, None]
 
 
 def test_signal_at_any_time_is_an_interrupt(tmp_path: Path) -> None:
