@@ -2,8 +2,9 @@
 """Main function of a node process."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 import ctypes
+import gc
 import inspect
 import os
 from pathlib import Path
@@ -22,6 +23,7 @@ import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
@@ -67,42 +69,63 @@ def run(kind: Callable[[], BaseNode]) -> int:
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
         _read_files(node)
-        executor: Executor = EventsExecutor()
-        executor.add_node(node)
-        status = 0
-
-        def refuse() -> None:
-            nonlocal status
-            # Publish the reason on /diagnostics.
-            node.publish_diagnostics()
-            status = 2
-
         spinning = True
-        try:
-            if node.get_parameter('autostart').value:
-                node.begin(refuse)
-            while not stopping and status == 0:
-                # Unlike spin_once, this call does not return to Python at each event.
-                executor.spin_until_future_complete(Future(), timeout_sec=0.02)
-        finally:
-            # Command zero force also after an error.
-            node.stop()
-        # Send the last messages (zero force, latched result).
-        deadline = time.monotonic() + 0.1
-        while time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.02)
-        if node.is_preparing:
-            # No command has been sent, and a compiler thread cannot be stopped otherwise.
-            sys.stderr.flush()
-            os._exit(status)
-        executor.shutdown()
-        node.destroy_node()
-        return status or int(node.failed)
+        status = _spin(node, lambda: stopping)
+        # The threads of DDS end with the last object of the node. While the interpreter ends they
+        # would use freed memory.
+        del node
+        gc.unfreeze()
+        gc.collect()
+        return status
     finally:
         rclpy.utilities.try_shutdown()
         # A second Ctrl-C must not change the exit status.
         for one in ENDINGS:
             signal.signal(one, signal.SIG_IGN)
+
+
+def _spin(node: BaseNode, stopping: Callable[[], bool]) -> int:
+    """Spin a node until it is to stop or refused to start; return the exit status."""
+    executor: Executor = EventsExecutor()
+    executor.add_node(node)
+    status = 0
+
+    def refuse() -> None:
+        nonlocal status
+        # Publish the reason on /diagnostics.
+        node.publish_diagnostics()
+        status = 2
+
+    try:
+        if node.get_parameter('autostart').value:
+            node.begin(refuse)
+        while not stopping() and status == 0:
+            # Unlike spin_once, this call does not return to Python at each event.
+            executor.spin_until_future_complete(Future(), timeout_sec=0.02)
+    finally:
+        # Command zero force also after an error.
+        node.stop()
+    # Send the last messages (zero force, latched result).
+    deadline = time.monotonic() + 0.1
+    while time.monotonic() < deadline:
+        executor.spin_once(timeout_sec=0.02)
+    if node.is_preparing:
+        # No command has been sent, and a compiler thread cannot be stopped otherwise.
+        sys.stderr.flush()
+        os._exit(status)
+    end(executor, [node])
+    return status or int(node.failed)
+
+
+def end(executor: Executor, nodes: Collection[Node]) -> None:
+    """Shut an executor down, and destroy its nodes; life cycle services end with the object."""
+    for node in nodes:
+        executor.remove_node(node)
+    # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
+    executor.spin_until_future_complete(Future(), timeout_sec=0.0)
+    executor.shutdown()
+    for node in nodes:
+        node.destroy_node()
 
 
 def _end_with_parent(parent: str) -> None:

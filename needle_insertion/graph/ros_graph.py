@@ -20,7 +20,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.graph.node_process import GraphError, NodeProcess
 from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
-from needle_ros.run_node import END_WITH_PARENT
+from needle_ros.run_node import end, END_WITH_PARENT
 from needle_ros.signals import DeferredSignals
 from rclpy.client import Client
 from rclpy.context import Context
@@ -84,13 +84,7 @@ class Graph:
 
     def __exit__(self, *raised: Any) -> None:
         try:
-            for node in self._nodes:
-                self.executor.remove_node(node)
-            # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
-            self.executor.spin_until_future_complete(Future(), timeout_sec=0.0)
-            self.executor.shutdown()
-            for node in self._nodes:
-                node.destroy_node()
+            end(self.executor, self._nodes)
             self.context.try_shutdown()
             self._nodes.clear()
             self._life_cycles.clear()

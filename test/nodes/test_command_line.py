@@ -72,6 +72,40 @@ def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(ros_graph: RosGr
     assert node.returncode == 0
 
 
+_ENDED = """
+from pathlib import Path
+import sys
+from needle_ros.run_node import run
+from support.installed import node_class
+status = run(node_class(sys.argv.pop(1)))
+print('threads', *[one.read_text().strip() for one in Path('/proc/self/task').glob('*/comm')])
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize('name', ['plant', 'controller', 'recorder'])
+def test_ended_node_leaves_no_thread_of_dds(
+    ros_graph: RosGraph, tmp_path: Path, name: str
+) -> None:
+    """A remaining thread would use the memory of the interpreter while that ends."""
+    words = ['-p', f'path:={tmp_path / "bag"}'] if name == 'recorder' else []
+    node = subprocess.Popen(
+        [sys.executable, '-c', _ENDED, name, '--ros-args', *words],
+        env={**ros_graph.environment, 'PYTHONPATH': str(ROOT / 'test')},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert node.stdout is not None
+    assert any(': active' in line for line in node.stdout)
+    node.send_signal(signal.SIGINT)
+    said, _ = node.communicate(timeout=60.0)
+    assert node.returncode == 0
+    word, *threads = said.splitlines()[-1].split()
+    assert (word, 'python' in ' '.join(threads)) == ('threads', True)
+    assert [one for one in threads if one.startswith('dds.')] == []
+
+
 @pytest.mark.parametrize('stage', ['numpy', 'rclpy', 'visualization_msgs.msg'])
 def test_ctrl_c_during_import_ends_the_process(ros_graph: RosGraph, stage: str) -> None:
     """Immediately, without a traceback."""
