@@ -18,7 +18,7 @@ from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate_batch
-from needle_dynamics.compiled.step import run
+from needle_dynamics.compiled.intervals import run
 from needle_dynamics.simulated.batch import Batch
 import numpy as np
 
@@ -74,7 +74,7 @@ class Batches:
         ends = np.tile(self._start, (len(self._parameters), 1))
         force, torque = np.array([FORCE]), np.zeros(1)
         for p, end in zip(self._parameters, ends, strict=True):
-            run(NeedleModel(p).compiled, end, force, torque, DURATION, _STEP, True, end[None])
+            run(NeedleModel(p).compiled, end, force, torque, DURATION, _STEP, True, 1, end[None])
         return ends
 
     def peak_memory(self, part: float, *, keep: bool) -> int:

@@ -19,7 +19,7 @@ MODULES: Final = (
     'needle_controller.compiled.guide_plan',
     'needle_controller.compiled.hypotheses',
     'needle_dynamics.compiled.lanes',
-    'needle_dynamics.compiled.refined',
+    'needle_dynamics.compiled.intervals',
     'needle_dynamics.compiled.cut',
     'needle_dynamics.compiled.cutting_needle',
     'needle_dynamics.compiled.superposition',

@@ -394,35 +394,3 @@ def advance(
     for value in sums:
         size += abs(value)
     return (left if size < inf else nan), sums
-
-
-@kernel
-def run(
-    c: CompiledNeedle,
-    state: Vector,
-    forces: Vector,
-    torques: Vector,
-    interval: float,
-    longest: float,
-    graded: bool,
-    states: Matrix,
-) -> int:
-    """
-    Advance a state through intervals of constant inputs, in place; return the completed count.
-
-    ``forces`` [N] and ``torques`` [N m] have shape (k,). ``states``, shape (k + 1, 2 (2 + n)),
-    takes the states at the ends of the intervals; with a single row it is unused.
-    """
-    keep, none = states.shape[0] > 1, np.empty((0, 3))
-    if keep:
-        for i in range(state.shape[0]):
-            states[0, i] = state[i]
-    for k in range(forces.shape[0]):
-        inputs = Inputs(forces[k], torques[k], 0.0, False)
-        left, _ = advance(c, state, k * interval, inputs, longest, graded, interval, none)
-        if left != 0.0:
-            return k
-        if keep:
-            for i in range(state.shape[0]):
-                states[k + 1, i] = state[i]
-    return len(forces)

@@ -11,7 +11,8 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
-from needle_dynamics.compiled.step import CompiledNeedle, run
+from needle_dynamics.compiled.intervals import run
+from needle_dynamics.compiled.step import CompiledNeedle
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
@@ -195,7 +196,7 @@ def _take(
             )
             completed[i] = run(
                 needle(i % len(each)), states[i], push, turn, inputs.interval, inputs.longest,
-                inputs.graded, kept[i],
+                inputs.graded, 1, kept[i],
             )  # fmt: skip
             progress()
 

@@ -40,7 +40,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
         'tip deflection at the end [m]': float(tips[-1]),
         'energy at the start [J]': model.energy(states[0]),
         'energy at the end [J]': model.energy(states[-1], float(trajectory.time[-1])),
-        **({'change by twice the step [1]': trajectory.error} if compared else {}),
+        **({'stated error [1]': trajectory.error} if compared else {}),
     }
 
 

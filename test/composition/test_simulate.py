@@ -101,7 +101,7 @@ def test_output_reports_speed_and_accuracy(capsys: pytest.CaptureFixture[str]) -
     assert times == pytest.approx(ratio, rel=0.1)
     for words, most in (([], 1e-3), (['--tolerance', '1e-6'], 1e-6)):
         assert main([*SHORT, '--json', *words]) == 0
-        assert 0.0 < json.loads(capsys.readouterr().out)['change by twice the step [1]'] <= most
+        assert 0.0 < json.loads(capsys.readouterr().out)['stated error [1]'] <= most
 
 
 def test_limits_of_model_and_sampling_are_warned_of(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from needle_dynamics import (
     ToleranceError,
     Trajectory,
 )
-from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
+from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE, ORDERS
 import numpy as np
 import pytest
 
@@ -139,9 +139,52 @@ def test_steps_become_longer_as_the_vibration_fades() -> None:
     assert np.isclose(late, 0.5 * run.time[1]).all()
 
 
-def test_dense_output_has_the_accuracy_of_the_samples() -> None:
-    run = go('paper_si')
-    fine = go('paper_si', step=float(run.steps.min()) / 8.0)
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('changes', [{}, {'tissue_damping': 1.6}, {'carriage_mass': 0.01}])
+def test_error_decreases_with_the_order(changes: dict[str, Any], order: int) -> None:
+    """A needle in motion, without start, stop and border of layers."""
+    p = preset('paper_si', **changes)
+    start = NeedleModel(p).state_at(0.025, 5e-4)
+    # Insertion at 0.5 m/s.
+    start[start.size // 2] = -0.5
+    options: Any = {'duration': 0.028, 'interval': 2.8e-4}
+    fine = simulate(p, start, 3.0, step=3.5e-6, order=8, **options)
+    errors = [
+        difference(simulate(p, start, 3.0, step=step, order=order, **options), fine)
+        for step in (2.8e-5, 1.4e-5)
+    ]
+    # Rounding: runs of order 8 differ by up to 3e-10.
+    assert np.log2(errors[0] / errors[1]) > order - 0.3 or errors[1] < 1e-9
+
+
+@pytest.mark.parametrize('order', ORDERS)
+def test_needle_held_by_friction_does_not_move_at_any_order(order: int) -> None:
+    """Extrapolated depths and velocities are exact at rest, while the modes vibrate."""
+    run = go('phantom, held', step=2e-5, order=order)
+    assert (run.states[:, 0] == run.states[0, 0]).all()
+    assert (run.velocity == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    'name', ['phantom', 'phantom, layers', 'paper_si, 1 N', 'phantom, to the hub']
+)
+def test_small_error_is_not_below_the_true_error(name: str) -> None:
+    """
+    The needle starts, crosses layers, reverses and stops: there the extrapolation has order 2.
+
+    The reference has even steps of order 2, of a 64th of the shortest step of the default run,
+    with a 4096th of its error.
+    """
+    run, default = go(name, tolerance=1e-5), go(name)
+    assert run.order > 2
+    fine = go(name, step=float(default.steps.min()) / 64.0)
+    assert difference(run, fine) < run.error + default.error / 4096.0
+
+
+@pytest.mark.parametrize('tolerance', [None, 1e-6])
+def test_dense_output_has_the_accuracy_of_the_samples(tolerance: float | None) -> None:
+    run = go('paper_si', tolerance=tolerance)
+    fine = go('paper_si', step=float(run.steps.min()) / 8.0, order=run.order)
     model = NeedleModel(run.parameters)
     peak = np.abs(run.tip_deflection).max()
     for time in np.random.default_rng(1).uniform(0.0, run.time[-1], size=50):
@@ -202,12 +245,15 @@ def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
     [
         ({'tolerance': 1e-3, 'step': 1e-5}, 'tolerance and step exclude each other'),
         ({'tolerance': 0.0}, 'tolerance must be positive and finite'),
-        ({'graded': True}, 'graded requires a step'),
+        ({'graded': True}, 'graded and order require a step'),
+        ({'order': 4}, 'graded and order require a step'),
+        ({'step': 1e-5, 'order': 3}, 'order must be one of 2, 4, 6, 8, got 3'),
+        ({'step': 1e-5, 'order': 4, 'law': 'tanh'}, 'order must be 2 unless friction_law is coul'),
         ({'force': lambda _: 3.0}, 'interval must be given with a force that is a function'),
     ],
 )
 def test_contradictory_options_are_rejected(options: dict[str, Any], complaint: str) -> None:
-    p = preset('phantom')
     words = {'force': 3.0, 'duration': 0.1, **options}
+    p = preset('phantom', friction_law=words.pop('law', 'coulomb'))
     with pytest.raises(ParameterError, match=complaint):
         simulate(p, NeedleModel(p).state_at(0.05), **words)
