@@ -95,7 +95,7 @@ class StudyPlan(NamedTuple):
 
 
 PLANS: Final = {
-    'default': StudyPlan(100_000, 8000, 6, (1000, 10_000, _MILLION), 10, 2000),
+    'default': StudyPlan(10_000, 2000, 5, (1000, 10_000, _MILLION), 10, 2000),
     'quick': StudyPlan(800, 400, 2, (100, 1000, 2000), 2, 100),
 }
 

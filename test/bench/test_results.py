@@ -66,18 +66,7 @@ def rows(name: str) -> list[tuple[str, str]]:
     return [(one[0].strip(), one[1].strip()) for one in cells[2:]]
 
 
-#: Pages without a bar that was added since.
-OLD = {'study': pytest.mark.xfail(reason='page of 0.1.0: needle bench study', strict=True)}
-
-
-@pytest.mark.parametrize(
-    'name',
-    [
-        pytest.param(name, marks=OLD.get(name, ()))
-        for name in MODULES
-        if (PAGES / f'{name}.md').exists()
-    ],
-)
+@pytest.mark.parametrize('name', [name for name in MODULES if (PAGES / f'{name}.md').exists()])
 def test_result_page_has_the_bars_of_the_benchmark(name: str) -> None:
     """Otherwise the page is older than the benchmark: run it again with ``-o``."""
     shown, own = rows(name), list(bars(MODULES[name]))
