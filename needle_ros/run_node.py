@@ -71,13 +71,13 @@ def run(kind: Callable[[], BaseNode]) -> int:
         _read_files(node)
         spinning = True
         status = _spin(node, lambda: stopping)
-        # The threads of DDS end with the last object of the node. While the interpreter ends they
-        # would use freed memory.
         del node
-        gc.unfreeze()
-        gc.collect()
         return status
     finally:
+        # The threads of DDS end with the last object of the node. While the interpreter ends they
+        # would use freed memory.
+        gc.unfreeze()
+        gc.collect()
         rclpy.utilities.try_shutdown()
         # A second Ctrl-C must not change the exit status.
         for one in ENDINGS:
@@ -121,11 +121,13 @@ def end(executor: Executor, nodes: Collection[Node]) -> None:
     """Shut an executor down, and destroy its nodes; life cycle services end with the object."""
     for node in nodes:
         executor.remove_node(node)
-    # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
-    executor.spin_until_future_complete(Future(), timeout_sec=0.0)
-    executor.shutdown()
-    for node in nodes:
-        node.destroy_node()
+    try:
+        # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
+        executor.spin_until_future_complete(Future(), timeout_sec=0.0)
+    finally:
+        executor.shutdown()
+        for node in nodes:
+            node.destroy_node()
 
 
 def _end_with_parent(parent: str) -> None:

@@ -7,10 +7,10 @@ with the frequency and the amplitude of the vibration. Steps are therefore a fra
 of the slowest mode, which grows as the square of the insertion depth, and become longer as the
 vibration decays. A second run with steps of half the length everywhere gives the error.
 
-The error of the symmetric step has even powers of its length only. Where the motion is smooth,
-k runs through a block of steps, with 1, 2, ..., k divisions of each step, are therefore
-extrapolated to order 2 k. Source: E. Hairer, S. P. Norsett, G. Wanner, "Solving Ordinary
-Differential Equations I", 2nd ed., 1993, section II.9.
+The error of the symmetric step has even powers of its length only, apart from a small term of
+viscous friction. Where the motion is smooth, k runs through a block of steps, with 1, 2, ..., k
+divisions of each step, are therefore extrapolated to order 2 k. Source: E. Hairer, S. P. Norsett,
+G. Wanner, "Solving Ordinary Differential Equations I", 2nd ed., 1993, section II.9.
 """
 
 from math import ceil, sqrt
@@ -27,16 +27,16 @@ import numpy as np
 SHARE: Final = 0.25
 
 _BLOCK: Final = 32  #: number of steps between updates of the step length
-#: Divisions of the steps of a block in which the needle starts, stops, reverses or changes layer,
-#: over 2 to the number of runs: runs of different order have different steps there, so that their
-#: difference includes the error.
+#: Divisions of the steps of a block after which the needle moves otherwise than before, over 2 to
+#: the number of runs: runs of different order have different steps there, so that their difference
+#: includes the error.
 _FINE: Final = 4
 _MOST: Final = 1e12  #: largest number of steps of an interval
 
 
 @inlined
 def _is_smooth(c: CompiledNeedle, state: Vector, ends: Matrix) -> bool:
-    """Return whether direction of motion, rest and layer are the same at all times."""
+    """Return whether direction of motion, rest and layer are the same before and after."""
     at = 2 + c.modes.modes.shape[1]
     starts = c.layers.starts
     layer, direction = layer_at(starts, c.length - state[0], 0), np.sign(state[at])
@@ -60,7 +60,8 @@ def advance_extrapolated(
     """
     Advance a state under constant forces as `advance`, at order 2 ``runs``, in place.
 
-    The order is 2 in a block in which the motion is not smooth. Returns the time left undone [s].
+    The order is 2 in a block after which the needle rests, moves in another direction or is in
+    another layer than before. Returns the time left undone [s].
     """
     none = np.empty((0, 3))
     if runs == 1:

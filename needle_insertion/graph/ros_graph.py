@@ -84,14 +84,28 @@ class Graph:
 
     def __exit__(self, *raised: Any) -> None:
         try:
-            end(self.executor, self._nodes)
-            self.context.try_shutdown()
-            self._nodes.clear()
-            self._life_cycles.clear()
-            del self.executor
-            # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the
-            # nodes in the domain, where the next graph would discover them.
-            gc.collect()
+            try:
+                end(self.executor, self._nodes)
+            except Exception:
+                # The error that ends the graph has priority.
+                if raised[0] is None:
+                    raise
+            finally:
+                self._free()
+        finally:
+            self._end_processes()
+
+    def _free(self) -> None:
+        self.context.try_shutdown()
+        self._nodes.clear()
+        self._life_cycles.clear()
+        del self.executor
+        # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the nodes
+        # in the domain, where the next graph would discover them.
+        gc.collect()
+
+    def _end_processes(self) -> None:
+        try:
             # SIGTERM first: a recorder closes its bag.
             for started in self._processes:
                 if started.process.poll() is None:

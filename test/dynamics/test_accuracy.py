@@ -147,14 +147,15 @@ def test_error_decreases_with_the_order(changes: dict[str, Any], order: int) -> 
     start = NeedleModel(p).state_at(0.025, 5e-4)
     # Insertion at 0.5 m/s.
     start[start.size // 2] = -0.5
-    options: Any = {'duration': 0.028, 'interval': 2.8e-4}
-    fine = simulate(p, start, 3.0, step=3.5e-6, order=8, **options)
+    # It ends before the hub.
+    options: Any = {'duration': 0.024, 'interval': 2.4e-4}
+    fine = simulate(p, start, 3.0, step=3e-6, order=8, **options)
     errors = [
         difference(simulate(p, start, 3.0, step=step, order=order, **options), fine)
-        for step in (2.8e-5, 1.4e-5)
+        for step in (4.8e-5, 2.4e-5)
     ]
-    # Rounding: runs of order 8 differ by up to 3e-10.
-    assert np.log2(errors[0] / errors[1]) > order - 0.3 or errors[1] < 1e-9
+    # The smaller error of order 8 is 3e-9 or more; with shorter steps rounding dominates.
+    assert np.log2(errors[0] / errors[1]) > order - 0.3
 
 
 @pytest.mark.parametrize('order', ORDERS)
@@ -248,6 +249,7 @@ def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
         ({'graded': True}, 'graded and order require a step'),
         ({'order': 4}, 'graded and order require a step'),
         ({'step': 1e-5, 'order': 3}, 'order must be one of 2, 4, 6, 8, got 3'),
+        ({'step': 1e-5, 'order': 4.0}, r'order must be one of 2, 4, 6, 8, got 4\.0'),
         ({'step': 1e-5, 'order': 4, 'law': 'tanh'}, 'order must be 2 unless friction_law is coul'),
         ({'force': lambda _: 3.0}, 'interval must be given with a force that is a function'),
     ],
