@@ -22,7 +22,7 @@ Question: TypeAlias = Callable[[Tick], Answer]
 
 #: Modules of each benchmark, each with a function `compare`; safety, graph and slicer need ROS.
 MODULES = {
-    'dynamics': ('step', 'solvers', 'rods', 'batches'),
+    'dynamics': ('step', 'solvers', 'precision', 'rods', 'batches'),
     'honesty': ('honesty',),
     'identification': ('identification',),
     'calibration': ('calibration', 'noises'),

@@ -13,13 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from math import inf
 from typing import Any, cast, Final, NamedTuple
 from unittest import mock
 import warnings
 
 from benchmarks.dop853 import build_solver, compiled
-from benchmarks.measure import Bar, geometric, least_times, number, seconds
+from benchmarks.measure import geometric, least_times, number, seconds
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.compiled import step as compiled_step
@@ -30,7 +29,6 @@ from needle_dynamics.compiled.integrals import (
     two_modes,
 )
 from needle_dynamics.compiled.modal_flow import rotate_two
-from needle_dynamics.parameters import PRESETS
 from needle_dynamics.simulated.trajectory import ORDERS
 import numpy as np
 from scipy.integrate import odeint, quad, solve_ivp
@@ -38,15 +36,8 @@ from scipy.integrate import odeint, quad, solve_ivp
 #: Open-loop run: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
 FORCE, DEPTH, DEFLECTION, DURATION = 3.0, 0.02, 5e-4, 0.0285
 
-#: Error of all solvers, over the peak of the tip deflection; first of the table of all.
+#: Error of all solvers, over the peak of the tip deflection.
 ACCURACY: Final = 1e-3
-ACCURACIES: Final = (1e-2, ACCURACY, 1e-4, 1e-5, 1e-6, 1e-8)
-
-#: Required ratio of the times of the best other solver and of ours, at an error.
-_RATIOS: Final = {ACCURACY: 2.0, 1e-6: 1.0}
-
-#: Error below which a method of second order is not measured.
-_SECOND: Final = 1e-7
 
 #: Solvers that run in one compiled call, except for the right-hand side of `odeint`.
 ODEINT, COMPILED = 'odeint (LSODA)', 'DOP853, compiled'
@@ -60,8 +51,6 @@ _STEPS: Final = (1e-3, 1e-8)  #: longest and shortest tried step [s]
 
 #: Sampling interval of our error [s]; several samples in a period of each mode.
 _GRID: Final = 1e-5
-#: The same for the comparison at several errors.
-_COARSE_GRID: Final = 1e-4
 
 #: Most stored steps.
 _STORED: Final = 20_000
@@ -483,53 +472,4 @@ def compare(tick: Tick) -> Answer:
         f'- The right-hand side of odeint and of the SciPy solvers is called from Python or '
         f'through it, 3 us or more each; DOP853, compiled, is one call.',
     )
-    second, bars = precision(tick)
-    return [section, second], bars
-
-
-def precision(tick: Tick) -> tuple[PageSection, list[Bar]]:
-    """Compare the times at several errors with the solvers that run in one call."""
-    rows = []
-    least = dict.fromkeys(_RATIOS, inf)
-    for preset in PRESETS:
-        case = OpenLoopCase(preset)
-        for accuracy in ACCURACIES:
-            tick(f'{preset}, error {accuracy:g}')
-            orders = ORDERS if accuracy > _SECOND else ORDERS[1:]
-            own = [
-                case.ours(graded=True, accuracy=accuracy, order=order, spacing=_COARSE_GRID)
-                for order in orders
-            ]
-            others = [case.other(method, accuracy) for method in (COMPILED, ODEINT)]
-            times = least_times(
-                {one.name: partial(one.run, case.right_hand_side) for one in (*own, *others)}, 9
-            )
-            ratio = min(times[one.name] for one in others) / min(times[one.name] for one in own)
-            figures = [number(spent * 1e3) for spent in times.values()]
-            missing = ['-'] * (len(ORDERS) - len(orders))
-            rows.append((preset, f'{accuracy:g}', *missing, *figures, f'{number(ratio)} x'))
-            if accuracy in least:
-                least[accuracy] = min(least[accuracy], ratio)
-    return PageSection(
-        'Work and precision',
-        (
-            'preset',
-            'error / peak',
-            *(f'ours, order {order}' for order in ORDERS),
-            COMPILED,
-            ODEINT,
-            'best of them / best of ours',
-        ),
-        rows,
-        'Wall times [ms] of the same run, with graded steps, the compiled right-hand side, and '
-        'each solver at the loosest setting that meets the error.',
-    ), [
-        Bar(
-            f'open loop, best of the others at an error of {accuracy:g}',
-            ratio,
-            _RATIOS[accuracy],
-            'x ours',
-            at_least=True,
-        )
-        for accuracy, ratio in least.items()
-    ]
+    return [section], []
