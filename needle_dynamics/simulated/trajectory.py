@@ -58,7 +58,7 @@ class Trajectory(Displayed):
         of the tip deflection error relative to its largest value and the depth error relative to
         the travel. NaN if the step was given, since there is no comparison.
     order : int
-        Order of accuracy while the motion is smooth, one of `ORDERS`.
+        Order of accuracy while the motion is smooth: 2, 4, 6 or 8.
 
     """
 
