@@ -86,10 +86,6 @@ class Graph:
         try:
             try:
                 end(self.executor, self._nodes)
-            except Exception:
-                # The error that ends the graph has priority.
-                if raised[0] is None:
-                    raise
             finally:
                 self._free()
         finally:
