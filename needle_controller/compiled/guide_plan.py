@@ -8,9 +8,15 @@ from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_controller.compiled.hypotheses import (
     BEVEL,
+    constant_mean,
+    CONSTANTS,
+    HARD,
+    LONG,
     Steering,
     STEP,
+    times,
     tip_distribution,
+    tip_form,
     tip_mean,
     TURNS,
     weights,
@@ -58,15 +64,15 @@ class FinalTip(NamedTuple):
 
 
 @compiled
-def _ends(c: Steering, turns: int, first: int) -> FinalTip:
+def _ends(c: Steering, w: FloatArray, turns: int, first: int) -> FinalTip:
     """Return the final position of the tip with ``turns`` turns from step ``first`` on."""
     r, last = c.responses, len(c.guide)
     # Future positions of the guide are 0.
-    tip = tip_distribution(c, last, c.guide)
+    tip = tip_distribution(c, tip_form(c, w, 0.0, last, c.guide))
     means, turned = tip.means, np.zeros(len(tip.means))
     if turns > 0:
         for i in range(len(means)):
-            g, load = i % len(r.bevel), c.mean[i, BEVEL]
+            g, load = i % len(r.bevel), constant_mean(c, i, BEVEL)
             for j in range(first, last + 1):
                 means[i] -= load * r.bevel[g, last, j] * c.turned[g, j]
             turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
@@ -91,34 +97,37 @@ def _guide_range(c: Steering, begin: float, step: int) -> tuple[float, float]:
 
 
 @compiled
-def _reachable(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    k, last, now = c.counts[STEP], len(c.guide), _guide_now(c)
-    ends = _ends(c, c.counts[TURNS], k + 1)
-    middles, sizes = ends.means, np.empty(len(ends.means), np.complex128)
-    for i in range(len(sizes)):
-        sizes[i] = complex(ends.turned[i], ends.turned[i])
+def _reachable(c: Steering, w: FloatArray) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    r, k, last, now = c.responses, c.counts[STEP], len(c.guide), _guide_now(c)
+    points = len(r.guide)
+    shifts, reach = np.zeros(points, np.complex128), np.zeros(points, np.complex128)
     for j in range(k, last):
         (x, wide), (z, high) = _guide_range(c, now.real, j - k), _guide_range(c, now.imag, j - k)
-        for i in range(len(middles)):
-            shift = c.responses.guide[i % len(c.responses.guide), last, j]
-            middles[i] += shift * complex(x, z)
-            sizes[i] += abs(shift) * complex(wide, high)
+        for g in range(points):
+            shifts[g] += times(r.guide[g, last, j], complex(x, z))
+            reach[g] += times(abs(r.guide[g, last, j]), complex(wide, high))
+    ends = _ends(c, w, c.counts[TURNS], k + 1)
+    middles, sizes = ends.means, np.empty(len(ends.means), np.complex128)
+    for i in range(len(sizes)):
+        middles[i] += shifts[i % points]
+        sizes[i] = reach[i % points] + complex(ends.turned[i], ends.turned[i])
     return middles, sizes, ends.errors
 
 
 @kernel
 def reachable_set(boxed: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return middle, half widths, x + i z, and error of the reachable set [m], shape (h,)."""
-    return _reachable(boxed.value)
+    return _reachable(boxed.value, weights(boxed.value.logs))
 
 
 @kernel
 def hit_probability(boxed: Boxed[Steering]) -> float:
     """Return the probability that the tip can reach the target within 1 mm."""
-    c = boxed.value
-    (middles, sizes, errors), w = _reachable(c), weights(c.logs)
-    found = 0.0
+    c, w, found = boxed.value, weights(boxed.value.logs), 0.0
+    middles, sizes, errors = _reachable(c, w)
     for i in range(len(w)):
+        if w[i] == 0.0:
+            continue
         x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
         along_x = along_z = 0.0
         for a in range(len(_WEIGHTS)):
@@ -138,12 +147,12 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
     c = boxed.value
     k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
     turns, candidates = c.counts[TURNS], _candidates(c, _FINE)
-    ends = _ends(c, turns, k + 2)
+    ends = _ends(c, w, turns, k + 2)
     cost, guide = _best(c, w, ends, candidates)
     if turns == 0 or cost < _TURN:
         return guide
     # The present plan with a turn now.
-    base, few = ends if turns > 1 else _ends(c, 0, k + 2), _candidates(c, _COARSE)
+    base, few = ends if turns > 1 else _ends(c, w, 0, k + 2), _candidates(c, _COARSE)
     best, roll, chosen = inf, 0.0, base
     for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
         other = c.roll[-1] + tau * turn / _ROLLS
@@ -153,7 +162,7 @@ def choose_guide(boxed: Boxed[Steering]) -> complex:
             for j in range(k + 1, k + 2 if turns > 1 else last + 1):
                 push += c.responses.bevel[g, last, j]
             change = _direction(_tip_roll(c, g, other)) - c.turned[g, k + 1]
-            means[i] += c.mean[i, BEVEL] * push * change
+            means[i] += constant_mean(c, i, BEVEL) * push * change
         ends = FinalTip(means, base.errors, base.turned)
         costs = _costs(c, w, ends, few)
         along_x = along_z = inf
@@ -266,14 +275,13 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
     if c.load_limit == inf:
         return force, stiffness
     for i in range(len(w)):
-        load, g = 0j, i % len(r.guide_load)
+        load, g = c.mean[i, len(c.path) + CONSTANTS + k], i % len(r.guide_load)
         for j in range(k):
             load += r.guide_load[g, k, j] * c.guide[j]
         push = 0j
         for j in range(c.turned.shape[1]):
             push += r.bevel_load[g, k, j] * c.turned[g, j]
-        for j in range(r.causes_load.shape[2]):
-            load += (push if j == BEVEL else r.causes_load[g, k, j]) * c.mean[i, j]
+        load += push * constant_mean(c, i, BEVEL)
         force += w[i] * load
         stiffness += w[i] * r.guide_load[g, k, k]
     return force, stiffness
@@ -283,18 +291,18 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
 def _follow(c: Steering, w: FloatArray) -> complex:
     """Return the setpoint that brings the tip to the line to the target over the next steps."""
     r, k, last, now = c.responses, c.counts[STEP], len(c.guide), _guide_now(c)
-    m, guide, need, gain = c.mean.shape[1], c.guide.copy(), 0j, _MOTION
-    row = np.empty(m, np.complex128)
+    guide, need, gain, used = c.guide.copy(), 0j, _MOTION, np.flatnonzero(w > _LEAST_WEIGHT)
     guide[k:] = now
-    for one in np.flatnonzero(w >= _LEAST_WEIGHT):
-        i = int(one)
-        g, long, hard = i % len(r.guide), c.mean[i, m - 3].real, c.mean[i, m - 2].real
-        for at in range(k + 1, min(k + _AHEAD, last) + 1):
-            off = c.path[at] * complex(c.target[0], c.target[1]) - tip_mean(c, i, at, guide, row)
-            shift = 0.0
+    for at in range(k + 1, min(k + _AHEAD, last) + 1):
+        form = tip_form(c, w, _LEAST_WEIGHT, at, guide)
+        line = c.path[at] * complex(c.target[0], c.target[1])
+        for one in used:
+            i = int(one)
+            g, shift = i % len(r.guide), 0.0
+            long, hard = constant_mean(c, i, LONG).real, constant_mean(c, i, HARD).real
             for j in range(k, at):
                 shift += r.guide[g, at, j]
                 shift += long * r.between[0, g, at, j] + hard * r.between[1, g, at, j]
-            need += w[i] * shift * off
+            need += w[i] * shift * (line - tip_mean(c, i, form))
             gain += w[i] * (1.0 + _DOUBT) * shift**2
     return now + need / gain

@@ -2,28 +2,27 @@
 r"""
 Hypotheses of the steering controller: state, and update by tip measurements.
 
-By hypothesis the tip at a depth is :math:`z = a \cdot b + x \cdot \theta` with the positions b of
-the guide, x + i z, and unknown constants :math:`\theta` with mean :math:`\bar\theta` and
-covariance P. Its mean is :math:`a \cdot b + x \cdot \bar\theta`, its covariance with the constants
-:math:`s = P \bar x`, and its variance :math:`x \cdot s`; a tip measurement is an update of rank
-one. See `needle_controller.steering.laws.multi_hypothesis`.
+By hypothesis the tip at depth number k is :math:`z_k = a_k \cdot b + f_k + y_k \cdot \psi` with
+the positions b of the guide, x + i z, the tip :math:`f_k` by origin, frame, tilt and path, and
+four constants :math:`\psi`, whose factors :math:`y_k` depend on past motion: load of the bevel,
+position between two bending lengths and between two skins, and slow error of the sensor. The state
+is :math:`(f_0, ..., f_n, \psi)`: a measurement contains five entries of it, and a tip that has
+been passed is no longer updated. If the load of the guide is limited, the state includes the
+forces on the guide by origin, frame, tilt and path.
 
-A tip measurement has a gross error with the probability :math:`\epsilon`. Its innovation e, with
-the variance v along each axis, has the likelihood
+With the mean :math:`\bar\theta` of the state and its covariance P, a tip :math:`x \cdot \theta`
+has the covariance :math:`s = P \bar x` with the state, and the variance :math:`x \cdot s`. A tip
+measurement is an update of rank one, so P is the prior covariance less a sum over all of them:
 
-.. math:: L = (1 - \epsilon) N(e; v) + \epsilon N(e; v + \sigma_g^2)
+.. math:: P = P_0 - \sum_i d_i s_i \bar s_i^T
 
-and no gross error with the probability :math:`r = (1 - \epsilon) N(e; v) / L`. The constants then
-are a mixture: updated with probability r, unchanged otherwise. A normal distribution of the same
-mean and covariance replaces it ([BarShalom2011]_, section 3.4, for measurements with clutter):
+P is never formed; each measurement stores its :math:`s_i` and :math:`d_i`. The prior is the same
+for all hypotheses of a point of the grid, up to path noise and slow error. In each step the entry
+of the slow error in the mean and in every :math:`s_i` decreases; its prior variance is stationary.
 
-.. math:: \bar\theta + r \frac{s}{v} e, \quad
-   P - r \left( 1 - (1 - r) \frac{|e|^2}{2 v} \right) \frac{s \bar s^T}{v}
-
-The probability :math:`\epsilon` is the mean of a beta distribution of the measurements so far.
-
-A fault of the sensor is an offset that stays: the evidence is a cumulative sum of the logarithm of
-the likelihood ratio of this fault and of the mixture over all hypotheses [Page1954]_.
+A tip measurement may have a gross error; the state then is a mixture, which a normal distribution
+replaces ([BarShalom2011]_, section 3.4, for measurements with clutter). A fault of the sensor is
+an offset that stays [Page1954]_. The formulas are in docs/steering.md.
 
 References
 ----------
@@ -56,7 +55,11 @@ if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
 _BEVEL_RELEASE: Final = 0.03  #: Standard deviation of the relative loss of the bevel load at rest.
-BEVEL: Final = 3  #: Index of the bevel load among the constants.
+
+#: Constants after the tips of the state: load of the bevel [N], position between two bending
+#: lengths and between two skins, and slow error of the sensor [m].
+BEVEL, LONG, HARD, SLOW = range(4)
+CONSTANTS: Final = 4
 
 #: Standard deviation of a gross error of a tip measurement along each axis [m]: organs below the
 #: diaphragm move by 5 to 10 mm.
@@ -79,13 +82,13 @@ _LEAST_LOG: Final = -30.0  #: Logarithm of the relative weight of a hypothesis t
 MOST_SAME: Final = 2  #: Number of equal successive tip measurements that is a frozen sensor.
 MOST_MISSING: Final = 6  #: Largest number of successive missing tip measurements.
 
-#: Indices of `Steering.counts`: tip measurements so far, remaining turns, and successive equal,
-#: gross and missing measurements.
-STEP, TURNS, SAME, GROSS, MISSING = range(5)
+#: Indices of `Steering.counts`: steps so far, remaining turns, successive equal, gross and missing
+#: measurements, and measurements that were used.
+STEP, TURNS, SAME, GROSS, MISSING, MEASURED = range(6)
 
-#: Indices of `Steering.gross`: expected number of gross errors, number of measurements, evidence
-#: of a sensor fault, and the last innovation along x and z [m].
-_ERRORS, _MEASURED, _EVIDENCE, _LAST_X, _LAST_Z = range(5)
+#: Indices of `Steering.gross`: expected number of gross errors, evidence of a sensor fault, and
+#: last innovation along x and z [m].
+_ERRORS, _EVIDENCE, _LAST_X, _LAST_Z = range(4)
 
 VALID, LOST, FROZEN, OUTLIER = range(4)  #: Result of the check of a tip measurement.
 
@@ -112,19 +115,40 @@ class HypothesisResponses(NamedTuple):
     later_bevel: Matrix
 
 
-class Steering(NamedTuple):
-    """State and limits of a steering controller: h hypotheses, n steps and m constants."""
+class StatePrior(NamedTuple):
+    """Prior of the state, for g points of the grid and h hypotheses."""
 
-    responses: HypothesisResponses
+    #: Covariance of the tips with tips and forces by origin, frame and tilt, and by a path noise
+    #: of 1, shape (g, n + 1, 2 n + 1).
+    known: Array3
+    wandering: Array3
+    #: Standard deviations of the first three constants: load of the bevel [N], and positions in
+    #: units of the grid, shape (3,).
+    deviations: Vector
+    noises: Vector  #: path noise by hypothesis [rad^2/m], shape (h,)
     drifts: Vector  #: standard deviation of the slow error by hypothesis [m], shape (h,)
     decay: Vector  #: correlation of the slow error over a step, shape (n,)
+
+
+class Steering(NamedTuple):
+    """
+    State and limits of a steering controller: h hypotheses, n steps and m entries of the state.
+
+    With a load limit, m is 2 n + 5, else n + 5, and u is the largest number of measurements.
+    """
+
+    responses: HypothesisResponses
+    prior: StatePrior
     path: Vector  #: depths relative to the target depth, from 0 to 1, shape (n + 1,)
     limit: float  #: largest position of the guide along each axis [m]
     load_limit: float  #: largest planned force of the guide [N]
     ranges: Vector  #: range of the guide motion after a number of steps, from 1 [m], shape (n,)
     target: Vector  #: target of the tip, x and z [m], shape (2,)
-    mean: ComplexMatrix  #: mean of the constants, shape (h, m)
-    covariance: ComplexArray3  #: their covariance, shape (h, m, m)
+    mean: ComplexMatrix  #: mean of the state, shape (h, m)
+    #: Covariance of each measured tip with the state, from the first depth on that could still be
+    #: measured, shape (h, u, m). Other entries, and discarded hypotheses, are never read.
+    shared: ComplexArray3
+    learned: Matrix  #: factor d of each measurement, shape (h, u)
     logs: Vector  #: logarithm of the hypothesis weights; -inf if discarded, shape (h,)
     guide: ComplexVector  #: position of the guide in each step [m]; 0 in future steps, shape (n,)
     #: Direction of the bevel relative to zero roll, on the skin and in each step, by point of the
@@ -132,8 +156,16 @@ class Steering(NamedTuple):
     turned: ComplexMatrix
     roll: Vector  #: Roll of the tip by point of the grid, then of the base [rad], shape (g + 1,).
     last: Vector  #: last tip measurement [m], shape (2,)
-    counts: IntVector  #: numbers with the index `STEP` and so on, shape (5,)
-    gross: Vector  #: numbers with the index `_ERRORS` and so on, shape (5,)
+    counts: IntVector  #: numbers with the index `STEP` and so on, shape (6,)
+    gross: Vector  #: numbers with the index `_ERRORS` and so on, shape (4,)
+
+
+class TipForm(NamedTuple):
+    """Tip at a depth as a linear form of the state, by point of the grid."""
+
+    at: int  #: depth number
+    shifts: ComplexVector  #: shift by the guide [m], shape (g,)
+    factors: ComplexMatrix  #: factors of the constants, shape (g, 4)
 
 
 class TipDistribution(NamedTuple):
@@ -141,7 +173,6 @@ class TipDistribution(NamedTuple):
 
     means: ComplexVector  #: mean, x + i z [m], shape (h,)
     variances: Vector  #: variance along each axis [m^2], shape (h,)
-    shared: ComplexMatrix  #: covariance with the constants, shape (h, m)
 
 
 class TipMoments(NamedTuple):
@@ -161,11 +192,22 @@ def weights(logs: Vector) -> FloatArray:
     for value in logs:
         largest = max(largest, value)
     for i in range(len(logs)):
-        found[i] = exp(logs[i] - largest)
+        found[i] = 0.0 if logs[i] == -inf else exp(logs[i] - largest)
         whole += found[i]
     for i in range(len(logs)):
         found[i] /= whole
     return found
+
+
+@inlined
+def _squared(value: complex) -> float:
+    return value.real * value.real + value.imag * value.imag
+
+
+@inlined
+def times(factor: float, value: complex) -> complex:
+    """Return a product of two multiplications; Numba converts a real factor and has four."""
+    return complex(factor * value.real, factor * value.imag)
 
 
 @inlined
@@ -178,51 +220,134 @@ def _guide_at_rest(c: Steering) -> ComplexArray:
 
 
 @compiled
-def tip_mean(c: Steering, i: int, at: int, guide: ComplexArray, row: ComplexArray) -> complex:
-    """Return the mean of the tip at a depth in a hypothesis; ``row`` takes x, shape (m,)."""
-    r, m = c.responses, len(row)
-    g, mean = i % len(r.guide), 0j
-    for j in range(m - 3):
-        row[j] = r.causes[g, at, j]
-    row[BEVEL] = row[m - 3] = row[m - 2] = row[m - 1] = 0.0
-    for j in range(c.turned.shape[1]):
-        row[BEVEL] += r.bevel[g, at, j] * c.turned[g, j]
-    for j in range(len(guide)):
-        mean += r.guide[g, at, j] * guide[j]
-        row[m - 3] += r.between[0, g, at, j] * guide[j]
-        row[m - 2] += r.between[1, g, at, j] * guide[j]
-    for j in range(m):
-        mean += c.mean[i, j] * row[j]
+def tip_form(
+    c: Steering, w: FloatArray, least: float, at: int, guide: ComplexArray, seen: float = 0.0
+) -> TipForm:
+    """Return the tip, measured if ``seen`` = 1; 0 at points without a weight above ``least``."""
+    r = c.responses
+    shifts = np.zeros(len(r.guide), np.complex128)
+    factors = np.zeros((len(r.guide), CONSTANTS), np.complex128)
+    for g in range(len(r.guide)):
+        heaviest = 0.0
+        for i in range(g, len(w), len(r.guide)):
+            heaviest = max(heaviest, w[i])
+        if heaviest <= least:
+            continue
+        shift = bevel = long = hard = 0j
+        # Later steps have no effect.
+        for j in range(at + 1):
+            bevel += times(r.bevel[g, at, j], c.turned[g, j])
+        for j in range(at):
+            shift += times(r.guide[g, at, j], guide[j])
+            long += times(r.between[0, g, at, j], guide[j])
+            hard += times(r.between[1, g, at, j], guide[j])
+        shifts[g] = shift
+        factors[g, BEVEL], factors[g, LONG], factors[g, HARD] = bevel, long, hard
+        factors[g, SLOW] = seen
+    return TipForm(at, shifts, factors)
+
+
+@inlined
+def constant_mean(c: Steering, i: int, index: int) -> complex:
+    """Return the mean of a constant in a hypothesis: `BEVEL`, `LONG`, `HARD` or `SLOW`."""
+    return complex(c.mean[i, len(c.path) + index])
+
+
+@inlined
+def tip_mean(c: Steering, i: int, form: TipForm) -> complex:
+    """Return the mean of the tip in a hypothesis, x + i z [m]."""
+    g = i % len(form.shifts)
+    mean: complex = form.shifts[g] + c.mean[i, form.at]
+    for j in range(CONSTANTS):
+        mean += form.factors[g, j] * constant_mean(c, i, j)
     return mean
 
 
-@compiled
-def tip_distribution(
-    c: Steering, at: int, guide: ComplexArray, seen: float = 0.0
-) -> TipDistribution:
-    """
-    Return the distribution of the tip at a depth by hypothesis; 0 for discarded hypotheses.
+@inlined
+def _prior_covariance(c: Steering, i: int, at: int, other: int) -> float:
+    """Return the prior covariance of a tip with a tip or a force in a hypothesis."""
+    p, g = c.prior, i % len(c.prior.known)
+    return float(p.known[g, at, other] + p.noises[i] * p.wandering[g, at, other])
 
-    With ``seen`` = 1: distribution of the measured tip, with the slow error of the sensor.
-    """
-    h, m = c.mean.shape
-    means, variances = np.zeros(h, np.complex128), np.zeros(h)
-    shared, row = np.zeros((h, m), np.complex128), np.empty(m, np.complex128)
-    for i in range(h):
-        if c.logs[i] == -inf:
-            continue
-        means[i] = tip_mean(c, i, at, guide, row) + seen * c.mean[i, m - 1]
-        of, row[m - 1] = shared[i], seen
-        for j in range(m):
-            # P is Hermitian: its rows are its conjugated columns.
-            for l in range(m):
-                of[l] += row[j] * c.covariance[i, j, l]
-        for j in range(m):
-            variances[i] += of[j].real * row[j].real + of[j].imag * row[j].imag
-            of[j] = of[j].conjugate()
-        elastic = c.responses.elastic[i % len(c.responses.elastic), at]
-        variances[i] += (_BEVEL_RELEASE * elastic * abs(c.mean[i, BEVEL])) ** 2
-    return TipDistribution(means, variances, shared)
+
+@inlined
+def _prior_variance(c: Steering, i: int, index: int) -> float:
+    """Return the prior variance of a constant in a hypothesis; the slow error is stationary."""
+    deviation = c.prior.drifts[i] if index == SLOW else c.prior.deviations[index]
+    return float(deviation * deviation)
+
+
+@inlined
+def _covariance_with_measurement(c: Steering, i: int, k: int, form: TipForm) -> complex:
+    """Return the conjugated covariance of the tip with measurement k, before its update."""
+    found, g = c.shared[i, k, form.at], i % len(form.shifts)
+    for j in range(CONSTANTS):
+        found += form.factors[g, j] * c.shared[i, k, len(c.path) + j]
+    return complex(found)
+
+
+@inlined
+def _released(c: Steering, i: int, form: TipForm) -> float:
+    """Return the variance of the tip by the bevel load that may be lost at rest [m^2]."""
+    elastic = _BEVEL_RELEASE * c.responses.elastic[i % len(form.shifts), form.at]
+    return float(elastic**2 * _squared(constant_mean(c, i, BEVEL)))
+
+
+@inlined
+def _variance(c: Steering, i: int, form: TipForm) -> float:
+    """Return the variance of the tip along each axis in a hypothesis [m^2]."""
+    g, found = i % len(form.shifts), _prior_covariance(c, i, form.at, form.at)
+    for j in range(CONSTANTS):
+        found += _squared(form.factors[g, j]) * _prior_variance(c, i, j)
+    for k in range(c.counts[MEASURED]):
+        found -= float(c.learned[i, k] * _squared(_covariance_with_measurement(c, i, k, form)))
+    return found + _released(c, i, form)
+
+
+@compiled
+def tip_distribution(c: Steering, form: TipForm) -> TipDistribution:
+    """Return the distribution of the tip by hypothesis; 0 for discarded hypotheses."""
+    means, variances = np.zeros(len(c.logs), np.complex128), np.zeros(len(c.logs))
+    for i in range(len(means)):
+        if c.logs[i] > -inf:
+            means[i], variances[i] = tip_mean(c, i, form), _variance(c, i, form)
+    return TipDistribution(means, variances)
+
+
+@inlined
+def _first(c: Steering) -> int:
+    """Return the first depth number that can still be measured."""
+    return int(max(0, c.counts[STEP] - 1))
+
+
+@inlined
+def _covariance_with_state(c: Steering, i: int, form: TipForm, shared: ComplexArray) -> None:
+    """Compute the covariance of the tip with the state, from the first depth on, in place."""
+    first, tips, g = _first(c), len(c.path), i % len(form.shifts)
+    for j in range(first, len(shared) - CONSTANTS):
+        shared[j if j < tips else j + CONSTANTS] = _prior_covariance(c, i, form.at, j)
+    for j in range(CONSTANTS):
+        shared[tips + j] = form.factors[g, j].conjugate() * _prior_variance(c, i, j)
+    for k in range(c.counts[MEASURED]):
+        factor = c.learned[i, k] * _covariance_with_measurement(c, i, k, form).conjugate()
+        to, of = shared[first:], c.shared[i, k, first:]
+        for j in range(len(to)):
+            to[j] -= factor * of[j]
+
+
+@compiled
+def _measurement_distribution(c: Steering, form: TipForm, noise: float) -> TipDistribution:
+    """Return the distribution of a measurement with a variance [m^2]; store its covariances."""
+    means, variances = np.zeros(len(c.logs), np.complex128), np.full(len(c.logs), noise)
+    new = c.counts[MEASURED]
+    for i in range(len(means)):
+        if c.logs[i] > -inf:
+            _covariance_with_state(c, i, form, c.shared[i, new])
+            means[i] = tip_mean(c, i, form)
+            variances[i] += _covariance_with_measurement(c, i, new, form).real + _released(
+                c, i, form
+            )
+    return TipDistribution(means, variances)
 
 
 @compiled
@@ -242,8 +367,8 @@ def _moments(w: FloatArray, tip: TipDistribution) -> TipMoments:
 @kernel
 def predict(boxed: Boxed[Steering], at: int) -> TipMoments:
     """Predict the tip at depth number ``at`` with guide and roll as last commanded."""
-    c = boxed.value
-    return _moments(weights(c.logs), tip_distribution(c, at, _guide_at_rest(c)))
+    c, w = boxed.value, weights(boxed.value.logs)
+    return _moments(w, tip_distribution(c, tip_form(c, w, 0.0, at, _guide_at_rest(c))))
 
 
 @kernel
@@ -256,10 +381,8 @@ def update(
     ``x`` and ``z`` are nan if the measurement is missing; ``variance`` is per axis [m^2]. Returns
     `VALID` or the reason for a stop, and the innovation along both axes [m].
     """
-    c = boxed.value
-    tip, w = tip_distribution(c, at, _guide_at_rest(c), 1.0), weights(c.logs)
-    for i in range(len(w)):
-        tip.variances[i] += variance
+    c, w = boxed.value, weights(boxed.value.logs)
+    tip = _measurement_distribution(c, tip_form(c, w, 0.0, at, _guide_at_rest(c), 1.0), variance)
     predicted = _moments(w, tip)
     kind, used = _check_sensor(c, x, z)
     off = complex(x - predicted.x, z - predicted.z)
@@ -286,10 +409,15 @@ def _check_sensor(c: Steering, x: float, z: float) -> tuple[int, bool]:
 
 
 @inlined
-def _log_density(off: complex, variance: float) -> float:
-    """Return the logarithm of a normal density in both planes, up to a constant."""
-    # Finite also for a measurement whose square is not.
-    return -0.5 * min(off.real**2 + off.imag**2, _FARTHEST) / variance - log(variance)
+def _distance(off: complex, variance: float) -> float:
+    """Return half the squared distance over the variance, limited: also of an infinite one."""
+    return 0.5 * min(_squared(off), _FARTHEST) / variance
+
+
+@inlined
+def _density(off: complex, variance: float) -> float:
+    """Return a normal density in both planes, up to a constant."""
+    return exp(-_distance(off, variance)) / variance
 
 
 @compiled
@@ -297,47 +425,41 @@ def _update_hypotheses(
     c: Steering, w: FloatArray, tip: TipDistribution, measured: complex
 ) -> tuple[float, float]:
     """Update all hypotheses; return the probability of no gross error, and the log-likelihood."""
-    share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.gross[_MEASURED])
-    likely, sounds, largest = np.full(len(w), -inf), np.zeros(len(w)), -inf
+    share = (_GROSS_PRIOR + c.gross[_ERRORS]) / (_COUNT_PRIOR + c.counts[MEASURED])
+    densities, sounds = np.zeros(len(w)), np.zeros(len(w))
     for i in range(len(w)):
         if c.logs[i] == -inf:
             continue
         off, variance = measured - tip.means[i], tip.variances[i]
-        normal = log(1.0 - share) + _log_density(off, variance)
-        gross = log(share) + _log_density(off, variance + _GROSS**2)
-        likely[i] = max(normal, gross) + log(1.0 + exp(-abs(normal - gross)))
-        largest = max(largest, likely[i])
-        # False for an infinite distance.
-        if off.real**2 + off.imag**2 < _FARTHEST:
-            sounds[i] = exp(normal - likely[i])
-            _update_hypothesis(c, i, off, variance, tip.shared[i], sounds[i])
+        normal = (1.0 - share) * _density(off, variance)
+        densities[i] = normal + share * _density(off, variance + _GROSS**2)
+        # False for an infinite distance: the measurement has no effect.
+        if _squared(off) < _FARTHEST:
+            sounds[i] = normal / densities[i]
+            _update_hypothesis(c, i, off, variance, sounds[i])
     whole, sound, most = 0.0, 0.0, -inf
     for i in range(len(w)):
-        part = w[i] * exp(likely[i] - largest)
-        whole += part
-        sound += part * sounds[i]
-        c.logs[i] += likely[i]
-        most = max(most, c.logs[i])
+        whole += w[i] * densities[i]
+        sound += w[i] * densities[i] * sounds[i]
+        if c.logs[i] > -inf:
+            c.logs[i] += log(densities[i])
+            most = max(most, c.logs[i])
     for i in range(len(w)):
         if c.logs[i] < most + _LEAST_LOG:
             c.logs[i] = -inf
-    return sound / whole, largest + log(whole)
+    c.counts[MEASURED] += 1
+    return sound / whole, log(whole)
 
 
 @inlined
-def _update_hypothesis(
-    c: Steering, i: int, off: complex, variance: float, shared: ComplexArray, sound: float
-) -> None:
+def _update_hypothesis(c: Steering, i: int, off: complex, variance: float, sound: float) -> None:
     """Update a hypothesis with an innovation [m] that has no gross error with a probability."""
-    # Mean and covariance of the mixture of the constants with and without the measurement.
-    squared = 0.5 * (off.real**2 + off.imag**2)
-    learned = sound * (1.0 - (1.0 - sound) * squared / variance)
-    for j in range(len(shared)):
-        gain = shared[j] / variance
-        c.mean[i, j] += sound * gain * off
-        to = c.covariance[i, j]
-        for k in range(len(shared)):
-            to[k] -= learned * gain * shared[k].conjugate()
+    shared, step = c.shared[i, c.counts[MEASURED]], sound / variance * off
+    for j in range(_first(c), len(shared)):
+        c.mean[i, j] += step * shared[j]
+    # Covariance of the mixture of the state with and without the measurement.
+    unsure = (1.0 - sound) * 0.5 * _squared(off) / variance
+    c.learned[i, c.counts[MEASURED]] = sound * (1.0 - unsure) / variance
 
 
 @inlined
@@ -348,15 +470,15 @@ def _detect_fault(
     counts, gross = c.counts, c.gross
     if counts[GROSS] > 0:
         change = off - complex(gross[_LAST_X], gross[_LAST_Z])
-        faulty = _log_density(change, variance + _FAULT_CHANGE**2)
+        variance += _FAULT_CHANGE**2
+        faulty = -_distance(change, variance) - log(variance)
     else:
         faulty = -inf
     # A fault may begin with any measurement.
-    faulty = max(faulty, _log_density(off, _FAULT**2))
+    faulty = max(faulty, -_distance(off, _FAULT**2) - log(_FAULT**2))
     found = gross[_EVIDENCE] + min(faulty - likelihood, _MOST_EVIDENCE)
     gross[_EVIDENCE] = max(0.0, found)
     gross[_ERRORS] += 1.0 - sound
-    gross[_MEASURED] += 1.0
     gross[_LAST_X], gross[_LAST_Z] = off.real, off.imag
     counts[GROSS] = counts[GROSS] + 1 if sound < 0.5 else 0
     return bool(gross[_EVIDENCE] >= _STOP_EVIDENCE or counts[GROSS] > MOST_MISSING)
@@ -366,14 +488,12 @@ def _detect_fault(
 def advance(boxed: Boxed[Steering]) -> None:
     """Advance to the next step: the slow error of the sensor changes."""
     c, k = boxed.value, boxed.value.counts[STEP]
-    if k < len(c.decay):
-        last, decay = c.mean.shape[1] - 1, c.decay[k]
+    if k < len(c.prior.decay):
+        slow, decay = len(c.path) + SLOW, c.prior.decay[k]
         for i in range(len(c.logs)):
-            if c.drifts[i] == 0.0 or c.logs[i] == -inf:
+            if c.prior.drifts[i] == 0.0 or c.logs[i] == -inf:
                 continue
-            c.mean[i, last] *= decay
-            for j in range(last + 1):
-                c.covariance[i, last, j] *= decay
-                c.covariance[i, j, last] *= decay
-            c.covariance[i, last, last] += (1.0 - decay**2) * c.drifts[i] ** 2
-    c.counts[STEP] = k + 1
+            c.mean[i, slow] *= decay
+            for j in range(c.counts[MEASURED]):
+                c.shared[i, j, slow] *= decay
+    c.counts[STEP] = min(k + 1, len(c.path))

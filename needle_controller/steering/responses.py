@@ -19,13 +19,10 @@ slow error is the last unknown constant. It changes from step to step.
 The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
 roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
 
-A needle with a bevel has kinematic points in addition to the grid, for a needle that is turned: a
-stiff tissue holds the shaft, which follows the tip, and the guide has no effect. A bevel along u
-cuts an arc of curvature :math:`\kappa`, with the tip ahead of it by :math:`\ell` (Webster et al.,
-"Nonholonomic modeling of needle steering", 2006): the tip is at
-:math:`\kappa \int_0^s (s - s' + \ell) \, u(s') \, ds'`. Friction winds up the shaft: the roll of
-the tip lags the roll of the base by an angle that grows with the depth (Reed et al., "Modeling and
-control of needles with torsional friction", 2009). Each of these points has its lag per depth.
+A needle with a bevel has kinematic points in addition to the grid, for a needle that is turned:
+stiff tissue holds the shaft, which follows the tip along arcs (Webster et al., "Nonholonomic
+modeling of needle steering", 2006), and friction winds up the shaft (Reed et al., "Modeling and
+control of needles with torsional friction", 2009). The formulas are in docs/steering.md.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ from dataclasses import replace
 from math import ceil
 from typing import Final
 
-from needle_controller.compiled.hypotheses import HypothesisResponses
+from needle_controller.compiled.hypotheses import HypothesisResponses, StatePrior
 from needle_controller.steering.prior import SteeringPrior
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.cutting_needle import Steered
@@ -73,6 +70,7 @@ _DRIFT_LENGTH: Final = 0.05  #: Correlation length of the slow error of the sens
 _BEYOND: Final = 1.1  #: Half width of the grid over the spread.
 _ELEMENT: Final = 1.25e-3  #: Longest element [m]: good to a few micrometers.
 _SAME: Final = 1e-9  #: Tolerance of equal depths [m].
+_BEVEL: Final = 3  #: Index of the load of the bevel among the causes.
 _EVEN: Final = 12.0**-0.5  #: Standard deviation of a uniform distribution over a cell of the grid.
 
 
@@ -96,25 +94,6 @@ class SteeringModel:
     progress : callable, optional
         Called before each hypothesis, with the number of those done and of all. Its exception
         cancels the construction. A hypothesis of 200 steps takes 10 ms, without the GIL.
-
-    Attributes
-    ----------
-    needle, steering, depths, prior
-        As given.
-    lengths, skins, drifts : ndarray, shape (h,)
-        By hypothesis: bending length relative to the nominal one, skin stiffness relative to the
-        stiffness of the tissue [m], standard deviation of the slow error of the sensor [m].
-    rolled : ndarray of bool, shape (h,)
-        Whether a hypothesis is kinematic: of a needle that is turned.
-    decay : ndarray, shape (n,)
-        Correlation of the slow error at the end of a step with that at its begin.
-    push : float
-        Nominal load of the bevel, along z at zero roll [N].
-    prior_covariance : ndarray, shape (h / g, 8 + n, 8 + n)
-        Prior covariance of the causes, of the position between two points of the grid, and of
-        the slow error, by path noise and slow error; hypothesis i has that of number i // g.
-    responses : HypothesisResponses
-        Responses at the g points of the grid; hypothesis i has those of point i modulo g.
 
     """
 
@@ -142,6 +121,7 @@ class SteeringModel:
             )
         self.needle, self.steering = needle, steering
         self.depths, self.prior = at, prior or SteeringPrior()
+        #: Nominal load of the bevel, along z at zero roll [N].
         self.push = most = max(steering.bevel_load)
         b, n = self.prior, self.steps
         width = _BEYOND * b.spread
@@ -183,25 +163,37 @@ class SteeringModel:
                 change[:beams] = whole.reshape(beams, n + 1, n)
         lags = np.outer([0.0] * beams + [windup for _, windup in arcs], at)
         later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
+        #: Responses at the g points of the grid; hypothesis i has those of point i modulo g.
         self.responses = HypothesisResponses(*[*arrays, between, lags, *later])
-        grid_lengths = np.append(grid_lengths, np.ones(len(arcs)))
-        grid_skins = np.append(grid_skins, np.full(len(arcs), nominal))
         kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
+        #: Whether a hypothesis is kinematic, of a needle that is turned; shape (h,).
         self.rolled = np.tile(np.arange(points) >= beams, len(kinds))
-        self.lengths, self.skins = (np.tile(one, len(kinds)) for one in (grid_lengths, grid_skins))
-        self.drifts = np.repeat(kinds[:, 1], len(grid_lengths))
-        self.decay = np.exp(-np.diff(at) / _DRIFT_LENGTH)
-        deviations = [b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (n + 1), _EVEN, _EVEN, 0.0]
-        self.prior_covariance = np.tile(np.diag(np.array(deviations) ** 2), (len(kinds), 1, 1))
+        #: Bending length by hypothesis, relative to the nominal one, and stiffness of the skin
+        #: relative to that of the tissue [m]; shape (h,).
+        self.lengths = np.tile(np.append(grid_lengths, np.ones(len(arcs))), len(kinds))
+        self.skins = np.tile(np.append(grid_skins, np.full(len(arcs), nominal)), len(kinds))
+        causes = np.concatenate([self.responses.causes, self.responses.causes_load], axis=1)
+        known = np.diag([b.offset**2, b.frame**2, b.tilt**2])
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
-        for covariance, (noise, drift) in zip(self.prior_covariance, kinds, strict=True):
-            covariance[4:-3, 4:-3] = noise / (2.0 * b.path_noise_length) * np.exp(-apart)
-            covariance[-1, -1] = drift**2
+        path = np.exp(-apart) / (2.0 * b.path_noise_length)
+        self.state_prior = StatePrior(
+            known=_covariance(causes[:, :, :_BEVEL], known, n + 1),
+            wandering=_covariance(causes[:, :, _BEVEL + 1 :], path, n + 1),
+            deviations=np.array([b.bevel, _EVEN, _EVEN]),
+            noises=np.repeat(kinds[:, 0], points),
+            drifts=np.repeat(kinds[:, 1], points),
+            decay=np.exp(-np.diff(at) / _DRIFT_LENGTH),
+        )
 
     @property
     def steps(self) -> int:
         """Number of steps n."""
         return len(self.depths) - 1
+
+
+def _covariance(causes: FloatArray, of_causes: FloatArray, tips: int) -> FloatArray:
+    """Return the covariance of tips with tips and forces, shape (g, tips, tips + forces)."""
+    return np.asarray(causes[:, :tips] @ of_causes @ causes.transpose(0, 2, 1))
 
 
 def _respond(

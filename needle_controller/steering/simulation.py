@@ -82,12 +82,15 @@ class SteeringPlant:
         self, needle: SteeredNeedle, depths: FloatArray, frame: ArrayLike = (0.0, 0.0)
     ) -> None:
         self.needle, self.depths, self.step = needle, depths, 0
-        self._roll, self._frame = needle.roll, np.array(frame)
+        self._roll = needle.roll
+        self._frame: list[float] = np.array(frame).tolist()
 
     @property
     def tip(self) -> FloatArray:
         """Position of the tip in the frame of the sensor, x and z [m]."""
-        return np.asarray(self.needle.tip[[0, 2]] + self._frame * self.needle.depth)
+        x, depth, z = self.needle.tip.tolist()
+        turn_x, turn_z = self._frame
+        return np.array([x + turn_x * depth, z + turn_z * depth])
 
     @property
     def done(self) -> bool:

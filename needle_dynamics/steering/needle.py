@@ -282,8 +282,9 @@ class SteeredNeedle(Displayed):
     @property
     def tip(self) -> FloatArray:
         """Tip position in x, y and z [m]; shape (3,)."""
-        (x, _), (z, _) = self._cut.tip
-        return np.array([x + self._placement.tissue[0], self.depth, z + self._placement.tissue[2]])
+        # Numbers of Python are faster than single elements of arrays.
+        ((x, _), (z, _)), shift = self._cut.tip.tolist(), self._placement.tissue.tolist()
+        return np.array([x + shift[0], self.depth, z + shift[2]])
 
     @property
     def guide(self) -> FloatArray:
@@ -361,8 +362,13 @@ def _finite(name: str, value: Any) -> float:
 
 
 def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
-    x, z = _numbers(name, values, 2)
-    return float(x), float(z)
+    # The usual arguments, without the cost of arrays.
+    if isinstance(values, (tuple, list)) and len(values) == 2:
+        x, z = values
+        if isinstance(x, float) and isinstance(z, float) and isfinite(x) and isfinite(z):
+            return x, z
+    x, z = _numbers(name, values, 2).tolist()
+    return x, z
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> FloatArray:

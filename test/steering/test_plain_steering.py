@@ -32,21 +32,36 @@ MODELS = {
 }
 
 
+def prior_covariances(model: SteeringModel) -> FloatArray:
+    """Return the prior of all causes by path noise and slow error, shape (6, 8 + n, 8 + n)."""
+    prior, cell = model.prior, 1.0 / sqrt(12.0)
+    deviations = [prior.offset, prior.frame, prior.tilt, prior.bevel]
+    deviations += [0.0] * (model.steps + 1) + [cell, cell, 0.0]
+    kinds = [(path, drift) for drift in (0.0, prior.drift) for path in (1.0, 10.0, 100.0)]
+    found = np.tile(np.diag(np.square(deviations)), (len(kinds), 1, 1))
+    apart = np.abs(np.subtract.outer(model.depths, model.depths)) / prior.path_noise_length
+    for covariance, (path, drift) in zip(found, kinds, strict=True):
+        variance = path * prior.path_noise / (2.0 * prior.path_noise_length)
+        covariance[4:-3, 4:-3] = variance * np.exp(-apart)
+        covariance[-1, -1] = drift**2
+    return found
+
+
 class Plain:
-    """The formulas of the controller in NumPy; without detection of faults."""
+    """The formulas with all causes as unknown constants, in NumPy; without detection of faults."""
 
     def __init__(self, model: SteeringModel, target: FloatArray, limits: SteeringLimits) -> None:
         limit = limits.guide_limit
         self.model, self.goal, self.limit = model, complex(*target), limit
         self.turns, self.load_limit, self.roll, self.step = limits.turns, limits.load_limit, 0.0, 0
-        n, m = model.steps, model.prior_covariance.shape[1]
+        priors = prior_covariances(model)
+        n, m = model.steps, priors.shape[1]
         self.ways = np.minimum(limits.guide_step * np.arange(1, n + 1), 2.0 * limit)
         self.guide, h = np.zeros(n, complex), len(model.lengths)
         self.turned, self.tips = np.ones((h, n + 1), complex), np.zeros(h)
         self.mean = np.zeros((h, m), complex)
         self.mean[:, 3] = 1j * model.push
-        repeats = len(self.mean) // len(model.prior_covariance)
-        self.covariance = np.repeat(model.prior_covariance.astype(complex), repeats, axis=0)
+        self.covariance = np.repeat(priors.astype(complex), len(self.mean) // len(priors), axis=0)
         # The hypotheses are repetitions of the grid.
         self.r = HypothesisResponses(
             **{
@@ -57,7 +72,7 @@ class Plain:
                 for name, one in model.responses._asdict().items()
             }
         )
-        self.logs, self.errors = np.where(model.rolled, -3.0, 0.0), 0.0
+        self.logs, self.errors, self.used = np.where(model.rolled, -3.0, 0.0), 0.0, 0
 
     @property
     def weights(self) -> FloatArray:
@@ -92,12 +107,14 @@ class Plain:
         off = np.array([(means - mean).real, (means - mean).imag])
         return np.array([mean.real, mean.imag]), (w * off) @ off.T + w @ variances * np.eye(2)
 
-    def see(self, look: FloatArray) -> None:
-        """Update the hypotheses by a tip measurement."""
-        means, variances, shared = self.tip(self.step, self.held(), 1.0)
-        whole, off = variances + self.model.prior.noise**2, complex(*look) - means
+    def see(self, look: FloatArray, at: int, noise: float) -> None:
+        """Update the hypotheses by a tip measurement at a depth number."""
+        means, variances, shared = self.tip(at, self.held(), 1.0)
+        whole = variances + max(self.model.prior.noise, noise) ** 2
+        off = complex(*look) - means
         # A gross error of 5 mm, with the prior of 0.1 of 20 measurements.
-        share, squared = (0.1 + self.errors) / (20.0 + self.step), 0.5 * abs(off) ** 2
+        share, squared = (0.1 + self.errors) / (20.0 + self.used), 0.5 * abs(off) ** 2
+        self.used += 1
         normal = np.log(1.0 - share) - squared / whole - np.log(whole)
         wide = whole + 5e-3**2
         gross = np.log(share) - squared / wide - np.log(wide)
@@ -231,10 +248,10 @@ class Plain:
             self.guide[k] = self.choose()
         if k <= last:
             decay = np.ones(self.mean.shape[1])
-            decay[-1] = self.model.decay[k]
+            decay[-1] = self.model.state_prior.decay[k]
             self.mean *= decay
             self.covariance *= np.outer(decay, decay)
-            self.covariance[:, -1, -1] += (1.0 - decay[-1] ** 2) * self.model.drifts**2
+            self.covariance[:, -1, -1] += (1.0 - decay[-1] ** 2) * self.model.state_prior.drifts**2
         self.step += 1
         at = self.guide[min(k, last)]
         return GuideSetpoint(at.real, at.imag, self.roll)
@@ -249,7 +266,8 @@ class Compared(MultiHypothesisLaw):
 
     def update(self, tip: Any, at: int, noise: float = 0.0) -> None:
         super().update(tip, at, noise)
-        self.plain.see(tip)
+        if tip is not None:
+            self.plain.see(tip, at, noise)
 
     def plan(self) -> GuideSetpoint:
         to, plain = super().plan(), self.plain
@@ -294,3 +312,27 @@ def test_a_hundred_insertions_equal_the_plain_formulas(limits: SteeringLimits) -
 
         simulate_steering(law, truth.plant(DEPTHS), sensor)
         assert law.turns == law.plain.turns
+
+
+@pytest.mark.parametrize('load_limit', [2.0, inf])
+def test_late_lost_and_wrong_measurements_equal_the_plain_formulas(load_limit: float) -> None:
+    """Each of the depth before, with its own noise; some are lost, and one is 5 mm off."""
+    limits = SteeringLimits(load_limit=load_limit)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        plant = sample_truth(NEEDLE, STEERING, TRUE, rng, seed).plant(DEPTHS)
+        law = Compared(MODELS[0.0], 2e-3 * rng.uniform(-1.0, 1.0, 2), limits)
+        tip = None
+        for k in range(len(DEPTHS)):
+            if k:
+                law.update(tip, k - 1, 2e-4 * rng.random())
+            tip = None if rng.random() < 0.2 else plant.tip + 1e-4 * rng.standard_normal(2)
+            if k == 5:
+                tip = plant.tip + np.array([5e-3, 0.0])
+            plant.guide(law.plan())
+            if not plant.done:
+                plant.insert()
+        # Further plans change nothing.
+        assert law.plan() == law.plan()
+        assert law.step == len(DEPTHS)
+        law.expected()

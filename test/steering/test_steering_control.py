@@ -192,7 +192,7 @@ def test_bending_length_is_identified() -> None:
 
 
 def test_noisier_measurement_reduces_uncertainty_less() -> None:
-    """The same measurement with four times its noise; a future depth is rejected."""
+    """With four times its noise; a future depth and a past one are rejected."""
     left, model = [], SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(drift=0.0))
     for noise in (0.0, 1.6e-4):
         controller = MultiHypothesisLaw(model, (0.0, 0.0), LIMITS)
@@ -202,6 +202,33 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
     assert left[1] > 5.0 * left[0]
     with pytest.raises(ParameterError, match=r'at must be in \[0, 0\], got 1'):
         controller.update((0.0, 0.0), 1)
+    for _ in range(3):
+        controller.plan()
+    # A measurement may be of the depth before.
+    before = controller.expected(3).covariance[0, 0]
+    controller.update((2e-4, 0.0), 2)
+    assert controller.expected(3).covariance[0, 0] < before
+    for use in (lambda: controller.update((0.0, 0.0), 1), lambda: controller.expected(1)):
+        with pytest.raises(ParameterError, match=r'at must be in \[2, \d+\], got 1'):
+            use()
+
+
+def test_number_of_measurements_is_not_limited() -> None:
+    """Ten measurements at each of three depths, with and without space for them at the start."""
+    model = SteeringModel(NEEDLE, STEERING, DEPTHS[:3], SteeringPrior(drift=0.0))
+    laws = [MultiHypothesisLaw(model, (0.0, 0.0), LIMITS) for _ in range(2)]
+    for _ in range(4):
+        laws[1]._extend()
+    for tip in 1e-5 * np.random.default_rng(1).standard_normal((3, 10, 2)):
+        for law in laws:
+            for one in tip:
+                law.update(one, law.step)
+            law.plan()
+    few, many = (law.expected() for law in laws)
+    assert_array_equal(few.mean, many.mean)
+    assert_array_equal(few.covariance, many.covariance)
+    # 40 um for one measurement.
+    assert few.covariance[0, 0] < 2e-5**2
 
 
 @pytest.mark.requirement('S-151')

@@ -2,10 +2,10 @@
 r"""
 Steering law for all hypotheses: bring the tip to a target by guide and roll, one step at a time.
 
-**Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its
-constants by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses
-together are a mixture of normal distributions. A measurement may have a gross error, such as
-breathing, with a probability that is learned: see `needle_controller.compiled.hypotheses`.
+**Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its state
+by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses together
+are a mixture of normal distributions. A measurement may have a gross error, such as breathing,
+with a probability that is learned: see `needle_controller.compiled.hypotheses`.
 
 **Control.** In a hypothesis the final position of the tip is
 
@@ -30,7 +30,7 @@ to :math:`\phi`, with the previous roll of the tip :math:`\varphi` and the lag :
 """
 
 from collections.abc import Mapping, Sequence
-from math import cos, nan, sin
+from math import cos, inf, nan, sin
 from typing import NamedTuple
 
 from needle_controller.compiled import guide_plan, hypotheses
@@ -118,33 +118,32 @@ class MultiHypothesisLaw(SteeringLaw):
         roll, limit, turns = checked_roll(roll), limits.guide_limit, limits.turns
         if limit == 0.0 and turns == 0:
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
-        from needle_dynamics.compiled.boxed import Boxed
-
-        prior, count = model.prior_covariance, len(model.lengths)
-        points = len(model.responses.guide)
-        mean = np.zeros((count, prior.shape[1]), dtype=np.complex128)
-        mean[:, hypotheses.BEVEL] = 1j * model.push
+        points, tips, count = len(model.responses.guide), model.steps + 1, len(model.lengths)
+        size = tips + hypotheses.CONSTANTS
+        if limits.load_limit < inf:
+            size += model.steps
+        mean = np.zeros((count, size), dtype=np.complex128)
+        mean[:, tips + hypotheses.BEVEL] = 1j * model.push
         self._model = model
-        self._now = hypotheses.Steering(
+        self._use(hypotheses.Steering(
             responses=model.responses,
-            drifts=model.drifts,
-            decay=model.decay,
+            prior=model.state_prior,
             path=(model.depths - model.depths[0]) / np.ptp(model.depths),
             limit=float(limit),
             load_limit=float(limits.load_limit),
             ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
             target=np.zeros(2),
             mean=mean,
-            covariance=np.repeat(prior.astype(np.complex128), points, axis=0),
+            shared=np.empty((count, tips, size), dtype=np.complex128),
+            learned=np.zeros((count, tips)),
             logs=np.where(model.rolled, _ROLLED if turns else -np.inf, 0.0),
             guide=np.zeros(model.steps, dtype=np.complex128),
             turned=np.full((points, model.steps + 1), complex(cos(roll), -sin(roll))),
             roll=np.full(points + 1, roll),
             last=np.full(2, nan),
-            counts=np.array([0, turns, 0, 0, 0]),
-            gross=np.zeros(5),
-        )
-        self._boxed = Boxed(self._now)
+            counts=np.array([0, turns, 0, 0, 0, 0]),
+            gross=np.zeros(4),
+        ))  # fmt: skip
         self._hit_probability: float | None = None  #: None until it is computed for this state
         self.aim(target)
 
@@ -181,8 +180,10 @@ class MultiHypothesisLaw(SteeringLaw):
         return float(self.weights @ self._model.lengths)
 
     def expected(self, at: int = -1) -> TipEstimate:
-        """Predict the tip at a depth number, with guide and roll at their last setpoint."""
-        x, z, xx, xz, zz = hypotheses.predict(self._boxed, range(self._model.steps + 1)[at])
+        """Predict the tip at a depth number, at least `step` - 1, with the last guide and roll."""
+        number = range(self._model.steps + 1)[at]
+        self._check_depth(number, self._model.steps)
+        x, z, xx, xz, zz = hypotheses.predict(self._boxed, number)
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
@@ -226,11 +227,12 @@ class MultiHypothesisLaw(SteeringLaw):
     ) -> None:
         if self.step > self._model.steps:
             raise JobError(f'all {self._model.steps} steps are done')
-        if not 0 <= at <= self.step:
-            raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
+        self._check_depth(at, self.step)
         x, z = checked_tip(tip).tolist()
         variance = max(self._model.prior.noise, noise) ** 2
         self._hit_probability = None
+        if self._now.counts[hypotheses.MEASURED] == self._now.learned.shape[1]:
+            self._extend()
         kind, off_x, off_z = hypotheses.update(self._boxed, at, x, z, variance)
         if kind == hypotheses.VALID:
             return
@@ -253,6 +255,27 @@ class MultiHypothesisLaw(SteeringLaw):
         hypotheses.advance(self._boxed)
         there = complex(now.guide[min(k, last)])
         return GuideSetpoint(there.real, there.imag, float(now.roll[-1]))
+
+    def _extend(self) -> None:
+        """Double the largest number of measurements."""
+        now = self._now
+        self._use(
+            now._replace(
+                shared=np.concatenate([now.shared, np.empty_like(now.shared)], axis=1),
+                learned=np.concatenate([now.learned, np.zeros_like(now.learned)], axis=1),
+            )
+        )
+
+    def _use(self, now: hypotheses.Steering) -> None:
+        from needle_dynamics.compiled.boxed import Boxed
+
+        self._now, self._boxed = now, Boxed(now)
+
+    def _check_depth(self, at: int, most: int) -> None:
+        """Raise for a depth after ``most``, or before the previous one: not in the state."""
+        least = max(0, self.step - 1)
+        if not least <= at <= most:
+            raise ParameterError(f'at must be in [{least}, {most}], got {at!r}')
 
     def _choose(self) -> complex:
         return guide_plan.choose_guide(self._boxed)
