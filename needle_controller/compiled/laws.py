@@ -6,7 +6,7 @@ The functions take `LawConstants` and `Instant` as plain tuples and name their f
 recognizes a plain tuple several times faster than a named tuple.
 """
 
-from math import inf
+from math import inf, isnan
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from needle_controller.compiled.learning import BLOCK, bounds, correction, learn
@@ -170,16 +170,11 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
     return found * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
-@kernel
-def law_learn(
+@compiled
+def _learn(
     constants: LawTuple, memory: Vector, position: float, velocity: float, force: float
 ) -> None:
-    """
-    Update the learned friction with the last period, if the law learns and the axis was sliding.
-
-    ``position`` and ``velocity`` are measured now, ``force`` is the force of the period less known
-    loads [N]; else as in `law_force`.
-    """
+    """Learn friction from the last period and its force less known loads, if the axis slid."""
     c = LawConstants(*constants)
     if c.bound == 0.0:
         return
@@ -280,8 +275,8 @@ def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: 
     return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 
 
-@kernel
-def law_match(
+@compiled
+def _match(
     constants: LawTuple, memory: Vector, instant: InstantTuple, load: float, force: float
 ) -> None:
     """Set the memory such that the force of the law equals ``force`` [N]; else as `law_force`."""
@@ -298,7 +293,7 @@ def law_match(
         memory[OFFSET] = missing
 
 
-@kernel
+@compiled
 def law_step(
     constants: LawTuple, memory: Vector, instant: InstantTuple, load: float, limit: float
 ) -> float:
@@ -306,7 +301,7 @@ def law_step(
     return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)
 
 
-@kernel
+@compiled
 def axis_step(
     constants: LawTuple, position: float, velocity: float, force: float
 ) -> tuple[float, float]:
@@ -314,3 +309,31 @@ def axis_step(
     c = LawConstants(*constants)
     velocity, moved = friction_flow(_friction(c), c.inertia, velocity, force, c.period)
     return position + moved, velocity
+
+
+@kernel
+def answer(
+    constants: LawTuple,
+    memory: Vector,
+    pending: Vector,
+    instant: InstantTuple,
+    acted: float,
+    load: float,
+    limit: float,
+    taken_over: float,
+) -> float:
+    """
+    Return the force within its limit [N] that answers a measurement, and update the memory.
+
+    ``instant`` has the measured state and the setpoint for the effect of the command. ``pending``,
+    shape (delay,), are commands without effect so far [N]; ``acted`` is the force of the last
+    period [N]. Before its limit the force equals a ``taken_over`` one that is not nan [N].
+    """
+    position, velocity, target, rate, acceleration = instant
+    _learn(constants, memory, position, velocity, acted - load)
+    for force in pending:
+        position, velocity = axis_step(constants, position, velocity, force - load)
+    at = (position, velocity, target, rate, acceleration)
+    if not isnan(taken_over):
+        _match(constants, memory, at, load, taken_over)
+    return law_step(constants, memory, at, load, limit)

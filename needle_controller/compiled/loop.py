@@ -2,8 +2,8 @@
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
 from needle_controller.compiled.laws import (
+    answer,
     axis_step,
-    law_learn,
     law_step,
     LawConstants,
     LawTuple,
@@ -85,12 +85,10 @@ def run_loop(  # noqa: C901
             break
         if noise.shape[0] > 0:
             depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
-        law_learn(law, memory, depth, velocity, acts)
-        for i in range(delay - known, delay):
-            depth, velocity = axis_step(law, depth, velocity, pending[i])
         aim = setpoints[k - waited]
         instant = (depth, velocity, aim[0], aim[1], aim[2])
-        command = law_step(law, memory, instant, 0.0, limit)
+        newest = pending[delay - known :]
+        command = answer(law, memory, newest, instant, acts, 0.0, limit, np.nan)
         to_go = setpoints[count - 1, 0] - goal[k - waited]
         if abs(command) >= limit and command * to_go > 0.0:
             waited += 1

@@ -6,16 +6,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from math import exp, inf, sqrt
+from math import exp, inf, nan, sqrt
 from typing import Any, ClassVar, Final
 
 from needle_controller.compiled.laws import (
-    axis_step,
+    answer,
     FOLLOWS,
     law_force,
-    law_learn,
-    law_match,
-    law_step,
     LawConstants,
     LEARNED,
     MEASURED,
@@ -194,15 +191,12 @@ class SampledLoop:
 
         Position and velocity are measured now; the setpoint is for the effect of the command.
         """
-        law, load = self.law, float(load)
-        law_learn(law.packed, self.memory, float(position), float(velocity), self._acts - load)
-        for force in self.pending:
-            position, velocity = axis_step(law.packed, position, velocity, force - load)
-        instant = _instant(position, velocity, setpoint)
-        if self._take_over:
-            self._take_over = False
-            law_match(law.packed, self.memory, instant, load, self.last)
-        self.last = force = law_step(law.packed, self.memory, instant, load, self.limit)
+        self.last = force = answer(
+            self.law.packed, self.memory, np.array(self.pending, np.float64),
+            _instant(position, velocity, setpoint), self._acts, float(load), self.limit,
+            self.last if self._take_over else nan,
+        )  # fmt: skip
+        self._take_over = False
         self._acts = self.pending[0] if self.pending else force
         self.pending.append(force)
         return force
