@@ -220,7 +220,7 @@ def written(parts: Path) -> dict[tuple[int, int], int]:
     found = {}
     # Parts are removed at the end of the study.
     with suppress(FileNotFoundError):
-        for path in parts.glob('*-*.parquet'):
+        for path in parts.glob('*-*.arrow'):
             first, end, _ = path.stem.split('-')
             found[int(first), int(end)] = path.stat().st_mtime_ns
     return found

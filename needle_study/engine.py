@@ -7,12 +7,13 @@ are not computed again. When all are complete they become one table, in the orde
 whose bytes depend neither on the chunks nor on the number of workers.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, FIRST_COMPLETED, Future, wait
-from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 import fcntl
 from functools import lru_cache
 from importlib.metadata import version
+from itertools import chain
 import json
 import os
 from pathlib import Path
@@ -39,7 +40,7 @@ _BLOCK: Final = 2**20  #: bytes that are read at once
 pa.set_memory_pool(pa.system_memory_pool())
 
 #: Name of a part: first sample, end, and checksum.
-_PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.parquet')
+_PART: Final = re.compile(r'(\d{10})-(\d{10})-([0-9a-f]{8})\.arrow')
 
 #: Packages whose versions affect the bits of a sample.
 _PACKAGES: Final = ('needle_insertion', 'numba', 'numpy', 'scipy')
@@ -172,37 +173,39 @@ class Results:
     def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
         """Write a chunk that starts at the sample `first`; return its number of samples."""
         count = len(columns['sample'])
-        end, draft = first + count, self._parts / f'{first:010d}.part'
-        self._write(draft, [pa.table(dict(columns))])
-        name = f'{first:010d}-{end:010d}-{_checksum(first, end, draft)}.parquet'
-        draft.replace(self._parts / name)
+        end, draft, table = first + count, self._parts / 'draft', pa.table(dict(columns))
+        with _errors_of(draft):
+            # Not compressed: a part is removed when all are complete.
+            with pa.ipc.new_file(str(draft), table.schema) as writer:
+                writer.write_table(table)
+            name = f'{first:010d}-{end:010d}-{_checksum(first, end, draft)}.arrow'
+            draft.replace(self._parts / name)
         return count
 
     def complete(self) -> None:
         """Merge all parts into one table, and remove the parts."""
         if not self.table.exists():
             draft = self.table.with_suffix('.part')
-            self._write(draft, self._groups(), durable=True)
+            with _errors_of(draft):
+                self._merge(draft)
             write_whole(self._sum, _checksum(0, self.study.samples, draft).encode())
             draft.replace(self.table)
         self._clear()
 
     def _is_intact(self) -> bool:
-        """Return whether the table has its checksum."""
         with suppress(OSError, UnicodeDecodeError):
             return self._sum.read_text() == _checksum(0, self.study.samples, self.table)
         return False
 
     def _clear(self) -> None:
-        """Remove the parts after they are merged."""
         shutil.rmtree(self._parts, ignore_errors=True)
-        self.table.with_suffix('.tmp').unlink(missing_ok=True)
 
     def _groups(self) -> Iterator[Any]:
         """Yield all samples in tables of equal size."""
         waiting: list[Any] = []
         for part in self._done():
-            waiting.append(parquet.read_table(part.path, use_threads=False))
+            with pa.OSFile(str(part.path)) as file:
+                waiting.append(pa.ipc.open_file(file).read_all())
             while sum(map(len, waiting)) >= _GROUP:
                 whole = pa.concat_tables(waiting)
                 yield whole.slice(0, _GROUP)
@@ -210,29 +213,27 @@ class Results:
         if sum(map(len, waiting)):
             yield pa.concat_tables(waiting)
 
-    @staticmethod
-    def _write(path: Path, tables: Iterable[Any], *, durable: bool = False) -> None:
-        """Write a file atomically."""
-        draft = path.with_suffix('.tmp')
-        try:
-            with ExitStack() as stack:
-                writer = None
-                for one in tables:
-                    writer = writer or stack.enter_context(
-                        parquet.ParquetWriter(
-                            draft, one.schema, compression='zstd', use_dictionary=False
-                        )
-                    )
-                    writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
-            if durable:
-                # The parts are removed afterwards. A lost part is computed again.
-                with draft.open('rb') as file:
-                    os.fsync(file.fileno())
-            draft.replace(path)
-        except OSError as error:
-            with suppress(OSError):
-                draft.unlink()
-            raise JobError(f'{path} cannot be written: {error.strerror or error}') from error
+    def _merge(self, path: Path) -> None:
+        groups = self._groups()
+        first = next(groups)
+        options = {'compression': 'zstd', 'use_dictionary': False}
+        with parquet.ParquetWriter(path, first.schema, **options) as writer:
+            for one in chain([first], groups):
+                writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
+        # The parts are removed afterwards. A lost part is computed again.
+        with path.open('rb') as file:
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def _errors_of(draft: Path) -> Iterator[None]:
+    """Remove a file that cannot be written, and raise JobError."""
+    try:
+        yield
+    except OSError as error:
+        with suppress(OSError):
+            draft.unlink()
+        raise JobError(f'{draft} cannot be written: {error.strerror or error}') from error
 
 
 def compute(

@@ -51,7 +51,7 @@ def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_repeated_computation_is_counted(tmp_path: Path) -> None:
     """In a rewritten part, a missing part, and an overlapping part."""
-    for name in ('0000000000-0000000004-0.parquet', '0000000004-0000000010-0.parquet', 'x.tmp'):
+    for name in ('0000000000-0000000004-0.arrow', '0000000004-0000000010-0.arrow', 'x.tmp'):
         (tmp_path / name).write_text('')
     before = written(tmp_path)
     assert set(before) == {(0, 4), (4, 10)}

@@ -22,7 +22,7 @@ from benchmarks.kills import kill_again_and_again, kill_workers
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray
-from needle_identification import read_topic
+from needle_identification.bags.bag import read_topic
 from needle_insertion.cli import main
 from needle_insertion.commands import study as study_command
 from needle_insertion.report import study_page as page
@@ -431,7 +431,7 @@ def test_damaged_parts_are_computed_again(
     compute(whole, here, 1, lambda _: None)
     for first in (0, 16):
         broken.add(first, study.rows(first, 16))
-    (part,) = (tmp_path / 'broken' / 'parts').glob('0000000000-*.parquet')
+    (part,) = (tmp_path / 'broken' / 'parts').glob('0000000000-*.arrow')
     damage(part)
     compute(broken, here, 1, lambda _: None)
     assert checksum(broken.table) == checksum(whole.table)
@@ -567,7 +567,9 @@ def test_a_full_disk_is_a_one_line_error(tmp_path: Path, monkeypatch: pytest.Mon
     room = resource_limit(2000)
     with room, pytest.raises(JobError, match=r'cannot be written: .*File too large'):
         compute(results, here, 1, lambda _: None)
-    assert not list((tmp_path / 'results').rglob('*.tmp'))
+    files = {path.name for path in (tmp_path / 'results').rglob('*') if path.is_file()}
+    assert 'draft' not in files
+    assert 'samples.part' not in files
     compute(results, here, 1, lambda _: None)
     assert len(column(results.table, 'miss')) == study.samples
 
