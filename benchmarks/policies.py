@@ -11,7 +11,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, NeedleParameters
 from needle_study.gym.insertion import InsertionVectorEnv
-from needle_study.gym.pushed import EFFORT, FORCE, NEAR, PERIOD, TIME, UNITS
+from needle_study.gym.pushed import EFFORT, FORCE, NEAR, PERIOD, START, TIME, UNITS, WAY
 import numpy as np
 
 #: Name of the controller.
@@ -30,7 +30,8 @@ def expert(observations: FloatArray) -> FloatArray:
     Return actions from the nominal friction, shape (n, 1).
 
     The force balances friction at a velocity: the one that costs the least reward for a distance,
-    or less near the target, so that the target is reached after one period.
+    or less near the target, so that the target is reached after one period. Near enough to arrive,
+    the force ends if the rest of the way is worth less than another period.
     """
     p = NeedleParameters.preset('phantom')
     error = UNITS[0] * observations[:, :1].astype(np.float64)
@@ -39,7 +40,9 @@ def expert(observations: FloatArray) -> FloatArray:
     cheapest = (dry + np.sqrt(dry**2 + TIME / EFFORT * FORCE**2)) / FORCE
     reached = (dry + p.viscous_friction * np.abs(error) / PERIOD) / FORCE
     action = np.sign(error) * np.minimum(reached, cheapest)
-    return np.asarray(np.where(np.abs(error) < 0.9 * NEAR, 0.0, action))
+    whole = error + UNITS[2] * observations[:, 2:3] - START
+    worth = WAY * np.abs(error / whole) + TIME + EFFORT * action**2
+    return np.asarray(np.where((np.abs(error) < 0.9 * NEAR) & (worth < 0.0), 0.0, action))
 
 
 def policies(number: int) -> dict[str, Policy]:
