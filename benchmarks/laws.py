@@ -31,8 +31,8 @@ from needle_controller import (
     ReferenceLimits,
     run_batch,
     Setpoint,
-    Trapezoid,
 )
+from needle_controller.reference.trapezoid import Trapezoid
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 

@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from needle_controller.reference.setpoint import Reference as Reference
     from needle_controller.reference.setpoint import ReferenceLimits as ReferenceLimits
     from needle_controller.reference.setpoint import Setpoint as Setpoint
-    from needle_controller.reference.trapezoid import Trapezoid as Trapezoid
     from needle_controller.safety.limits import SafetyLimits as SafetyLimits
     from needle_controller.stability import check_stability as check_stability
     from needle_controller.steering.executive import SteeringExecutive as SteeringExecutive

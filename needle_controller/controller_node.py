@@ -236,7 +236,6 @@ class ControllerNode(ModelNode):
         return gains
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
-        """Return the depth to retract to, or reject it."""
         value = changes.get(_RETRACT, self.get_parameter(_RETRACT).value)
         low, high = self.settings('', ControllerSettings).depths(self.model_parameters())
         if _RETRACT not in changes and value == RETRACT_DEPTH:

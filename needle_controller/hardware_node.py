@@ -91,7 +91,6 @@ def await_topics(node: BaseNode, settings: HardwareSettings) -> None:
 
 
 def _published(node: BaseNode, type_name: str) -> list[str]:
-    """Return the topics of a type that other nodes publish."""
     own = node.get_name(), node.get_namespace()
     return sorted(
         name
@@ -190,7 +189,6 @@ class Driver:
         )
 
     def with_robot(self, status: ControllerStatus) -> ControllerStatus:
-        """Return the status of the controller with the topics of the robot."""
         joints = ', '.join(self._settings.joints)
         return replace(
             status,

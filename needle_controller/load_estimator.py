@@ -36,7 +36,6 @@ class LoadEstimator:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all measurements."""
         #: Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
         self.load = 0.0
         self.warning: str | None = None  #: Why the observer is inconsistent.

@@ -255,7 +255,6 @@ class SteeringNode(CompiledNode):
                 self._take_answers(node, answers)
 
     def _take_answers(self, receiver: str, answers: RequestStatus) -> None:
-        """Process the answers of a receiver of the motions."""
         if self._loop is not None and self.is_active:
             self._act(self._loop.receive(receiver, answers, self.now()))
 

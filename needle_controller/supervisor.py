@@ -448,7 +448,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return self._release(stamp)
 
     def _log_fault(self, fault: str, consequence: str) -> None:
-        """Record a fault, and log its beginning."""
         # The first word of the line identifies the kind of fault.
         kind = fault.partition(' ')[0]
         if self.fault is None or not self.fault.startswith(kind):

@@ -79,7 +79,6 @@ class NeedleModel:
 
     @cached_property
     def modes(self) -> ModeShapes:
-        """Shape modes of the needle."""
         p = self.parameters
         return mode_shapes(p.length, p.modes, p.reach)
 

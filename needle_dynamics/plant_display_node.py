@@ -21,7 +21,6 @@ _RATE: Final = 30.0  #: rate of the messages [Hz]
 
 
 def time_message(stamp: int) -> TimeMessage:
-    """Convert a stamp [ns] to a message."""
     return TimeMessage(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
 
 

@@ -203,7 +203,6 @@ class PlantNode(ModelNode):
         self._obey()
 
     def cleanup(self) -> None:
-        """Discard the plant."""
         if self._run is not None:
             self._number = self._run.number
             self._trajectories.destroy()
@@ -227,7 +226,6 @@ class PlantNode(ModelNode):
             samples.fault = SensorFault(kind, parameters, float(rate), seed)
 
     def activate(self) -> None:
-        """Start sampling."""
         if self._run is None:
             return
         self._halted = None
@@ -260,7 +258,6 @@ class PlantNode(ModelNode):
         )
 
     def deactivate(self) -> None:
-        """Stop sampling."""
         self._trajectories.end('the plant is not active')
         for timer in self._active_timers:
             self.destroy_timer(timer)
@@ -403,7 +400,6 @@ class PlantNode(ModelNode):
             self.report_change()
 
     def _sample(self, stamp: int) -> None:
-        """Take a sample and publish it."""
         plant_run = self._run
         self._samples.publish_clock(stamp)
         if plant_run is None or self._halted is not None:

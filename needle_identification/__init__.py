@@ -16,7 +16,6 @@ from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
     from needle_identification.bags.bag import Bag as Bag
-    from needle_identification.bags.bag import read_topic as read_topic
     from needle_identification.bags.table import read_bag as read_bag
     from needle_identification.bags.table import TopicTable as TopicTable
     from needle_identification.bags.writer import BagWriter as BagWriter
@@ -50,7 +49,6 @@ if TYPE_CHECKING:
     from needle_identification.result import write_result as write_result
     from needle_identification.sensor.estimate import SensorEstimate as SensorEstimate
     from needle_identification.sensor.identify import identify_sensor as identify_sensor
-    from needle_identification.sensor.reading import read_sensor_recording as read_sensor_recording
     from needle_identification.sensor.recording import SensorRecording as SensorRecording
     from needle_identification.steering.estimate import SteeringEstimate as SteeringEstimate
     from needle_identification.steering.identify import identify_steering as identify_steering

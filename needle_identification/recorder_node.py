@@ -143,7 +143,6 @@ class RecorderNode(BaseNode):
     # Recording.
 
     def activate(self) -> None:
-        """Start a recording."""
         number = self._recordings + 1
         path = self._path.with_name(f'{self._path.name}_{number}') if number > 1 else self._path
         self._bag = BagWriter(path, self._compression)

@@ -144,7 +144,6 @@ class ParameterNode(LifecycleNode):
         return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
 
     def values(self) -> dict[str, Any]:
-        """Return all parameters by name."""
         values = {}
         for name, parameter in sorted(self._parameters.items()):
             value = parameter.value

@@ -88,7 +88,6 @@ class RequestStatus:
         return cls(takes, tuple(answers))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
-        """Return the answer to a request with a topic and stamp [ns], or None."""
         found = (one for one in self.answers if (one.topic, one.stamp) == (topic, stamp))
         return next(found, None)
 

@@ -128,7 +128,6 @@ def outcome_of(answer: Acknowledgement, now: int) -> Outcome:
 
 
 def _check_joints(field: str, names: Collection[str], valid: Collection[str]) -> None:
-    """Check that a field names some of the valid joints, each once."""
     if not names or len({*names}) < len(names) or not {*names} <= {*valid}:
         raise UnknownJointError(
             f'{field} must be some of {", ".join(valid) or "no joint"}, each once, got '

@@ -372,7 +372,6 @@ class InsertionScenario(Scenario):
             ).until(done)  # fmt: skip
 
     def _metrics_of(self, row: Mapping[str, float], run: _Insertion) -> dict[str, float]:
-        """Return the metrics of an insertion."""
         depth, speed, target = run.depth, run.speed, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)

@@ -12,8 +12,8 @@ from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import ParameterError
-from needle_identification import read_topic, RecordingError
-from needle_identification.bags.bag import message_counts
+from needle_identification import RecordingError
+from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document

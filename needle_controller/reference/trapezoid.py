@@ -22,28 +22,9 @@ class Step(Reference):
 
 class Trapezoid(Reference):
     """
-    Fastest motion within the limits: accelerate, constant speed, brake.
+    Fastest motion to a target [m] within the limits: accelerate, constant speed, brake.
 
-    Parameters
-    ----------
-    start : Setpoint
-        Start of the motion; its acceleration is ignored.
-    target : float
-        Position of the end, at rest [m].
-    limits : ReferenceLimits
-        Limits. If the start is faster than the limit, the motion first brakes.
-
-    Examples
-    --------
-    >>> from needle_controller import ReferenceLimits, Setpoint, Trapezoid
-    >>> motion = Trapezoid(Setpoint(0.02), 0.05, ReferenceLimits(speed=0.01, acceleration=0.1))
-    >>> round(motion.duration, 9)
-    3.1
-    >>> motion.at(3.0)
-    Setpoint(position=0.0495, velocity=0.01, acceleration=0.0)
-    >>> motion.at(5.0)
-    Setpoint(position=0.05, velocity=0.0, acceleration=0.0)
-
+    The acceleration at the start is ignored; a start faster than the limit first brakes.
     """
 
     def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:

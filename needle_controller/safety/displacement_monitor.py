@@ -20,7 +20,6 @@ class DisplacementMonitor:
         self.forget()
 
     def forget(self) -> None:
-        """Discard all measurements."""
         #: Time [s], insertion depth [m] and velocity [m/s] of the last measurement.
         self._last: tuple[float, float, float] | None = None
         #: Displacement unexplained by the velocities of the last seconds [m].

@@ -98,7 +98,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     @property
     def phase(self) -> Phase:
-        """State."""
         if self.planner.job is not None:
             return Phase.PLANNING
         if self._retraction is not None:
@@ -123,7 +122,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     @property
     def law(self) -> SteeringLaw | None:
-        """Steering law of the latest insertion."""
         return None if self._insertion is None else self._insertion.law.law
 
     @property
@@ -181,7 +179,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return self._motions.at
 
     def _plan(self, stamp: int, point: tuple[float, float, float], now: int) -> None:
-        """Start to compute a plan."""
         at, last = self._check_ready(now), self._insertion
         begun = None if last is None else float(last.law.depths[0])
         request = self.planner.prepare(
@@ -294,7 +291,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return None
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
-        """Process `joint_states`."""
         found = dict(zip(reading.names, reading.values[0], strict=False))
         if missing := [name for name in self.settings.joints if name not in found]:
             got = f'got names {list(reading.names)}'
@@ -340,7 +336,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
-        """Process `tip_deflection`."""
         tip = reading.values[0]
         if not self._is_valid(self._tip_stream, reading, tip, now):
             return None

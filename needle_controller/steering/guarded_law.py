@@ -78,7 +78,6 @@ class GuardedLaw:
         self.aim(np.array([x, z]))
 
     def repeat(self, entry: Mapping[str, Any]) -> None:
-        """Repeat an input of the history."""
         if 'aim' in entry:
             self.aim(np.array(entry['aim']))
             return

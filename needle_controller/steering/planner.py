@@ -115,7 +115,6 @@ class InsertionPlanner:
         return np.linspace(depth, point[1], steps + 1)
 
     def start(self, request: PlannedInsertion) -> None:
-        """Start to compute the law of a request."""
         settings, depths, record = self.settings, request.depths, request.record
         # The law of a record was constructed for the target at the start.
         x, _, z = request.point if record is None else record.point

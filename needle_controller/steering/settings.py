@@ -98,7 +98,6 @@ class ExecutiveSettings(SteeringLimits):
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Joints that are moved."""
         return JOINTS if self.turns else JOINTS[:-1]
 
     def limits(self, step: float) -> SteeringLimits:

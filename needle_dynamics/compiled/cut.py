@@ -110,7 +110,6 @@ def move(n: Steered, c: Cut, to: GuidePose) -> None:
 
 @kernel
 def move_boxed(boxed: Boxed[CuttingNeedle], to: GuidePose) -> None:
-    """Apply `move` to a boxed needle."""
     move(boxed.value.constants, boxed.value.state, to)
 
 

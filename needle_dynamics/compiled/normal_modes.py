@@ -28,7 +28,6 @@ class NormalModes(NamedTuple):
 
 @compiled
 def empty_normal_modes(n: int) -> NormalModes:
-    """Return arrays of zeros for n normal modes."""
     return NormalModes(np.zeros((n, n)), np.zeros((n, n)), np.zeros(n))
 
 

@@ -140,7 +140,6 @@ class SteeredPlant(SimulatedPlant):
         return velocity_text(self.insertion.velocity) or (joints and f'{joints} moves')
 
     def change(self, parameters: NeedleParameters) -> None:
-        """Change the friction constants."""
         self.insertion.change(parameters)
 
     def advance(self, force: float = 0.0) -> list[float]:

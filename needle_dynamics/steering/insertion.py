@@ -19,7 +19,6 @@ DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
 
 
 def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConstants:
-    """Return the constants along the insertion axis."""
     if needle.friction_law != 'coulomb':
         raise ParameterError(
             f'friction_law must be coulomb for a steered needle, got {needle.friction_law!r}'

@@ -168,33 +168,7 @@ def _empty(bag: Bag) -> RecordingError:
 
 
 def read_topic(path: Path | str, topic: str) -> list[tuple[int, Any]]:
-    """
-    Read one topic of a bag.
-
-    Parameters
-    ----------
-    path : Path or str
-        As in `Bag`.
-    topic : str
-        Full name.
-
-    Returns
-    -------
-    list of (int, message)
-        Receive time [ns] and deserialized message.
-
-    Raises
-    ------
-    RecordingError
-        If the bag lacks the topic, or a message is invalid.
-
-    Examples
-    --------
-    >>> received, message = read_topic('bags/friction_01', '/joint_states')[0]
-    >>> message.name
-    ['insertion', 'rotation']
-
-    """
+    """Return receive time [ns] and deserialized message of a topic, by its full name."""
     # Lazy import: large, and needed for deserialization only.
     from needle_identification.bags.messages import deserialize
 

@@ -56,7 +56,8 @@ class BagWriter:
 
     Examples
     --------
-    >>> from needle_identification import BagWriter, read_topic
+    >>> from needle_identification import BagWriter
+    >>> from needle_identification.bags.bag import read_topic
     >>> from needle_identification.bags.messages import encode, message_type
     >>> from tempfile import TemporaryDirectory
     >>> folder = TemporaryDirectory()

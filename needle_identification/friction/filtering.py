@@ -152,7 +152,6 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
 def _filtered_velocity(
     time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, from_depth: bool
 ) -> BSpline:
-    """Return the filtered velocity as a spline of time, from velocity or from depth."""
     from scipy.interpolate import make_interp_spline
 
     start = raw[0] if from_depth else 0.0

@@ -189,7 +189,6 @@ def plain_name(name: str) -> str:
 
 
 def unit_of(name: str, role: str) -> str | None:
-    """Return the unit in a name, if valid for the role."""
     match = _BRACKETS.match(name)
     word = match[2].strip() if match else name.rpartition('_')[2]
     return word if word in UNITS[role] and word != name else None

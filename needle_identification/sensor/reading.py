@@ -47,39 +47,12 @@ def read_sensor_recording(
     truth_columns: Mapping[str, str] | None = None,
 ) -> SensorRecording:
     """
-    Read a recording of a tip sensor, and the true position.
+    Read a bag or a table of a tip sensor, and the true position, which may be constant [m].
 
-    Parameters
-    ----------
-    path : Path or str
-        A bag, as in `read_friction_recording`, or a table with time and positions.
-    truth : Path or str or sequence of float
-        Constant position x, y, z [m]; or a bag or a table by the same clock, which may be the
-        recording itself.
-    axes : sequence of str
-        Axes to compare, of x, y and z.
-    tip_topic : str, optional
-        Topic of the tip, PointStamped or PoseStamped; default the only topic of these types, or
-        the topic with the last name tip_deflection.
-    truth_topic : str, optional
-        Topic of the true position, likewise, or a JointState with the joints in
-        ``truth_columns``; default the only such topic.
-    time : str
-        Stamps to use, one of `TIMES`.
-    columns, truth_columns : mapping of str to str, optional
-        By role, of `SENSOR_ROLES`: columns of a table, see `tables`; for a bag, the axes x, y or
-        z, or joints, with a prefix ``-`` for the opposite sign.
-
-    Returns
-    -------
-    SensorRecording
-        The recording; its ``losses`` list discarded and corrected data.
-
-    Raises
-    ------
-    RecordingError
-        If a file is not readable, lacks a topic or a column, or the times do not overlap.
-
+    ``columns`` and ``truth_columns`` are by role, of `SENSOR_ROLES`: columns of a table, see
+    `tables`; for a bag, the axes x, y or z, or joints, with a prefix ``-`` for the opposite sign.
+    The true position may be a JointState. Topics are by default the only ones of their types, or
+    end with tip_deflection. Otherwise as `read_friction_recording`.
     """
     axes = tuple(axes)
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:

@@ -41,7 +41,6 @@ def with_unit(
 
 
 def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
-    """Add a repeatable option for `constants`."""
     parser.add_argument(
         option,
         action='append',

@@ -120,7 +120,6 @@ def add_output(parser: argparse._ActionsContainer, use: str = '') -> None:
 
 
 def words_of(text: str) -> list[str]:
-    """Return the words of a list with commas."""
     return [word.strip() for word in text.split(',')]
 
 

@@ -209,7 +209,6 @@ class RecordedRun:
         return rows
 
     def _number(self, stamp: int) -> int:
-        """Return the sample number of a stamp [ns]."""
         begin, number = self._anchors[max(bisect_right(self._anchors, (stamp, inf)) - 1, 0)]
         return number + round((stamp - begin) / self._period)
 

@@ -213,7 +213,6 @@ class Connection:
             self._establish(coming, self.place)
 
     def _establish(self, connection: socket.socket, peer: str) -> None:
-        """Initialize an established connection."""
         self._socket, self.peer = connection, peer
         self._frames = Frames(self._wanted, self._events.reject)
         # A connection that is already closed is detected by the next read.

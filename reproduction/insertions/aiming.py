@@ -10,7 +10,7 @@ from typing import Final
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
-from needle_identification import read_topic
+from needle_identification.bags.bag import read_topic
 from needle_insertion.graph.lockstep import RunSample, WARM_UP
 from needle_insertion.graph.messages import State
 from needle_insertion.graph.node_process import GraphError

@@ -9,12 +9,8 @@ from builtin_interfaces.msg import Duration
 from matplotlib.figure import Figure
 from needle_dynamics import bending_length, FloatArray
 from needle_dynamics.needles import NEEDLES
-from needle_identification import (
-    identify_steering,
-    read_steering_recording,
-    read_topic,
-    SteeringSettings,
-)
+from needle_identification import identify_steering, read_steering_recording, SteeringSettings
+from needle_identification.bags.bag import read_topic
 from needle_insertion.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle, evenly

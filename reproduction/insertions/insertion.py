@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
-from needle_identification import read_topic
+from needle_identification.bags.bag import read_topic
 from needle_insertion.graph.lockstep import WARM_UP
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.progress import Show

@@ -20,8 +20,8 @@ from needle_identification import (
     identify_stiffness,
     read_friction_recording,
     read_indentation_recording,
-    read_topic,
 )
+from needle_identification.bags.bag import read_topic
 from needle_identification.bags.messages import encode, message_type
 from needle_insertion.cli import main
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2

@@ -7,8 +7,7 @@ from pathlib import Path
 import re
 
 from needle_dynamics import NeedleModel, NeedleParameters, simulate
-from needle_identification import read_topic
-from needle_identification.bags.bag import message_counts
+from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.cli import main
 import numpy as np
 from numpy.testing import assert_allclose

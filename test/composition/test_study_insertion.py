@@ -19,8 +19,7 @@ from needle_controller import (
 )
 from needle_controller.safety.guard import Guard
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_identification import read_topic
-from needle_identification.bags.bag import message_counts
+from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.cli import main
 from needle_ros.process_pool import processes
 from needle_study.engine import compute, Results

@@ -18,9 +18,9 @@ from needle_controller import (
     run_batch,
     run_controller,
     Setpoint,
-    Trapezoid,
 )
 from needle_controller.laws.axis import Axis
+from needle_controller.reference.trapezoid import Trapezoid
 from needle_dynamics import (
     add_friction_law,
     Friction,

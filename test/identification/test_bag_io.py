@@ -16,11 +16,10 @@ from needle_identification import (
     Bag,
     BagWriter,
     read_friction_recording,
-    read_topic,
     Recording,
     RecordingError,
 )
-from needle_identification.bags.bag import message_counts
+from needle_identification.bags.bag import message_counts, read_topic
 from needle_identification.bags.topics import OfferedQos
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal

@@ -18,12 +18,12 @@ from needle_identification import (
     BagWriter,
     IdentificationError,
     identify_sensor,
-    read_sensor_recording,
     RecordingError,
     SensorRecording,
 )
 from needle_identification.sensor.losses import fit_losses
 from needle_identification.sensor.noise import NoiseLikelihood
+from needle_identification.sensor.reading import read_sensor_recording
 from needle_insertion.cli import main
 from needle_ros import contract
 from needle_ros.errors import ParameterError, ShapeError

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from needle_identification import Bag, BagWriter, read_bag, read_topic, RecordingError
+from needle_identification import Bag, BagWriter, read_bag, RecordingError
+from needle_identification.bags.bag import read_topic
 from needle_identification.bags.messages import encode, message_type
 from needle_ros.contract import JOINT_STATES
 import numpy as np

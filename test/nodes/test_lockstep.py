@@ -26,7 +26,8 @@ from needle_controller.steering.law import build_law, DEFAULT_LAW
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.simulation import sample_truth, simulate_steering, step_depths
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, NEEDLES
-from needle_identification import Bag, read_topic
+from needle_identification import Bag
+from needle_identification.bags.bag import read_topic
 from needle_identification.bags.messages import deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.graph.lockstep import RunSample

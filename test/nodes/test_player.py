@@ -13,7 +13,8 @@ from typing import Any
 
 from builtin_interfaces.msg._time import Time
 from mcap.writer import Writer as McapWriter
-from needle_identification import Bag, BagWriter, read_topic
+from needle_identification import Bag, BagWriter
+from needle_identification.bags.bag import read_topic
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode

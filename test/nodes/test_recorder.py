@@ -13,8 +13,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Goals
-from needle_identification import Bag, BagWriter, read_topic
-from needle_identification.bags.bag import message_counts
+from needle_identification import Bag, BagWriter
+from needle_identification.bags.bag import message_counts, read_topic
 from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import UNLIMITED
 from needle_identification.recorder_node import RecorderNode

@@ -16,7 +16,7 @@ import sys
 import time
 
 from needle_dynamics.plant_node import PlantNode
-from needle_identification import read_topic
+from needle_identification.bags.bag import read_topic
 from needle_insertion.replay.rerun import verify
 import pytest
 from support.installed import ROOT

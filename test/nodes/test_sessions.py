@@ -16,7 +16,7 @@ import sys
 from time import monotonic, time_ns
 from typing import Any, NamedTuple
 
-from needle_identification import read_topic
+from needle_identification.bags.bag import read_topic
 from needle_ros.base_node import SENSOR
 from needle_ros.contract import INSERTION
 from needle_ros.errors import JobError

@@ -6,11 +6,16 @@ from __future__ import annotations
 from math import cos, pi, sin, sqrt
 
 from needle_dynamics import NeedleParameters, ParameterError, ShapeError, SteeringParameters
-from needle_dynamics.steering.reference_models import springs
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from support.reference_models import bicycle, bicycle_curvature, intrinsic_curvature, unicycle
+from support.reference_models import (
+    bicycle,
+    bicycle_curvature,
+    intrinsic_curvature,
+    springs,
+    unicycle,
+)
 
 
 def test_unicycle_moves_along_an_arc() -> None:

@@ -6,8 +6,12 @@ Steering models from the literature, for comparison with `SteeredNeedle`.
 axis and turns with its bevel. `intrinsic_curvature` of [Lezcano2020]_ is the shape of a needle at
 one depth, without insertion history.
 
+`springs` pull the needle to its axis, without memory of a path [Glozman2007]_.
+
 References
 ----------
+.. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
+   Transactions on Robotics 23, 2007.
 .. [Webster2006] R. J. Webster, J. S. Kim, N. J. Cowan, G. S. Chirikjian, A. M. Okamura,
    "Nonholonomic modeling of needle steering", International Journal of Robotics Research 25, 2006.
 .. [Lezcano2020] D. A. Lezcano, I. Iordachita, J. S. Kim, "Trajectory generation of FBG-sensorized
@@ -17,9 +21,17 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, tan
 
-from needle_dynamics import FloatArray, ParameterError, ShapeError
+from needle_dynamics import (
+    FloatArray,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+    SteeredNeedle,
+    SteeringParameters,
+)
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -86,3 +98,18 @@ def intrinsic_curvature(depth: float, curvature: float, at: ArrayLike = inf) -> 
     part = np.minimum(np.asarray(at, dtype=np.float64) / depth, 1.0)
     # Twice the integral of (1 - u)^2.
     return np.asarray(curvature * depth**2 * ((1.0 - part) ** 4 - 1.0 + 4.0 * part) / 12.0)
+
+
+def springs(
+    needle: NeedleParameters, steering: SteeringParameters, depth: float
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Return tip response and tip compliance at a tip depth [m], without memory of a path.
+
+    The response (2, 2) is deflection [m] and slope of the tip per guide position [m] and tilt, the
+    compliance (2, 2) per lateral force [N] and moment [N m] at the tip.
+    """
+    one = SteeredNeedle(needle, replace(steering, bevel_load=(0.0,), path_noise=0.0))
+    # A straight path coincides with the axis.
+    one.move(depth=depth)
+    return one.authority, one.compliance
