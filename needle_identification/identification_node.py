@@ -407,7 +407,6 @@ def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:
 def _status(
     name: str, message: str, values: Mapping[str, object], source: str = ''
 ) -> DiagnosticStatus:
-    """Return a status, without values that are None."""
     pairs = [KeyValue(key=k, value=str(v)) for k, v in values.items() if v is not None]
     return DiagnosticStatus(name=name, message=message, hardware_id=source, values=pairs)
 

@@ -291,6 +291,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return None
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
+        """Process `joint_states`."""
         found = dict(zip(reading.names, reading.values[0], strict=False))
         if missing := [name for name in self.settings.joints if name not in found]:
             got = f'got names {list(reading.names)}'
@@ -336,6 +337,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return move
 
     def tip(self, reading: Reading, now: int) -> JointMotion | None:
+        """Process `tip_deflection`."""
         tip = reading.values[0]
         if not self._is_valid(self._tip_stream, reading, tip, now):
             return None

@@ -185,7 +185,6 @@ def _pace(ratio: float) -> str:
 
 
 def _changed(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
-    """Return the constants of a needle, changed by ``name=value`` words."""
     given = common.constants(words)
     valid = [*NEEDLE_CONSTANTS, *(item.name for item in fields(SteeringParameters))]
     for key in given:
