@@ -119,11 +119,13 @@ def _spin(node: BaseNode, stopping: Callable[[], bool]) -> int:
 
 def end(executor: Executor, nodes: Collection[Node]) -> None:
     """Shut an executor down, and destroy its nodes; life cycle services end with the object."""
-    for node in nodes:
-        executor.remove_node(node)
     try:
-        # EventsExecutor never frees a queued task, nor its node: execute the queued tasks.
-        executor.spin_until_future_complete(Future(), timeout_sec=0.0)
+        # EventsExecutor never frees a queued task, nor its node: execute them, and their tasks. An
+        # event of a node that is already removed would be freed without the lock of Python.
+        for _ in range(2):
+            done = Future()
+            executor.create_task(done.set_result, None)
+            executor.spin_until_future_complete(done, timeout_sec=1.0)
     finally:
         executor.shutdown()
         for node in nodes:

@@ -4,6 +4,8 @@
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
 from threading import Timer
 import weakref
 
@@ -48,6 +50,40 @@ def test_queued_task_does_not_keep_the_nodes(tmp_path: Path) -> None:
         del node
     del graph.context
     assert [one() for one in kept] == [None, None]
+
+
+#: Subscriptions with events, which are queued while their graph ends.
+_ENDS = """
+from pathlib import Path
+import sys
+from needle_insertion.graph.ros_graph import Graph
+from needle_ros.base_node import SENSOR
+from rclpy.event_handler import SubscriptionEventCallbacks
+from std_msgs.msg import Bool
+for _ in range(5):
+    with Graph(Path(sys.argv[1])) as graph:
+        reader, writer, matches = graph.node('reader'), graph.node('writer'), []
+        events = SubscriptionEventCallbacks(matched=matches.append)
+        for k in range(5):
+            reader.create_subscription(Bool, f'topic{k}', print, SENSOR, event_callbacks=events)
+        writer.create_publisher(Bool, 'topic0', 1)
+        graph.spin_until(lambda: matches, 'a match')
+        for k in range(1, 5):
+            writer.create_publisher(Bool, f'topic{k}', 1)
+print('ended')
+"""
+
+
+def test_queued_events_do_not_crash_the_end(tmp_path: Path) -> None:
+    """An event that outlives its subscription would be freed without the lock of Python."""
+    done = subprocess.run(
+        [sys.executable, '-c', _ENDS, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=100.0,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ['ended']), done.stderr
 
 
 def test_signal_at_any_time_is_an_interrupt(tmp_path: Path) -> None:
