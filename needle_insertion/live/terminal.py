@@ -8,7 +8,7 @@ from math import inf
 import re
 import shlex
 from time import monotonic
-from typing import Final
+from typing import Any, Final
 
 from needle_controller import LAWS
 from needle_dynamics import DEFAULT_NEEDLE
@@ -101,6 +101,7 @@ class Terminal:
             if name in nodes:
                 accepted = partial(self._has_accepted, name, topic)
                 self._spin_until(accepted, f'{topic}, an input of {name}', _ANSWER)
+                self._spin_until(self._readings.insertion, 'a measurement', _ANSWER)
         self._begun = True
 
     def _has_accepted(self, node: str, topic: str) -> bool:
@@ -167,8 +168,8 @@ class Terminal:
             self._steers &= word != 'retract'
         return True
 
-    def _spin_until(self, condition: Callable[[], bool], what: str, timeout: float) -> None:
-        def holds() -> bool:
+    def _spin_until(self, condition: Callable[[], Any], what: str, timeout: float) -> None:
+        def holds() -> Any:
             self._print_warnings()
             return condition()
 

@@ -248,7 +248,7 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     status, said, complained = told(ros_graph, tmp_path / 'run', script, '--hardware', *words)
     assert (status, complained) == (0, ''), said
     before, *_, after = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
-    assert float(before) == pytest.approx(20.0, abs=0.01)
+    assert float(before) == pytest.approx(20.0, abs=0.01), said
     # A stage without friction: the lag of 20 ms has passed.
     assert float(after) == pytest.approx(22.0, abs=0.1)
     assert 'no measurements' not in said
