@@ -108,7 +108,6 @@ class Topic:
     meaning: str = ''  #: Content of the messages, for the documentation.
 
     def described(self, meaning: str) -> Topic:
-        """Return the topic with a description of its messages."""
         return replace(self, meaning=meaning)
 
     def with_joints(self, *joints: Joint, efforts: bool = True) -> Topic:

@@ -7,7 +7,7 @@ are not computed again. When all are complete they become one table, in the orde
 whose bytes depend neither on the chunks nor on the number of workers.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, contextmanager, suppress
 import fcntl
@@ -85,13 +85,17 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
     return monotonic() - begin, columns
 
 
-def _checksum(first: int, end: int, path: Path) -> str:
-    """Return the checksum of a range of samples and of a file, read in blocks."""
+def _checksum(first: int, end: int, blocks: Iterable[bytes]) -> str:
+    """Return the checksum of a range of samples and of the content of their file."""
     value = crc32(f'{first} {end}'.encode())
-    with path.open('rb') as file:
-        while block := file.read(_BLOCK):
-            value = crc32(block, value)
+    for block in blocks:
+        value = crc32(block, value)
     return f'{value:08x}'
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with path.open('rb') as file:
+        yield from iter(lambda: file.read(_BLOCK), b'')
 
 
 class _Part(NamedTuple):
@@ -147,7 +151,7 @@ class Results:
                 raise JobError(f'another process computes {self.folder}') from error
             end = 0
             for part in [] if self.table.exists() else self._done():
-                intact = _checksum(part.first, part.end, part.path) == part.checksum
+                intact = _checksum(part.first, part.end, _blocks(part.path)) == part.checksum
                 if part.first < end or not intact:
                     part.path.unlink()
                 else:
@@ -173,28 +177,36 @@ class Results:
     def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
         """Write a chunk that starts at the sample `first`; return its number of samples."""
         count = len(columns['sample'])
-        end, draft, table = first + count, self._parts / 'draft', pa.table(dict(columns))
-        with _errors_of(draft):
-            # Not compressed: a part is removed when all are complete.
-            with pa.ipc.new_file(str(draft), table.schema) as writer:
-                writer.write_table(table)
-            name = f'{first:010d}-{end:010d}-{_checksum(first, end, draft)}.arrow'
-            draft.replace(self._parts / name)
+        end, table, file = first + count, pa.table(dict(columns)), pa.BufferOutputStream()
+        # Not compressed: a part is removed when all are complete.
+        with pa.ipc.new_file(file, table.schema) as writer:
+            writer.write_table(table)
+        content = file.getvalue().to_pybytes()
+        name = f'{first:010d}-{end:010d}-{_checksum(first, end, [content])}.arrow'
+        try:
+            write_whole(self._parts / name, content)
+        except ParameterError as error:
+            raise JobError(str(error)) from error
         return count
 
     def complete(self) -> None:
         """Merge all parts into one table, and remove the parts."""
         if not self.table.exists():
             draft = self.table.with_suffix('.part')
-            with _errors_of(draft):
+            try:
                 self._merge(draft)
-            write_whole(self._sum, _checksum(0, self.study.samples, draft).encode())
-            draft.replace(self.table)
+                checksum = _checksum(0, self.study.samples, _blocks(draft))
+                write_whole(self._sum, checksum.encode())
+                draft.replace(self.table)
+            except OSError as error:
+                with suppress(OSError):
+                    draft.unlink()
+                raise JobError(f'{self.table} cannot be written: {error}') from error
         self._clear()
 
     def _is_intact(self) -> bool:
         with suppress(OSError, UnicodeDecodeError):
-            return self._sum.read_text() == _checksum(0, self.study.samples, self.table)
+            return self._sum.read_text() == _checksum(0, self.study.samples, _blocks(self.table))
         return False
 
     def _clear(self) -> None:
@@ -223,17 +235,6 @@ class Results:
         # The parts are removed afterwards. A lost part is computed again.
         with path.open('rb') as file:
             os.fsync(file.fileno())
-
-
-@contextmanager
-def _errors_of(draft: Path) -> Iterator[None]:
-    """Remove a file that cannot be written, and raise JobError."""
-    try:
-        yield
-    except OSError as error:
-        with suppress(OSError):
-            draft.unlink()
-        raise JobError(f'{draft} cannot be written: {error.strerror or error}') from error
 
 
 def compute(

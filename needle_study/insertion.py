@@ -122,7 +122,6 @@ class _Insertion(NamedTuple):
         return np.asarray(np.stack([self.depth, self.speed]) + noise.T)
 
     def until(self, end: int) -> '_Insertion':
-        """Truncate it at a sample."""
         return self._replace(
             states=self.states[: end + 1],
             commands=self.commands[:end],
@@ -214,7 +213,6 @@ class InsertionScenario(Scenario):
     def _made(
         self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty
     ) -> Law | None:
-        """Return the law of a controller, or None in open loop."""
         p = self._needle
         if controller == OPEN_LOOP:
             if gains:

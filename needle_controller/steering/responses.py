@@ -11,8 +11,8 @@ with positions :math:`b_j` of the guide in the steps, and unknown constants :mat
 and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
 between the depths. A and H depend on the bending length and on the stiffness of the skin, which
 form a grid. A position between two points of the grid is described by two more unknown constants,
-with the difference of A between the points. A hypothesis is one of g points together with a path
-noise and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
+with the difference of A between the points. A hypothesis is a point of the grid with a path noise
+and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
 explained by them. They widen the prediction, and path noise lets each measurement count more. The
 slow error is the last unknown constant. It changes from step to step.
 
@@ -163,7 +163,7 @@ class SteeringModel:
                 change[:beams] = whole.reshape(beams, n + 1, n)
         lags = np.outer([0.0] * beams + [windup for _, windup in arcs], at)
         later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
-        #: Responses at the g points of the grid; hypothesis i has those of point i modulo g.
+        #: Responses at the g points of the grid; hypothesis i has point i modulo g.
         self.responses = HypothesisResponses(*[*arrays, between, lags, *later])
         kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
         #: Whether a hypothesis is kinematic, of a needle that is turned; shape (h,).
@@ -241,7 +241,7 @@ def _kinematic(
 def _by_cause(
     found: FloatArray, origin: FloatArray, turn: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Split responses, shape (k, 3 n + 3), into those of guide, constant causes and bevel."""
+    """Split responses, shape (k, 3 n + 3): to guide, to constant causes and to the bevel."""
     n = found.shape[1] // 3 - 1
     bevel = found[:, n + 1 : 2 * n + 2]
     constants = origin, turn, found[:, n], bevel.sum(axis=1), found[:, 2 * n + 2 :]

@@ -141,7 +141,6 @@ class PlantConstants:
         return Plant(integrator, sensor, rate, self._base(self.model.length), tip)
 
     def joint_commands(self) -> JointCommands:
-        """Return the parser of `joint_commands` for the joints of this plant."""
         own = self.own
         return JointCommands(
             self.mode, steered=self.steered, shortest=1.0 / own.rate, longest=own.command_timeout

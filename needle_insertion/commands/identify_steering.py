@@ -144,7 +144,6 @@ def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
 def _read(
     path: Path, columns: Mapping[str, str], options: argparse.Namespace
 ) -> SteeringRecording | None:
-    """Read a recording, or print the error and return None."""
     try:
         return read_steering_recording(
             path,

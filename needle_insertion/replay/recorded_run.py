@@ -226,7 +226,6 @@ class RecordedRun:
             yield stamp, force, torque
 
     def stamp(self, number: int) -> int:
-        """Return the stamp [ns] of a sample number."""
         after = bisect_right(self._anchors, number, key=lambda anchor: anchor[1])
         begin, known = self._anchors[max(after - 1, 0)]
         return begin + round((number - known) * self._period)

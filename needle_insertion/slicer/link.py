@@ -96,7 +96,6 @@ class Connection:
 
     @property
     def state(self) -> str:
-        """State of the connection as text."""
         if self.peer:
             return f'connected with {self.peer}'
         verb = 'waits for a peer on' if self._settings.role == 'server' else 'tries to connect to'

@@ -192,7 +192,7 @@ def test_bending_length_is_identified() -> None:
 
 
 def test_noisier_measurement_reduces_uncertainty_less() -> None:
-    """With four times its noise; a future depth and a past one are rejected."""
+    """Four times the noise, the same measurement; other depths are rejected."""
     left, model = [], SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(drift=0.0))
     for noise in (0.0, 1.6e-4):
         controller = MultiHypothesisLaw(model, (0.0, 0.0), LIMITS)
