@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
 from needle_controller.laws.axis import Axis, require_complete
@@ -100,8 +100,7 @@ class ControllerSettings(CheckedSettings):
         return low, high
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measurement:
+class Measurement(NamedTuple):
     """Readings of the encoders."""
 
     time: float  #: time of the sample [s]
@@ -146,8 +145,7 @@ class Measurement:
 NO_SETPOINT: Final = Setpoint(nan)  #: Setpoint of a command without a reference.
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControllerOutput:
+class ControllerOutput(NamedTuple):
     """Command of a controller in response to a measurement."""
 
     force: float  #: f_y [N], positive into the tissue

@@ -37,7 +37,6 @@ from needle_ros.trajectories import FollowedJoint, JointPath, JointReference
 from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import ParameterDescriptor
-from rclpy.publisher import Publisher
 from trajectory_msgs.msg import JointTrajectory
 
 _RETRACT = 'retract_depth'
@@ -139,7 +138,7 @@ class ControllerNode(ModelNode):
         self._supervisor = supervisor = Supervisor()
         #: Adapter of a robot with its own topics.
         self._driver: Driver | None = None
-        self._command: Publisher | None = None
+        self._command: Callable[[Any], None] | None = None
         self._action: TrajectoryAction | None = None
         self._checks, self._missing = 0, ''
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
@@ -171,8 +170,13 @@ class ControllerNode(ModelNode):
             contract.BASE_WRENCH.name: (topics.wrench, measurers),
             contract.TIP_DEFLECTION.name: (contract.TIP_DEFLECTION, measurers),
         }
-        self._command = self.publisher(topics.command)
-        take_state = self._passing(self._supervisor.encoders)
+        #: Publishes commands; those of a robot are ROS messages.
+        self._command = (
+            self.publisher(topics.command).publish
+            if self._driver is not None
+            else self.writer(topics.command)
+        )
+        take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
             self._driver.listen(take_state, take_wrench, self._check_inputs)
@@ -182,8 +186,8 @@ class ControllerNode(ModelNode):
         self.listen(
             contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs
         )
-        self._reference = self.publisher(contract.REFERENCE)
-        self._tracking_error = self.publisher(contract.TRACKING_ERROR)
+        self._reference = self.writer(contract.REFERENCE)
+        self._tracking_error = self.writer(contract.TRACKING_ERROR)
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
         self._action = TrajectoryAction(
@@ -301,12 +305,16 @@ class ControllerNode(ModelNode):
     # Inputs.
 
     def _passing(
-        self, take: Callable[[Reading, int], ForceCommand | None]
+        self,
+        take: Callable[[Reading, int], ForceCommand | None],
+        then: Callable[[], None] | None = None,
     ) -> Callable[[Reading], None]:
         """Return a callback that processes a measurement and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
             self._act(take(reading, self.now()))
+            if then is not None:
+                then()
 
         return on_reading
 
@@ -368,10 +376,10 @@ class ControllerNode(ModelNode):
                 stopped = supervisor.safety.stop is not None
                 message = driver.message(answer, supervisor.bending.load, stopped=stopped)
             if message is not None:
-                self._command.publish(message)
+                self._command(message)
             if reference:
-                self._reference.publish(self._write_aim(stamp, *reference))
-                self._tracking_error.publish(self._write_aim(stamp, *error))
+                self._reference(self._write_aim(stamp, *reference))
+                self._tracking_error(self._write_aim(stamp, *error))
                 self._update_goals(answer)
         self._system.publish()
         self.publish_events(self._supervisor.events)

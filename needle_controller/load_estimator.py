@@ -26,7 +26,11 @@ def build_observer(
 
 
 class LoadEstimator:
-    """Load of the bent needle up to ``largest`` [N], of an observer or the simulation, or zero."""
+    """
+    Load of the bent needle up to ``largest`` [N], of an observer or the simulation, or zero.
+
+    Encoders and tip wait for `update`, so that no command waits for the observer.
+    """
 
     def __init__(
         self, parameters: NeedleParameters, observer: Observer | None = None, largest: float = 1e6
@@ -40,15 +44,17 @@ class LoadEstimator:
         self.load = 0.0
         self.warning: str | None = None  #: Why the observer is inconsistent.
         self._updates = 0
-        #: Stamp, lateral force and moment of the last wrench that waits for the encoders.
+        #: Stamp, lateral force and moment of the last wrench that waits for the encoders, and
+        #: encoders and tip that wait for the update, with their stamps [ns].
         self._waiting: tuple[int, float, float] | None = None
+        self._encoders: tuple[int, Measurement] | None = None
+        self._tip: tuple[int, float] | None = None
         if self.observer is not None:
             self.observer.reset()
 
     def take_tip(self, stamp: int, deflection: float) -> None:
         """Add a deflection of the tip [m] with its stamp [ns]."""
-        if self.observer is not None:
-            self.observer.add_tip(stamp, deflection)
+        self._tip = stamp, deflection
 
     def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
         """
@@ -74,11 +80,29 @@ class LoadEstimator:
             raise ParameterError(f'implausible load of {load:.3g} N')
         self.load = load
 
-    def update(self, stamp: int, measured: Measurement) -> None:
-        """Update the observer with an encoder sample and the wrench of the same stamp [ns]."""
-        observer, wrench = self.observer, self._waiting
+    def take_encoders(self, stamp: int, measured: Measurement) -> None:
+        """Add an encoder sample with its stamp [ns]."""
+        self._encoders = stamp, measured
+
+    @property
+    def waits(self) -> bool:
+        """Whether an encoder sample waits for the update."""
+        return self._encoders is not None
+
+    def update(self) -> None:
+        """Update the load with the measurements since the last update."""
+        observer, encoders, tip = self.observer, self._encoders, self._tip
+        self._encoders = self._tip = None
         if observer is None:
             return
+        if tip is not None:
+            observer.add_tip(*tip)
+        if encoders is not None:
+            self._update(observer, *encoders)
+
+    def _update(self, observer: Observer, stamp: int, measured: Measurement) -> None:
+        """Process an encoder sample, and the wrench of the same stamp [ns]."""
+        wrench = self._waiting
         own = wrench[1:] if wrench is not None and wrench[0] == stamp else None
         if wrench is not None and wrench[0] <= stamp:
             self._waiting = None
@@ -87,12 +111,12 @@ class LoadEstimator:
         self._updates += 1
         if self._updates % _CHECK_INTERVAL == 0:
             self._check_consistency(observer)
-        if not abs(observer.load) <= self._largest:
-            load = observer.load
+        load = observer.load
+        if not abs(load) <= self._largest:
             self.forget()
             raise ParameterError(f'implausible load estimate of {load:.3g} N; observer restarted')
         if self.warning is None:
-            self.load = observer.load
+            self.load = load
 
     def _check_consistency(self, observer: Observer) -> None:
         """Check the consistency of the observer (NIS)."""

@@ -143,8 +143,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _check_clock(self, now: int) -> ForceCommand | None:
         """Command zero force and discard measurements and requests if the clock was set back."""
-        back = self.clock_went_back(now, self.safety.streams['joint_states'].timeout)
-        if not back:
+        if not (back := self.clock_went_back(now, self.safety.streams['joint_states'].timeout)):
             return None
         self._begin(now)
         return self._release_for(f'clock went back by {back:.3f} s', now)
@@ -209,8 +208,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _execute_request(self, stamp: int, elapsed: float = 0.0) -> None:
         """Execute a request that was sent before a stamp [ns], if any, and acknowledge it."""
-        request = self._waiting.take(stamp)
-        if request is None:
+        if (request := self._waiting.take(stamp)) is None:
             return
         if self.authority.mode is Mode.RETRACTING and not self._targets:
             # The motion is from the node `steering`, not from a user.
@@ -265,8 +263,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _clear(self, now: int) -> bool:
         """Release the stop, or stop the system again because of a measurement."""
-        reason = self.safety.clear(now)
-        if reason is not None:
+        if (reason := self.safety.clear(now)) is not None:
             self.authority.stop(reason)
             self._obeyed = Mode.STOPPED
             return False
@@ -291,6 +288,7 @@ class Supervisor(StateMachine[ForceCommand]):
             answer = self._stop_for(self.safety.guard.tip(deflection, depth, x), now) or answer
             # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
+                self.estimate()
                 self.bending.take_tip(reading.stamp, deflection)
         return answer
 
@@ -306,6 +304,7 @@ class Supervisor(StateMachine[ForceCommand]):
             moment -= self._last.torque
             newest = self.safety.streams['joint_states'].last
             if not guard.is_beyond('base_wrench'):
+                self.estimate()
                 self.bending.take_wrench(reading.stamp, lateral, moment, newest)
         return answer
 
@@ -323,7 +322,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return answer
 
     def _report(self, stream: InputMonitor, refusal: Refusal) -> None:
-        """Log that a measurement is refused, once a second."""
         self._warn(f'{stream.name} {refusal.kind}', f'{refusal.line}; ignored')
 
     def _warn(self, kind: str, line: str | None) -> None:
@@ -332,10 +330,11 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
         """Answer `joint_states`; a repeated message gets the same command, a late one none."""
-        controller = self._active
-        if controller is None:
+        if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
+        if self.bending.waits:
+            self.estimate()
         refusal = self.safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
@@ -357,12 +356,16 @@ class Supervisor(StateMachine[ForceCommand]):
                     return self._command(ForceCommand(stamp))
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
-            try:
-                self.bending.update(stamp, measured)
-            except NeedleError as error:
-                self._warn('observer', f'observer: {error}')
-            self._warn('doubt', self.bending.warning)
+            self.bending.take_encoders(stamp, measured)
         return self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
+
+    def estimate(self) -> None:
+        """Estimate the load for the next command; the last command does not wait for it."""
+        try:
+            self.bending.update()
+        except NeedleError as error:
+            self._warn('observer', f'observer: {error}')
+        self._warn('doubt', self.bending.warning)
 
     def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
@@ -395,8 +398,8 @@ class Supervisor(StateMachine[ForceCommand]):
         following, depth, load = self._following, measured.depth, self.bending.load
         forces, steps = (self._last.force, measured.force), controller.guide.steps
         lost = following.update(stamp, depth, aim.velocity, *forces, load, steps)
-        stopped = self._stop_for(safety.guard.tracking(error[0]) or following.fault, stamp)
-        if stopped is not None:
+        fault = safety.guard.tracking(error[0]) or following.fault
+        if (stopped := self._stop_for(fault, stamp)) is not None:
             return stopped
         controller.guide.waits, controller.relaxed = lost, following.relaxed
         if lost:

@@ -28,7 +28,7 @@ class SamplePublishers:
             contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION,
             contract.GROUND_TRUTH, contract.END_EFFECTOR_POSE,
         )  # fmt: skip
-        publishers = {topic.name: node.publisher(topic) for topic in streams}
+        writers = {topic.name: node.writer(topic) for topic in streams}
         self._events = node.publisher(contract.EVENTS)
         self._clock: Publisher | None = None
         self._node = node
@@ -42,7 +42,7 @@ class SamplePublishers:
         rate = constants.own.rate
         #: Publish functions for the values of a sample, by topic.
         self._publish: dict[str, Callable[[int, list[float]], None]] = {
-            name: partial(_write, publishers[name], topic.template().serialize)
+            name: partial(_write, writers[name], topic.template().serialize)
             for name, topic in plant_run.topics.items()
         }
         limits = constants.sensor.per_axis('range').tolist()
@@ -123,6 +123,9 @@ class SamplePublishers:
 
 
 def _write(
-    publisher: Publisher, serialize: Callable[..., bytes], stamp: int, values: list[float]
+    write: Callable[[bytes], None],
+    serialize: Callable[..., bytes],
+    stamp: int,
+    values: list[float],
 ) -> None:
-    publisher.publish(serialize(stamp, *values))
+    write(serialize(stamp, *values))

@@ -93,6 +93,7 @@ class BaseNode(ParameterNode):
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
+        self._get_now = self.get_clock().handle.get_now
         self.failure: str | None = None  #: Reason of the last refused transition.
         self.failed = (
             False  #: Whether the node failed at its task: its process ends with status 1.
@@ -153,13 +154,20 @@ class BaseNode(ParameterNode):
     def now(self) -> int:
         """Return the time of the node clock [ns]."""
         # Clock.now creates objects and takes three times as long.
-        return int(self.get_clock().handle.get_now().nanoseconds)
+        return int(self._get_now().nanoseconds)
 
     def publisher(self, topic: Topic, *, always: bool = False) -> Publisher:
         """Create a publisher of a contract topic, limited to the active state unless `always`."""
         create = self.create_publisher if always else self.create_lifecycle_publisher
         offered: Publisher = create(message_class(topic.type_name), topic.name, profile(topic.qos))
         return offered
+
+    def writer(self, topic: Topic) -> Callable[[bytes], None]:
+        """Create a publisher of serialized messages, limited to the active state."""
+        offered: Any = self.publisher(topic)
+        # Publisher.publish checks the type and the life of each message in Python.
+        publish = offered.handle.publish_raw
+        return lambda data: publish(data) if offered.is_activated else None
 
     def subscribe(self, topic: Topic, take: Callable[[Any], None]) -> Subscription:
         kind = message_class(topic.type_name)

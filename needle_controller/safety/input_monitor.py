@@ -4,6 +4,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from math import isfinite
+from operator import gt, sub
 from typing import Final, NamedTuple
 
 from needle_ros.status import InputStatus
@@ -63,7 +64,7 @@ class InputMonitor:
         self._ahead = self.timeout if ahead is None else round(ahead * NANOSECONDS) + _ROUNDING
         self.publishers = 1
         self._frames = frames
-        self._jumps, self._noise = jumps, noise
+        self._jumps, self._lowest = jumps, [0.1 * one for one in noise]
         self.counts: Counter[str] = Counter()
         self.window = RateCounter()
         self.forget()
@@ -120,12 +121,12 @@ class InputMonitor:
 
     def _judge_change(self, stamp: int, values: Sequence[float]) -> Refusal | None:
         before, self._values = self._values, values
-        if before is None or (not self._jumps and not self._noise):
+        if before is None or (not self._jumps and not self._lowest):
             self._changed = stamp
             return None
-        steps = [abs(value - old) for value, old in zip(values, before, strict=True)]
+        steps = [*map(abs, map(sub, values, before))]
         if any(steps):
-            noisy = any(step > 0.1 * one for step, one in zip(steps, self._noise, strict=False))
+            noisy = any(map(gt, steps, self._lowest))
             self._lively = min(max(self._lively + (1 if noisy else -1), 0), _LIVELY)
             self._changed, self.frozen = stamp, False
         elif self._lively == _LIVELY and stamp - self._changed > self.timeout:

@@ -292,7 +292,7 @@ class Blurred:
     def command(self, measured: Measurement, load: float = 0.0) -> ControllerOutput:
         depth, speed, _ = next(self._noise)
         return self._controller.command(
-            replace(measured, depth=measured.depth + depth, velocity=measured.velocity + speed),
+            measured._replace(depth=measured.depth + depth, velocity=measured.velocity + speed),
             load,
         )
 

@@ -1152,7 +1152,8 @@ def test_inconsistent_observer_is_not_used() -> None:
         for stamp in islice(stamps, count):
             moment = size * float(rng.choice([-1.0, 1.0]))
             bending.take_wrench(stamp, 0.5, 0.1 + moment, stamp - 1)
-            bending.update(stamp, Measurement(time=1e-9 * stamp, depth=0.1, velocity=0.0))
+            bending.take_encoders(stamp, Measurement(time=1e-9 * stamp, depth=0.1, velocity=0.0))
+            bending.update()
 
     watch(600, 0.0)
     assert bending.warning is None

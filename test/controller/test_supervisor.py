@@ -17,6 +17,7 @@ from needle_ros.event_log import EventLog, Severity
 from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.trajectories import JointPath, MOST_POINTS
 from needle_ros.wire import Reading
+import numpy as np
 import pytest
 
 PERIOD = 1_000_000
@@ -415,6 +416,7 @@ def test_stop_resets_the_observer() -> None:
     observer = loop.supervisor.bending.observer
     for word in (STOP, CLEAR_STOP):
         loop.measure()
+        loop.supervisor.estimate()
         assert observer.ready
         loop.request(word)
         assert not observer.ready
@@ -431,7 +433,29 @@ def test_wrench_waits_for_encoders_of_its_stamp() -> None:
     loop.wrench(moment=0.25)
     loop.encoders(loop.now, loop.depth, 0.0)
     loop.measure()
+    loop.supervisor.estimate()
     assert taken == [None, (0.0, 0.25), None]
+
+
+def test_no_command_waits_for_the_observer() -> None:
+    """Each update follows its command; a later update gives the same estimate."""
+    estimates = []
+    for later in (False, True):
+        loop, rng = Loop(observed=ObserverSettings()), np.random.default_rng(1)
+        observer = loop.supervisor.bending.observer
+        assert observer is not None
+        for _ in range(200):
+            before = observer.ready and observer.tip_deflection
+            loop.now += PERIOD
+            loop.tip(1e-3 + 1e-5 * float(rng.standard_normal()))
+            loop.measure(1e-5, 0.01)
+            assert later or (observer.ready and observer.tip_deflection) == before
+            if not later:
+                loop.supervisor.estimate()
+                assert observer.tip_deflection != before
+        loop.supervisor.estimate()
+        estimates.append(observer.tip_deflection)
+    assert estimates[0] == estimates[1]
 
 
 def test_invalid_observer_settings_are_named() -> None:
