@@ -127,14 +127,9 @@ class Measurement(NamedTuple):
                 "joint_states needs position and velocity of 'insertion', got names "
                 f'{list(names)}, {len(positions)} positions, {len(velocities)} velocities'
             ) from None
-        return cls(
-            time=reading.stamp / NANOSECONDS,
-            depth=depth,
-            velocity=velocity,
-            angle=angle,
-            angular_velocity=angular_velocity,
-            force=efforts[i] if i < len(efforts) else nan,
-        )
+        force = efforts[i] if i < len(efforts) else nan
+        time = reading.stamp / NANOSECONDS
+        return cls(time, depth, velocity, angle, angular_velocity, force)
 
     def is_finite(self) -> bool:
         """Return whether every number is finite; the force may be missing."""

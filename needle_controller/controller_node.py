@@ -158,7 +158,6 @@ class ControllerNode(ModelNode):
             await_topics(self, self.settings('hardware.', HardwareSettings))
 
     def _connect(self) -> None:
-        """Offer the commands and subscribe to measurements."""
         self._topics = topics = self._driver.topics if self._driver is not None else CONTRACT
         offer_lease(self, topics.commander)
         commanders = Publishers(self, topics.commander, self._check_inputs)
@@ -171,11 +170,8 @@ class ControllerNode(ModelNode):
             contract.TIP_DEFLECTION.name: (contract.TIP_DEFLECTION, measurers),
         }
         #: Publishes commands; those of a robot are ROS messages.
-        self._command = (
-            self.publisher(topics.command).publish
-            if self._driver is not None
-            else self.writer(topics.command)
-        )
+        command, robot = topics.command, self._driver is not None
+        self._command = self.publisher(command).publish if robot else self.writer(command)
         take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
@@ -307,14 +303,13 @@ class ControllerNode(ModelNode):
     def _passing(
         self,
         take: Callable[[Reading, int], ForceCommand | None],
-        then: Callable[[], None] | None = None,
+        then: Callable[[], None] = lambda: None,
     ) -> Callable[[Reading], None]:
         """Return a callback that processes a measurement and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
             self._act(take(reading, self.now()))
-            if then is not None:
-                then()
+            then()
 
         return on_reading
 

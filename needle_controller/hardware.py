@@ -248,10 +248,7 @@ class Robot:
                     angle, angular_velocity = positions[j], velocities[j]
         if isfinite(depth):
             self._depth = depth
-        return Measurement(
-            time=time, depth=depth, velocity=velocity, angle=angle,
-            angular_velocity=angular_velocity, force=force,
-        )  # fmt: skip
+        return Measurement(time, depth, velocity, angle, angular_velocity, force)
 
     def _find(self, joint: str, reading: Reading) -> int:
         """Return the index of a joint that has a position."""

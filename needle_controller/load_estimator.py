@@ -119,7 +119,6 @@ class LoadEstimator:
             self.load = load
 
     def _check_consistency(self, observer: Observer) -> None:
-        """Check the consistency of the observer (NIS)."""
         # The initial state is a guess, and affects the NIS while the history contains it.
         known = self._updates * observer.period > 1.2 * observer.settings.history
         nis = observer.nis

@@ -81,7 +81,6 @@ class StateMachine(ABC, Generic[_Command]):
         self.requests.answer(topic, stamp, verdict, joints=(INSERTION,))
 
     def _reject(self, topic: Topic, stamp: int, reason: str | NeedleError) -> None:
-        """Log and answer that a request is rejected."""
         self.events.reject(f'{topic.name} rejected: {reason}')
         self.requests.reject(topic, stamp, reason)
 

@@ -281,7 +281,6 @@ class SteeringNode(CompiledNode):
             self._record.publish(String(data=json.dumps(record.to_values())))
 
     def _keep(self, record: SteeringRecord) -> None:
-        """Publish a record, and write it for a restart."""
         text = json.dumps(record.to_values())
         self._record.publish(String(data=text))
         try:

@@ -148,7 +148,6 @@ class PlantTrajectories:
         self._executions.append(_Execution(path, frozenset(moved), begun))
 
     def _hold(self, joints: Collection[str]) -> None:
-        """Hold joints now, also while no sample is taken."""
         self._forget(joints)
         self._run.hold([name for name in self._moved if name in joints])
 

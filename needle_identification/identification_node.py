@@ -244,7 +244,6 @@ class IdentificationNode(BaseNode):
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
-        """Identify each distinct recording; log its losses and warnings."""
         estimates = []
         digests: dict[bytes, str] = {}
         for bag in self._bags:

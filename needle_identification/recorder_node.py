@@ -121,7 +121,6 @@ class RecorderNode(BaseNode):
     # Services.
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Start a recording; no effect during a recording."""
         try:
             if not self.is_active:
                 raise RecordingError('not active')

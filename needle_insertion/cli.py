@@ -152,8 +152,6 @@ def _parser(chosen: str, command: ModuleType | None) -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Argument parser that suggests the nearest valid word."""
-
     def error(self, message: str) -> NoReturn:
         # Imported here: the help does not need it.
         from difflib import get_close_matches

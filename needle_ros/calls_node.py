@@ -16,8 +16,6 @@ _CHECK: Final = 0.25  #: Period of the checks [s].
 
 @dataclass(slots=True)
 class _Call:
-    """A pending call."""
-
     client: Client
     request: Any
     later: Future

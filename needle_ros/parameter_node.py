@@ -35,7 +35,6 @@ _Settings = TypeVar('_Settings')
 
 
 def _same(new: Any, old: Any) -> bool:
-    """Return whether a parameter keeps its value."""
     if isinstance(new, (list, tuple, array)):
         new = list(new)
     return bool(new == old)

@@ -35,8 +35,6 @@ class _WorkerError(Exception):
 
 
 class _Worker:
-    """A worker process and its pipe."""
-
     def __init__(self) -> None:
         context = get_context('spawn')
         self._pipe, end = context.Pipe()
@@ -136,7 +134,6 @@ def processes(workers: int) -> Iterator[Executor]:
 
 
 def _work(pipe: Connection) -> None:
-    """Execute jobs until the parent closes the pipe."""
     # Only the parent handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # A busy worker does not read its pipe, and would outlive a killed parent.

@@ -97,8 +97,6 @@ Listener: TypeAlias = Callable[[Acknowledgement, Collection[str]], None]
 
 
 class _Watched(NamedTuple):
-    """A request whose end is reported."""
-
     joints: frozenset[str]
     report: Listener
 

@@ -149,7 +149,6 @@ def _read_files(node: BaseNode) -> None:
 
 
 def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
-    """Reject unknown arguments, and print ``--help``, both by SystemExit."""
     program, *others = remove_ros_args(list(words))
     parser = argparse.ArgumentParser(Path(program).name, usage=_USAGE, add_help=False)
     parser.add_argument('-h', '--help', action='store_true')

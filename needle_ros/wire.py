@@ -164,7 +164,6 @@ class Template:
         return template
 
     def _walk(self, type_name: str, cursor: _Cursor) -> None:
-        """Locate the fields of a message."""
         fields = _FIELDS[type_name]
         cursor.take(4, 2)
         self.frame = cursor.string()

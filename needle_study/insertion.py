@@ -283,7 +283,6 @@ class InsertionScenario(Scenario):
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
     def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Insertion:
-        """Simulate an insertion under a control law."""
         numbers, model = self._numbers, NeedleModel(self._truth(row))
         # The reference starts at the measured depth.
         begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())

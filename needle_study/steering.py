@@ -153,7 +153,6 @@ class SteeringScenario(Scenario):
 
     @cached_property
     def _model(self) -> SteeringModel:
-        """Model of all hypotheses, the same for all samples."""
         return SteeringModel(self._needle, self._steering, self._depths, self._prior)
 
     def insert(

@@ -150,7 +150,6 @@ class StudyTable(Displayed):
 
 @lru_cache(maxsize=64)
 def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
-    """Return the strata of a dimension by sample number."""
     # The generators of samples have two numbers in their key, this generator has three.
     key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
     return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))

@@ -69,7 +69,6 @@ class Law:
     packed: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
-        """Compute the constants from axis, period and gains."""
         unused = ('model_kp', 'model_kv', 'filter_time', 'tracking', 'feed_forward', 'bound')
         friction = self.axis.constants._asdict()
         back = self.axis.response(self.period, self.axis.withdrawal)._asdict()

@@ -56,8 +56,6 @@ class _Encoders(NamedTuple):
 
 
 class _Estimate(NamedTuple):
-    """Estimate at the present depth."""
-
     modal: FloatArray  #: q [m^3/2] and q_dot [m^3/2 / s], shape (2 n,)
     jacobian: FloatArray  #: derivative by the normal coordinates of the filter, shape (2 n, 2 n)
     deflection: float  #: tip deflection [m]

@@ -52,7 +52,6 @@ class ReferenceGenerator:
         self._change: Callable[[Setpoint], Reference] | None = self._plan
 
     def _mark(self) -> None:
-        """Store the elapsed time of the path."""
         if isinstance(self._motion, Joined) and self._motion.path is self._path:
             self._passed = max(self.now - self._start - self._motion.offset, self._passed)
 

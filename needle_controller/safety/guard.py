@@ -15,22 +15,19 @@ _IN_A_ROW: Final = 2  #: Readings in a row that violate a limit: one may be a se
 #: By topic: quantity, unit and name of the limit of each reading.
 _READINGS: Final = {
     'joint_states': (
-        ('insertion speed', 'm/s', 'speed'),
-        ('angle', 'rad', 'angle'),
+        ('insertion speed', 'm/s', 'speed'), ('angle', 'rad', 'angle'),
         ('angular speed', 'rad/s', 'angular_speed'),
     ),
     'reference': (('tracking error', 'm', 'tracking_error'),),
     'base_wrench': (
-        ('axial force', 'N', 'axial_load'),
-        ('lateral force', 'N', 'lateral_load'),
-        ('moment', 'N m', 'moment_load'),
-        ('torque about the needle', 'N m', 'torsion_load'),
+        ('axial force', 'N', 'axial_load'), ('lateral force', 'N', 'lateral_load'),
+        ('moment', 'N m', 'moment_load'), ('torque about the needle', 'N m', 'torsion_load'),
     ),
     'tip_deflection': (
         ('tip deflection', 'm', 'tip_deflection'),
         ('distance of the tip from the depth range', 'm', 'tip_deflection'),
     ),
-}
+}  # fmt: skip
 
 
 def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:
@@ -72,7 +69,6 @@ class Guard:
         self._beyond: dict[str, tuple[str, int]] = {}
 
     def _hold(self, topic: str, *values: float) -> str | None:
-        """Compare the readings of a topic with their limits."""
         limits = self._limits[topic]
         # Written so that NaN is beyond every limit.
         if all(map(le, map(abs, values), limits)):

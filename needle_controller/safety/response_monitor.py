@@ -65,7 +65,6 @@ class StallMonitor:
         self._learn()
 
     def _learn(self) -> None:
-        """Observe the friction from the next measurement on."""
         self._friction = 1.0  #: Friction in the last motion, as a multiple of the nominal one.
         self._mark: _Mark | None = None
         self._impulse = 0.0  #: Impulse since the mark [N s].

@@ -198,7 +198,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.events.add(Severity.INFO, f'planning cancelled: {why}')
 
     def _begin_if_planned(self, now: int) -> JointMotion | None:
-        """Begin the insertion once its plan is computed."""
         taken = None if self._obeyed is Mode.PAUSED else self.planner.take()
         if taken is None:
             return None
@@ -259,7 +258,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return halt
 
     def _stop(self, why: str, now: int) -> JointMotion | None:
-        """Stop the whole system: axial force, needle and guide."""
         self.authority.stop(why)
         return self.obey(now)
 

@@ -125,7 +125,6 @@ class GuardedLaw:
         )
 
     def _check_sensor(self, tip: FloatArray | None) -> None:
-        """Count missing and identical measurements."""
         if tip is None:
             self._missing += 1
             if self._missing > MOST_MISSING:

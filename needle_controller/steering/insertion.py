@@ -109,7 +109,6 @@ class SteppedInsertion:
         return self._begin_step(to, now)
 
     def _begin_step(self, to: GuideSetpoint, now: int) -> JointMotion | None:
-        """Begin the step after a measurement at rest."""
         goal = self._motions.goal
         goal = np.array([goal[0], to.x, to.z, to.roll])[: len(goal)]
         return self._send(Phase.GUIDING, goal, now)

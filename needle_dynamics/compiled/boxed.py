@@ -19,8 +19,6 @@ _Value = TypeVar('_Value')
 
 @structref.register
 class _BoxedType(types.StructRef):  # type: ignore[misc, name-defined]
-    """Numba's type of `Boxed`."""
-
     def preprocess_fields(self, fields: Any) -> Any:
         """Return the fields with non-literal types."""
         return tuple((name, types.unliteral(kind)) for name, kind in fields)  # type: ignore[attr-defined]

@@ -171,14 +171,12 @@ def _modes(w: FloatArray, n: int, table: FloatArray) -> None:
 
 @inlined
 def _powers(w: FloatArray, column: int, i: int, xi: float) -> float:
-    """Evaluate a polynomial of three columns in xi."""
     at = _SERIES + column * LANES + i
     return float(w[at] + xi * w[at + LANES] + xi * xi * w[at + 2 * LANES])
 
 
 @inlined
 def _line(w: FloatArray, column: int, i: int, xi: float) -> float:
-    """Evaluate a polynomial of two columns in xi."""
     at = _SERIES + column * LANES + i
     return float(w[at] + xi * w[at + LANES])
 
@@ -282,7 +280,6 @@ def _gram(table: FloatArray, xi: float) -> tuple[float, float, float]:
 def _load(
     w: FloatArray, i: int, constants: FloatArray, state: FloatArray, table: FloatArray
 ) -> None:
-    """Load a needle into a lane."""
     for k in range(len(constants)):
         w[k * LANES + i] = constants[k]
     length, rho = constants[0], constants[1]

@@ -96,7 +96,6 @@ def _stamp(folder: Path) -> str:
 
 @cache
 def _is_portable() -> bool:
-    """Return whether this processor executes code for `PORTABLE`."""
     from numba.core.codegen import get_host_cpu_features
 
     return {*get_host_cpu_features().split(',')} >= _FEATURES

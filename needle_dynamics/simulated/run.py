@@ -181,7 +181,6 @@ class PlantRun:
         self._events.append(event)
 
     def _change(self, changes: Mapping[str, Any]) -> bool:
-        """Change the friction constants; return whether they differ."""
         values = {**self._values, **changes}
         before, self.constants = self.constants, PlantConstants.of(values)
         self._values = values

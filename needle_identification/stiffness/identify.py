@@ -172,7 +172,6 @@ def _doubts(level: LevelEstimate, fit: matrix.MatrixFit) -> Iterator[tuple[str, 
 
 
 def _falling(presses: Presses, levels: Sequence[LevelEstimate]) -> list[str]:
-    """Warn of displacements that decrease with increasing force."""
     along = (presses.force * presses.displacement).sum(axis=1) / np.hypot(*presses.force.T)
     error = np.hypot(*presses.displacement_error.T)
     falls: dict[tuple[int, int], int] = {}

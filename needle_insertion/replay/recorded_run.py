@@ -181,7 +181,6 @@ class RecordedRun:
         self.notes = [*losses, *self._missing(has_events=bool(recorded))]
 
     def _measured(self, messages: Mapping[str, _Messages]) -> dict[str, Rows]:
-        """Sort the measurements by sample number."""
         sampled = [name for name in self.topics if not name.endswith(TIP_DEFLECTION.name)]
         stamps = [reading.stamp for name in sampled for _, reading in messages.get(name, [])]
         if not stamps:

@@ -128,7 +128,6 @@ class Rerun:
         }
 
     def _commands(self) -> dict[int, AppliedForces]:
-        """Return the active commands by sample number, if recorded."""
         for name, rows in self.recorded.rows.items():
             topic = self.recorded.topics[name]
             efforts = [k for k, q in enumerate(topic.quantities) if q.name.startswith('effort')]

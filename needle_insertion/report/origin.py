@@ -134,7 +134,6 @@ def identify_all(
 
 
 def _digests(bag: Path) -> tuple[tuple[str, str], ...]:
-    """Return the files of a recording with their SHA-256."""
     files = sorted(path for path in bag.iterdir() if path.is_file()) if bag.is_dir() else [bag]
     found = []
     for path in files:

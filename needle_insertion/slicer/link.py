@@ -183,7 +183,6 @@ class Connection:
                 self._establish(accepted, f'{host}:{port}')
 
     def _connect(self) -> None:
-        """Start a connection, or check its progress."""
         coming = self._socket
         if coming is None:
             if not self._is_time():

@@ -222,7 +222,6 @@ class View:
         guide: Sequence[float | None],
         now: float,
     ) -> dict[str, Any]:
-        """Return needle, path, and source of the shape."""
         received, needle = self._lines.get('needle', (0.0, None))
         path = self._lines.get('path', (0.0, None))[1]
         if needle is not None and now - received < self._silence:
