@@ -190,7 +190,7 @@ def _converse(terminal: Terminal, screen: Screen, witness: Witness | None) -> No
             witness.release()
             witness = None
         try:
-            if not terminal.do(line):
+            if terminal.onecmd(line):
                 return
             if witness is not None and word == 'target':
                 witness.release()

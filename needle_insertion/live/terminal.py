@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execute the commands of `needle run`, typed by a person or read from a script."""
 
+from cmd import Cmd
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from functools import partial
@@ -17,7 +18,7 @@ from needle_insertion.graph.node_process import GraphError
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.live.readings import Readings
-from needle_insertion.live.requests import CONTROLLER, STEERING
+from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
 from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
@@ -74,12 +75,13 @@ WORDS: Final = {
 }
 
 
-class Terminal:
+class Terminal(Cmd):
     """Execute commands, one line after another; the commands spin the graph."""
 
     def __init__(
         self, graph: Graph, operator: Operator, readings: Readings, screen: Screen
     ) -> None:
+        super().__init__()
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
@@ -135,38 +137,31 @@ class Terminal:
         self._spin_until(lambda: self._screen.answered, 'a line', inf)
         return self._screen.take()
 
-    def do(self, line: str) -> bool:
-        """Execute a command, where ``#`` begins a comment; return whether another may follow."""
+    def parseline(self, line: str) -> tuple[str | None, Any, str]:
+        """Return the first word of a line, where ``#`` begins a comment, and the others."""
         try:
-            words = shlex.split(line, comments=True)
+            word, *rest = shlex.split(line, comments=True) or ('',)
         except ValueError as error:
             raise ParameterError(f'{line!r}: {str(error).lower()}') from error
-        if not words:
-            return True
-        word, *rest = words
-        if word not in WORDS:
-            # Imported here: rarely needed.
-            from difflib import get_close_matches
-
-            near = get_close_matches(word, WORDS, 1)
-            meant = f'; did you mean {near[0]}?' if near else ''
-            raise ParameterError(f'unknown word {word!r}{meant} Valid are {", ".join(WORDS)}')
-        takes, _ = WORDS[word]
-        if takes:
-            getattr(self, f'_{word}')(*rest)
-        elif rest:
+        if rest and word in WORDS and not WORDS[word][0]:
             raise _unfit(word, rest)
-        elif word == 'quit':
-            return False
-        elif word == 'help':
-            rows = [(f'{name} {given}', meaning) for name, (given, meaning) in WORDS.items()]
-            self._say(table(rows, ('word', 'effect')))
-        elif word == 'status':
-            self._status()
-        else:
+        return word, rest, word
+
+    def emptyline(self) -> bool:
+        return False
+
+    def default(self, word: str) -> None:
+        """Execute a request to all nodes; reject other words."""
+        if word in REQUESTS:
             self._answered(self._operator.ask(word), word)
             self._steers &= word != 'retract'
-        return True
+            return
+        # Imported here: rarely needed.
+        from difflib import get_close_matches
+
+        near = get_close_matches(word, WORDS, 1)
+        meant = f'; did you mean {near[0]}?' if near else ''
+        raise ParameterError(f'unknown word {word!r}{meant} Valid are {", ".join(WORDS)}')
 
     def _spin_until(self, condition: Callable[[], Any], what: str, timeout: float) -> None:
         def holds() -> Any:
@@ -199,9 +194,7 @@ class Terminal:
                 self._printed[name, kind] = now
             self._last[name] = kind
 
-    # Words.
-
-    def _target(self, *words: str) -> None:
+    def do_target(self, words: list[str]) -> None:
         aims = self._operator.aims
         if not words:
             raise _unfit('target', words)
@@ -224,7 +217,7 @@ class Terminal:
         self._steers = aims == STEERING
         self._say(f'{aims}: on its way')
 
-    def _wait(self, *words: str) -> None:
+    def do_wait(self, words: list[str]) -> None:
         longest = quantity(' '.join(words) or 'inf', 's')
         if not longest >= 0.0:
             raise _unfit('wait', words)
@@ -255,12 +248,12 @@ class Terminal:
         if self._steers:
             self._say(f'{STEERING}: {self._state(STEERING).message}')
 
-    def _law(self, *words: str) -> None:
+    def do_law(self, words: list[str]) -> None:
         if len(words) != 1 or words[0] not in LAWS:
             raise ParameterError(f'law takes one of {", ".join(LAWS)}, got {" ".join(words)!r}')
         self._answered(self._operator.set(CONTROLLER, 'law', words[0]), f'law {words[0]}')
 
-    def _set(self, *words: str) -> None:
+    def do_set(self, words: list[str]) -> None:
         if len(words) != 3:
             raise _unfit('set', words)
         node, name, text = words
@@ -272,7 +265,14 @@ class Terminal:
             raise ParameterError(f'{text!r} is not a value of a parameter')
         self._answered(self._operator.set(node, name, value), f'{node} {name} = {text}')
 
-    def _status(self) -> None:
+    def do_help(self, _words: list[str]) -> None:  # type: ignore[override]
+        rows = [(f'{name} {given}', meaning) for name, (given, meaning) in WORDS.items()]
+        self._say(table(rows, ('word', 'effect')))
+
+    def do_quit(self, _words: list[str]) -> bool:
+        return True
+
+    def do_status(self, _words: list[str]) -> None:
         states = self._operator.states
         rows = [
             (name, _LEVELS[min(state.level, 3)], state.message)
