@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 import gc
 from itertools import filterfalse
+from math import inf
 import os
 from pathlib import Path
 import subprocess
@@ -36,6 +37,7 @@ DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
 
 _START: Final = 180.0  #: Timeout of the start of a node, with compilation on a busy machine [s].
+_CLIENT: Final = 30.0  #: Time without an answer after which a new client requests the state [s].
 _REQUEST: Final = 0.2  #: Period of the requests for the state of a node [s].
 _PATIENCE: Final = 3.0  #: Timeout of the clean end of the nodes, before they are killed [s].
 
@@ -177,20 +179,26 @@ class Graph:
         show: Callable[[], object] = lambda: None,
     ) -> None:
         """Request the state of a node at a period [s], until its state is in `states`."""
-        client = node.create_client(GetState, f'{name}/get_state')
-        self.spin_until(client.service_is_ready, f'the node {name}', _START)
+        clients = [node.create_client(GetState, f'{name}/get_state')]
         # A response to a client that the server has not discovered is lost.
         answers: list[Future] = []
-        start = time.monotonic()
+        start, sent = time.monotonic(), -inf
 
         def answered() -> bool:
+            nonlocal sent
             show()
-            if time.monotonic() - start >= period * len(answers):
-                answers.append(client.call_async(GetState.Request()))
+            now = time.monotonic()
+            # Seen in a few of thousands of starts: a client that is never ready for a node.
+            if now - start > _CLIENT * len(clients):
+                clients.append(node.create_client(GetState, f'{name}/get_state'))
+            if now - sent >= period and clients[-1].service_is_ready():
+                sent = now
+                answers.append(clients[-1].call_async(GetState.Request()))
             return any(one.done() and one.result().current_state.id in states for one in answers)
 
         self.spin_until(answered, what, _START)
-        node.destroy_client(client)
+        for client in clients:
+            node.destroy_client(client)
 
     def change(self, node: Node, name: str, *transitions: int) -> None:
         """Execute lifecycle transitions of a node that was started without ``autostart``."""
