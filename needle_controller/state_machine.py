@@ -66,7 +66,6 @@ class StateMachine(ABC, Generic[_Command]):
         """Stop, pause, retract or continue; return the command to publish."""
 
     def _end_retraction(self) -> None:
-        """Continue with a motion that a user has requested."""
         self.authority.run()
         self._obeyed = self.authority.mode
 

@@ -244,7 +244,6 @@ class SteeringNode(CompiledNode):
         self._act(self._loop.target(stamp, header.frame_id, at, self.now()))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Pass other nodes' answers to motions to the executive."""
         if self._client is not None:
             # The action answers; receivers of the topic take none of the motions.
             return

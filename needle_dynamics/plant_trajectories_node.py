@@ -118,7 +118,6 @@ class PlantTrajectories:
         return {name for one in self._held for name in one.joints}
 
     def _forget(self, joints: Collection[str]) -> None:
-        """Forget the paths of joints that follow something else."""
         for paths in (self._executions, self._held):
             kept = [one._replace(joints=one.joints - {*joints}) for one in paths]
             paths[:] = [one for one in kept if one.joints]

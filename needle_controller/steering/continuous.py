@@ -84,7 +84,6 @@ class ContinuousInsertion(SteppedInsertion):
         return move
 
     def _pass(self) -> None:
-        """Process the measurement of the depth before, and plan."""
         k, at, there = self._passed, self._motions.at, self._between[1]
         if np.abs(at[1:3] - there).max() > LAGGING * self._settings.guide_tolerance:
             x, z = 1e3 * at[1:3]

@@ -122,7 +122,6 @@ class RecursiveFriction:
             self._select(now, 0.5 * (after - before) / self._period, filtered)
 
     def _drop_pending(self) -> None:
-        """Discard samples before and after a change of regime."""
         self._pending.clear()
         self._since_change = 0
 

@@ -77,7 +77,6 @@ def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:
 
 
 def _covered(stamps: NDArray[np.int64], motion: NDArray[np.int64]) -> BoolArray:
-    """Return which stamps allow an interpolation of the motion."""
     steps = np.diff(motion)
     after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
     inside = (motion[0] <= stamps) & (stamps <= motion[-1])

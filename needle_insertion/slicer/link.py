@@ -224,7 +224,6 @@ class Connection:
         self._events.add(Severity.INFO, f'connected with {peer}', 'connected')
 
     def _report(self, line: str) -> None:
-        """Log the reason why no connection is possible, once."""
         if line != self.error:
             self.error = line
             self._events.add(

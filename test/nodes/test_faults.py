@@ -319,7 +319,8 @@ def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     reports = ros_graph.statuses(loop.probe, RecorderStatus, 100)
     recorder = ros_graph.start('recorder', {'path': str(bag), 'compression': 'none'})
     loop.until(lambda: list(bag.glob('*.mcap')) and loop.depth, 'the bag')
-    size = 200_000
+    # The messages of about 7 s: those of a stall are lost in one piece, and are few in comparison.
+    size = 2_000_000
     resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
     loop.until(lambda: any('File too large' in one.failure for one in reports), 'the report')
     recorder.check()
