@@ -305,7 +305,6 @@ class ControllerNode(ModelNode):
         take: Callable[[Reading, int], ForceCommand | None],
         then: Callable[[], None] = lambda: None,
     ) -> Callable[[Reading], None]:
-        """Return a callback that processes a measurement and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
             self._act(take(reading, self.now()))
@@ -361,7 +360,6 @@ class ControllerNode(ModelNode):
     # Outputs.
 
     def _act(self, answer: ForceCommand | None) -> None:
-        """Publish a command, lines for the log, and answers to requests."""
         if answer is not None and self._command is not None:
             stamp, force, torque, reference, error = answer
             driver, supervisor = self._driver, self._supervisor

@@ -251,7 +251,6 @@ class Robot:
         return Measurement(time, depth, velocity, angle, angular_velocity, force)
 
     def _find(self, joint: str, reading: Reading) -> int:
-        """Return the index of a joint that has a position."""
         names, positions = reading.names, reading.values[0]
         i = names.index(joint) if joint in names else len(positions)
         if i >= len(positions) or isnan(positions[i]):

@@ -203,7 +203,6 @@ class SteeringNode(CompiledNode):
     def _passing(
         self, take: Callable[[SteeringExecutive, Reading, int], JointMotion | None]
     ) -> Callable[[Reading], None]:
-        """Return a callback that processes a measurement and publishes the motion."""
 
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:

@@ -446,7 +446,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return self.obey(stamp)
 
     def _release_for(self, fault: str, stamp: int) -> ForceCommand:
-        """Command zero force on a fault, and log its beginning."""
         self._log_fault(fault, 'no force is commanded')
         return self._release(stamp)
 

@@ -359,7 +359,6 @@ class PlantNode(ModelNode):
     # Samples.
 
     def _on_timer(self) -> None:
-        """Take all due samples, each stamped with its own time."""
         if self._run is None:
             return
         due = self._time.due(self.now())

@@ -181,5 +181,4 @@ def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool
 
 
 def _short(value: float) -> float:
-    """Round to more digits than the accuracy of any experiment."""
     return float(f'{value:.7g}')

@@ -58,7 +58,6 @@ def shared_names(found: Sequence[ParameterSection], node: str) -> frozenset[str]
 
 
 def _nodes(content: Any, namespace: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield nodes, which may be nested in namespaces, and their parameters."""
     for name, below in content.items() if isinstance(content, Mapping) else ():
         path = f'{namespace}/{name}'.strip('/')
         if isinstance(below, Mapping) and _MARK in below:

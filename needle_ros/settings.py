@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import field, fields
 from difflib import get_close_matches
+from importlib import import_module
 from math import inf, isfinite
 from typing import Any, Final, TypeVar
 
@@ -91,6 +92,24 @@ class CheckedSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+
+
+def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
+    """
+    Return a class from its address ``module:Class``, or from a name of `known` with its address.
+
+    Raises `ParameterError`, which begins with ``what``, if there is none.
+    """
+    valid = f'{what} must be one of {", ".join(known)}, or module:Class'
+    address = known.get(name, name) if isinstance(name, str) else ''
+    module, _, of_class = address.partition(':')
+    if not module or not of_class:
+        raise ParameterError(f'{valid}, got {name!r}')
+    try:
+        return getattr(import_module(module), of_class)
+    # The module is any code of the user.
+    except Exception as error:
+        raise ParameterError(f'{valid}; {name!r} cannot be imported: {error}') from error
 
 
 def check_choice(name: str, value: object, valid: Collection[str]) -> None:

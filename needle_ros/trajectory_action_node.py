@@ -212,7 +212,6 @@ class TrajectoryAction:
         return feedback
 
     def _finish(self, handle: ServerGoalHandle, outcome: Outcome) -> None:
-        """Set the final state of a goal, and send its result."""
         if handle.is_cancel_requested:
             handle.canceled()
         elif outcome.code is ErrorCode.SUCCESSFUL:

@@ -27,8 +27,6 @@ ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 
 
 class _Fields(NamedTuple):
-    """Fields after the header of a message type, in this order."""
-
     names: bool = False
     strings: int = 0
     sequences: int = 0

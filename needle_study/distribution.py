@@ -13,26 +13,23 @@ from scipy import stats
 
 
 class Kind(NamedTuple):
-    """A kind of distribution, with two parameters."""
+    """A kind of distribution."""
 
-    parameters: tuple[str, str]
-    valid: Callable[[float, float], bool]
+    parameters: tuple[str, ...]
+    valid: Callable[..., bool]
     rule: str
-    frozen: Callable[[float, float], Any]
+    frozen: Callable[..., Any]
 
 
+# The quantile functions of gamma and beta are exact in the valid ranges.
 KINDS: Final = {
     'uniform': Kind(
-        ('low', 'high'),
-        lambda low, high: low < high,
-        'low < high',
+        ('low', 'high'), lambda low, high: low < high, 'low < high',
         lambda low, high: stats.uniform(low, high - low),
     ),
     'normal': Kind(
-        ('mean', 'standard deviation'),
-        lambda _mean, deviation: deviation > 0.0,
-        'standard deviation > 0',
-        stats.norm,
+        ('mean', 'standard deviation'), lambda _mean, deviation: deviation > 0.0,
+        'standard deviation > 0', stats.norm,
     ),
     'lognormal': Kind(
         ('median', 'standard deviation of the logarithm'),
@@ -42,18 +39,27 @@ KINDS: Final = {
     ),
     'gamma': Kind(
         ('mean', 'standard deviation'),
-        # The quantile function is exact in this range.
         lambda mean, deviation: min(mean, deviation) > 0.0 and 1e-3 < mean / deviation < 1e6,
         'mean > 0, standard deviation > 0, and their ratio from 0.001 to 1e+06',
-        lambda mean, deviation: stats.gamma(
-            (mean / deviation) ** 2, scale=mean / (mean / deviation) ** 2
-        ),
+        lambda mean, sd: stats.gamma((mean / sd) ** 2, scale=mean / (mean / sd) ** 2),
     ),
-}
+    'triangular': Kind(
+        ('low', 'mode', 'high'), lambda low, mode, high: low <= mode <= high and low < high,
+        'low <= mode <= high and low < high',
+        lambda low, mode, high: stats.triang((mode - low) / (high - low), low, high - low),
+    ),
+    'beta': Kind(
+        ('a', 'b', 'low', 'high'),
+        lambda a, b, low, high: min(a, b) >= 0.1 and max(a, b) <= 1e4 and low < high,
+        'a and b from 0.1 to 10000, and low < high',
+        lambda a, b, low, high: stats.beta(a, b, low, high - low),
+    ),
+}  # fmt: skip
 
 _LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
+_WEIGHTS: Final = 'weights'
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +67,19 @@ class Distribution:
     """Distribution of one variable."""
 
     kind: str  #: one of `KINDS`, or ``choice``
-    numbers: tuple[float, ...]  #: parameters of the kind, or equally probable values
+    numbers: tuple[float, ...]  #: parameters of the kind, or values to choose from
     within: tuple[float, float] = (-np.inf, np.inf)  #: ends of a truncated distribution
+    weights: tuple[float, ...] = ()  #: relative probabilities of the values; empty: equal ones
 
     def quantiles(self, parts: FloatArray) -> FloatArray:
         """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""
         if self.kind == _CHOICE:
             number = len(self.numbers)
-            at = np.minimum((parts * number).astype(int), number - 1)
+            at = (parts * number).astype(int)
+            if self.weights:
+                ends = np.cumsum(self.weights)
+                at = np.searchsorted(ends, parts * ends[-1], side='right')
+            at = np.minimum(at, number - 1)
             return np.asarray(np.array(self.numbers)[at])
         frozen = _frozen(self.kind, self.numbers)
         low, high = frozen.cdf(self.within)
@@ -84,7 +95,7 @@ class Distribution:
 
 
 @lru_cache(maxsize=256)
-def _frozen(kind: str, numbers: tuple[float, float]) -> Any:
+def _frozen(kind: str, numbers: tuple[float, ...]) -> Any:
     """Return the distribution of SciPy, which takes 0.5 ms to construct."""
     return KINDS[kind].frozen(*numbers)
 
@@ -95,15 +106,22 @@ def distribution(name: str, given: Any) -> Distribution:
         return Distribution(_CHOICE, (float(given),))
     if not isinstance(given, Mapping):
         raise ParameterError(f'{name} must be a number or one of {_kinds()}, got {given!r}')
-    kinds = [kind for kind in given if kind != _WITHIN]
+    kinds = [kind for kind in given if kind not in (_WITHIN, _WEIGHTS)]
     if len(kinds) != 1 or kinds[0] not in (*KINDS, _CHOICE):
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
     numbers = _numbers(f'{name}: {kind}', given[kind])
     if kind == _CHOICE:
+        weights = _numbers(f'{name}: {_WEIGHTS}', given.get(_WEIGHTS, ()))
         if not numbers or _WITHIN in given:
             raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
-        return Distribution(kind, numbers)
+        if len(weights) not in (0, len(numbers)) or min(weights, default=1.0) <= 0.0:
+            raise ParameterError(
+                f'{name}: {_WEIGHTS} must have a positive number for each value, got {weights}'
+            )
+        return Distribution(kind, numbers, weights=weights)
+    if _WEIGHTS in given:
+        raise ParameterError(f'{name}: only a {_CHOICE} has {_WEIGHTS}')
     row = KINDS[kind]
     if len(numbers) != len(row.parameters):
         takes = ', '.join(row.parameters)
@@ -124,7 +142,7 @@ def distribution(name: str, given: Any) -> Distribution:
 
 def _kinds() -> str:
     kinds = [f'{{{kind}: [{", ".join(row.parameters)}]}}' for kind, row in KINDS.items()]
-    return ', '.join([*kinds, f'{{{_CHOICE}: [values]}}'])
+    return ', '.join([*kinds, f'{{{_CHOICE}: [values], {_WEIGHTS}: [numbers]}}'])
 
 
 def is_number(value: Any) -> bool:

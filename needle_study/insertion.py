@@ -89,8 +89,6 @@ class InsertionStudy(ReferenceLimits):
 
 
 class _Insertion(NamedTuple):
-    """Trajectory of one insertion up to its end or stop."""
-
     model: NeedleModel  #: the true needle
     states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
     commands: FloatArray  #: command of each sample [N], shape (k,)

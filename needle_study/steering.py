@@ -187,7 +187,6 @@ class SteeringScenario(Scenario):
         )
 
     def _open(self, truths: Sequence[GroundTruth]) -> Iterable[dict[str, float]]:
-        """Simulate all insertions with a guide at rest in one batch."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
         rolls = np.array([np.arctan2(*truth.bevel) for truth in truths])[:, np.newaxis]

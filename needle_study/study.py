@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import isfinite
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, Final, TYPE_CHECKING
 
 from needle_dynamics import FloatArray
@@ -16,6 +15,7 @@ from needle_dynamics.display import Displayed, new_figure, shown
 from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
+from needle_ros.settings import find_class
 from needle_study.distribution import Distribution, distribution, is_number
 from needle_study.scenario import check_names, mapping, one_of, Scenario, SCENARIOS
 import numpy as np
@@ -58,15 +58,9 @@ class Study:
     def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
         """Return the sampled values of consecutive sample numbers by variable."""
         parts = np.clip(self._parts(int(numbers[0]), len(numbers)), _INSIDE, _BELOW)
-        if not np.array_equal(self.factor, np.eye(len(self.factor))):
+        if self.design != 'latin' and not np.array_equal(self.factor, np.eye(len(self.factor))):
             scores = ndtri(parts)
-            # No matrix product: its bits may depend on the number of rows.
-            parts = np.array(
-                [
-                    ndtr(sum(f * one for f, one in zip(row, scores.T, strict=True)))
-                    for row in self.factor
-                ]
-            ).T
+            parts = np.array([ndtr(_mixed(row, scores.T)) for row in self.factor]).T
             parts = np.clip(parts, _INSIDE, _BELOW)
         return {
             name: one.quantiles(part)
@@ -87,10 +81,8 @@ class Study:
         ).reshape(count, dimensions)
         if self.design != 'latin':
             return uniform
-        strata = [
-            _permutation(self.samples, self.seed, dimension)[first : first + count]
-            for dimension in range(dimensions)
-        ]
+        rows = map(tuple, self.factor.tolist())
+        strata = [_strata(self.samples, self.seed, row)[first : first + count] for row in rows]
         return np.asarray((np.transpose(strata) + uniform) / self.samples).reshape(uniform.shape)
 
     def rng(self, number: int, stream: int) -> np.random.Generator:
@@ -148,7 +140,30 @@ class StudyTable(Displayed):
         return found
 
 
+def _mixed(row: Sequence[float], scores: Iterable[FloatArray]) -> FloatArray:
+    # No matrix product: its bits may depend on the number of rows.
+    return np.asarray(sum(f * one for f, one in zip(row, scores, strict=False)))
+
+
 @lru_cache(maxsize=64)
+def _strata(count: int, seed: int, row: tuple[float, ...]) -> NDArray[np.uint32]:
+    """
+    Return the strata of a dimension by sample, with its row of the Cholesky factor.
+
+    Each has one sample, also with correlations: they are in the order of correlated normal scores.
+    Source: R. L. Iman, W. J. Conover, Communications in Statistics B 11 (1982), 311.
+    """
+    dimension = max(np.flatnonzero(row))
+    if dimension and any(row[:dimension]):
+        scores = (
+            ndtri((_permutation(count, seed, k) + 0.5) / count) for k in range(dimension + 1)
+        )
+        strata = np.empty(count, dtype=np.uint32)
+        strata[np.argsort(_mixed(row, scores), kind='stable')] = np.arange(count)
+        return strata
+    return _permutation(count, seed, int(dimension))
+
+
 def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
     # The generators of samples have two numbers in their key, this generator has three.
     key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
@@ -172,13 +187,15 @@ def build_study(document: Any) -> Study:
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)
-    kind = one_of('scenario', document.get('scenario'), SCENARIOS)
+    of_class = find_class('scenario', document.get('scenario'), SCENARIOS)
+    if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
+        raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
     design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
     if design == 'latin' and samples > _MOST_LATIN:
         raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
-    scenario: Scenario = resolve_name(SCENARIOS[kind])(settings)
+    scenario: Scenario = of_class(settings)
     known = scenario.variables
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.

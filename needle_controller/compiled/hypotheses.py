@@ -316,7 +316,6 @@ def tip_distribution(c: Steering, form: TipForm) -> TipDistribution:
 
 @inlined
 def _first(c: Steering) -> int:
-    """Return the first depth number that can still be measured."""
     return int(max(0, c.counts[STEP] - 1))
 
 

@@ -103,8 +103,6 @@ def run_continuous(
 
 @dataclass
 class _Pieces:
-    """Solver of a closed loop between changes of the friction state."""
-
     law: ContinuousLaw
     plant: NeedleModel
     goal: Callable[[float], ArrayLike]

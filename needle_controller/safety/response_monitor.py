@@ -70,7 +70,6 @@ class StallMonitor:
         self._impulse = 0.0  #: Impulse since the mark [N s].
 
     def _observe(self, stamp: int, depth: float, impulse: float) -> None:
-        """Compare the mean force of a displacement with the nominal friction."""
         if self._mark is not None:
             self._impulse += impulse
             moved, elapsed = depth - self._mark.depth, stamp - self._mark.stamp

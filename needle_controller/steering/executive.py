@@ -167,7 +167,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
             raise JobError('paused; resume before the next insertion')
 
     def _check_ready(self, now: int) -> FloatArray:
-        """Return the positions of the joints, if an insertion can begin."""
         for stream in self._streams:
             if stream.publishers > 1:
                 raise JobError(f'{stream.publishers} nodes publish {stream.name}')
@@ -190,7 +189,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.events.add(Severity.INFO, f'planning to {describe_target(point)} in {steps} steps')
 
     def _cancel(self, verdict: Verdict, why: str) -> None:
-        """Cancel the computation of a plan, if it is under way."""
         request = self.planner.cancel()
         if request is None:
             return

@@ -99,7 +99,6 @@ class SteppedInsertion:
         return None
 
     def _end_measurement(self, measured: TipMeasurements, now: int) -> JointMotion | None:
-        """End a measurement of the tip, and begin the next step."""
         k, self._measured = self.law.step, None
         self.law.update(measured, k, float(self._motions.at[0]))
         to = self.law.plan()

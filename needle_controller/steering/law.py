@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from math import isfinite, nan
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
@@ -11,6 +10,7 @@ from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
+from needle_ros.settings import find_class
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -113,15 +113,7 @@ LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float]
 
 def find_law(name: str) -> LawClass:
     """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
-    valid = f'law must be one of {", ".join(STEERING_LAWS)}, or module:Class'
-    module, _, of_class = STEERING_LAWS.get(name, name).partition(':')
-    if not module or not of_class:
-        raise ParameterError(f'{valid}, got {name!r}')
-    try:
-        found: LawClass = getattr(import_module(module), of_class)
-    # The module is any code of the user.
-    except Exception as error:
-        raise ParameterError(f'{valid}; {name!r} cannot be imported: {error}') from error
+    found: LawClass = find_class('law', name, STEERING_LAWS)
     return found
 
 

@@ -307,7 +307,6 @@ class _Rows:
 
 
 def _layers(starts: FloatArray, depths: ArrayLike) -> IntArray:
-    """Return the layers that begin at depths or contain them."""
     return np.asarray(np.searchsorted(starts, np.asarray(depths) + _SAME, side='right') - 1)
 
 

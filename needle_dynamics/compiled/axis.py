@@ -91,7 +91,6 @@ def _events(a: AxisConstants, state: FloatArray, punctured: BoolArray) -> tuple[
 
 @inlined
 def _arrive(a: AxisConstants, state: FloatArray, punctured: BoolArray) -> None:
-    """Update greatest depth, punctures and hub contact at the new depth."""
     depth = state[DEPTH]
     state[DEEPEST] = max(state[DEEPEST], depth)
     for i in range(len(a.membranes)):

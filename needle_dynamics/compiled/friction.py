@@ -196,7 +196,6 @@ def _sticking_flow(
 def _smooth_flow(
     f: FrictionConstants, mass: float, u: float, drive: float, h: float
 ) -> tuple[float, float, float]:
-    """Return velocity, displacement and change of friction of a smooth law."""
     part = 1.0 - sqrt(0.5)
     first = _implicit_stage(f, mass, u, drive, part * h)
     end = _implicit_stage(f, mass, u + (1.0 - part) / part * (first - u), drive, part * h)

@@ -259,5 +259,4 @@ def _unlock(folder: Path, name: str) -> None:
 
 
 def _byte(name: str) -> int:
-    """Return the offset of the lock byte of an entry."""
     return int.from_bytes(sha256(name.encode()).digest()[:7], 'big')

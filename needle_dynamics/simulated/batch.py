@@ -247,7 +247,6 @@ def _groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, I
 
 
 def _fits(p: NeedleParameters) -> bool:
-    """Return whether a needle can share a vector register with others."""
     return (
         p.modes == 2
         and p.formulation == 'complete'

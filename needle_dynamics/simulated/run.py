@@ -115,7 +115,6 @@ class PlantRun:
         }
 
     def _measured_joints(self) -> dict[str, tuple[float, float, float]]:
-        """Return the last measured position, velocity and effort of each joint."""
         if JOINT_STATES.name in self.topics:
             joints = self.topics[JOINT_STATES.name].joints
             *_, (_, _, values) = self._measured

@@ -94,7 +94,6 @@ class Bag:
         return tuple(sorted(found, key=lambda topic: (topic.name, topic.type_name)))
 
     def _count(self) -> Mapping[BagTopic, int]:
-        """Read the whole bag and count its messages by topic."""
         for _ in self.batches(lambda _topic: False):
             pass
         return self.counts

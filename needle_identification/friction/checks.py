@@ -118,7 +118,6 @@ def noise_words(design: Design, bias: float) -> str:
 
 
 def _of_memory(design: Design, fit: Regression) -> Iterator[str]:
-    """Warn if autocorrelated noise increases the standard errors clearly."""
     if fit.memory is None or not fit.memory.length or fit.is_exact:
         return
     growth = float(fit.memory.inflation[fit.determined].max(initial=1.0))

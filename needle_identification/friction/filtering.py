@@ -141,7 +141,6 @@ def filter_taps(cutoff: float, period: float) -> FloatArray:
 
 
 def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
-    """Filter a signal by FFT, with constant extension at both ends."""
     padded = np.pad(signal, len(taps) // 2, mode='edge')
     size = next_fast_len(len(padded), real=True)
     found = np.fft.irfft(np.fft.rfft(padded, size) * np.fft.rfft(taps, size), size)

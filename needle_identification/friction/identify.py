@@ -144,7 +144,6 @@ def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | No
 
 
 def _noise_remark(chosen: _Candidate) -> str:
-    """Describe the effect of velocity noise if it is relevant."""
     design = chosen.design
     if bias := checks.noise_bias(design, chosen.fit):
         return checks.noise_words(design, bias)

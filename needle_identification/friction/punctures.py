@@ -73,7 +73,6 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
 
 
 def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Puncture:
-    """Locate the steepest drop near a sample and measure its size."""
     signals = design.signals
     width, reach = signals.correlation, signals.half_filter
     around = slice(peak - width // 2 - reach, peak + width // 2 + reach)

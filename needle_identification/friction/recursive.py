@@ -218,7 +218,6 @@ class _Information:
     def _scores(
         self, values: FloatArray, inverse: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Return score covariance, effective blocks per parameter, and their total number."""
         now = self._count
         parts = [*self._parts, (self._part, now)]
         ages = np.array([self.decay ** (now - count) for _, count in parts])

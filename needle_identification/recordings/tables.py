@@ -401,7 +401,6 @@ def _distinct(names: Iterator[str]) -> Iterator[str]:
 
 
 def _spend(path: Path, budget: Budget) -> None:
-    """Count the decompressed size of the variables of a file."""
     with path.open('rb') as stream:
         head = stream.read(_MATLAB_HEAD)
         order = '>' if head[-2:] == b'MI' else '<'

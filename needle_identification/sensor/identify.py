@@ -117,7 +117,6 @@ def _true(one: SensorRecording, time: FloatArray) -> FloatArray:
 
 
 def _covered(one: SensorRecording) -> BoolArray:
-    """Return which samples, (n,), have a true position at all delays."""
     if not one.moves:
         return np.ones(len(one.time), dtype=np.bool_)
     times, gaps = one.true_time, are_gaps(np.rint(1e9 * np.diff(one.true_time)).astype(np.int64))

@@ -197,7 +197,6 @@ class Search:
     def _residual(
         self, factors: list[FloatArray], x: FloatArray, at: list[int], values: FloatArray
     ) -> FloatArray:
-        """Return weighted residuals after a change of variables, in place."""
         x[at] = values
         parts = zip(factors, self.fits(x), strict=True)
         return np.concatenate(

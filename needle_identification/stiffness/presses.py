@@ -178,7 +178,6 @@ def grouped(sizes: FloatArray, tolerance: float) -> IntArray:
 
 
 def _directions(force: FloatArray) -> IntArray:
-    """Group forces by direction, starting after the widest gap between directions."""
     angle = np.arctan2(force[:, 1], force[:, 0])
     order = np.sort(angle)
     gaps = np.diff(order, append=order[0] + 2.0 * pi)
@@ -207,7 +206,6 @@ def _follow_zero(
 
 
 def _drift_rate(times: FloatArray, rests: FloatArray, variance: FloatArray) -> float:
-    """Return the maximum likelihood variance of the random walk per second."""
     step, change = np.diff(times), np.diff(rests, axis=0)
     slow = 0.01 * float(np.median(variance)) / float(step.sum())
     fast = 100.0 * max(slow, float((change**2).max() / step.min()))

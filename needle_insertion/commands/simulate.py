@@ -179,7 +179,6 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
 
 
 def _pace(ratio: float) -> str:
-    """Format the ratio of simulated to real time to two digits."""
     times, word = (ratio, 'faster') if ratio >= 1.0 else (1.0 / ratio, 'slower')
     return f'{float(f"{times:.2g}"):g} times {word} than'
 

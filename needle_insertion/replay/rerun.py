@@ -217,7 +217,6 @@ class Rerun:
         )
 
     def _limits(self, name: str, tolerance: float) -> FloatArray:
-        """Return the largest accepted difference for each quantity of a topic."""
         topic, constants = self.recorded.topics[name], self.recorded.constants
         sizes = np.abs(self.recorded.rows[name].values)
         sizes = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0, initial=0.0)

@@ -79,7 +79,6 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
 
 
 def _excluded(axes: Axes, fit: Fit, most: int, size: float) -> None:
-    """Draw the samples that the fit does not use, against velocity."""
     out = ~fit.used
     speed, force = _thinned(1e3 * fit.velocity[out], fit.force[out], most=most)
     axes.plot(speed, force, 'x', color=_EXCLUDED, markersize=size, alpha=0.5, label=_NAMED)
@@ -166,7 +165,6 @@ def _panels(
 
 
 def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
-    """Draw the displacements at each force level according to its matrix."""
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = np.array([np.cos(turn), np.sin(turn)])
     for level in estimate.levels:

@@ -197,7 +197,6 @@ def _tissue_stiffness(estimate: StiffnessEstimate, force: float) -> ParameterEst
 
 
 def _spring_row(level: LevelEstimate) -> tuple[str, ...]:
-    """Return force, curl, asymmetry, and the principal stiffnesses and their direction."""
     return (
         f'{level.force:.2f} N',
         *map(_cell, (level.curl, level.spring, *level.principal)),

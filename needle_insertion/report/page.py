@@ -70,7 +70,6 @@ def _power(found: re.Match[str]) -> str:
 
 
 def _kind(cell: str) -> str:
-    """Return the style class of a table cell, or ''."""
     is_number = _NUMBER.match(cell) and len(cell) < _LONGEST_NUMBER
     return _VERDICTS.get(cell, 'number' if is_number else '')
 

@@ -64,7 +64,6 @@ class Frames:
 
 
 def _header(header: bytes) -> tuple[str, str, int]:
-    """Return type, device name and size of the body."""
     version, kind, device, _, _, size, _ = HEADER.unpack(header)
     name = kind.rstrip(b' \0')
     if version not in _VERSIONS or not name.isascii() or not name.decode('latin1').isprintable():

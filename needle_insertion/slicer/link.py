@@ -233,7 +233,6 @@ class Connection:
     # Data.
 
     def _read(self) -> list[Frame]:
-        """Read received data up to a limit and return the messages."""
         found: list[Frame] = []
         for _ in range(_MOST_READ // _AT_ONCE):
             if self._socket is None:

@@ -186,7 +186,6 @@ class Server:
             raise
 
     def _fault(self, host: str, origin: str | None) -> str:
-        """Return the reason for the rejection of a request, or ''."""
         try:
             parts = urlsplit(f'//{host}')
             name, port = parts.hostname or '', parts.port or 80

@@ -184,7 +184,6 @@ class View:
         return [round(now, 3), *values]
 
     def _joints(self, topic: str) -> dict[str, tuple[float | None, ...]]:
-        """Return position, velocity and effort of each joint of a topic."""
         _, reading = self._readings.get(topic, (0.0, None))
         if reading is None:
             return {}

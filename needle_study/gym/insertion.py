@@ -28,8 +28,6 @@ _EDGE: Final = 2e-3  #: lateral position at the upper edge of an image [m]
 
 
 class _Needles:
-    """The needles of several episodes, each with its target."""
-
     def __init__(self, needle: str, number: int) -> None:
         self._nominal = NeedleParameters.preset(needle)
         model = NeedleModel(self._nominal)

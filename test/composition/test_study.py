@@ -28,7 +28,7 @@ from needle_insertion.commands import study as study_command
 from needle_insertion.report import study_page as page
 from needle_ros.errors import JobError
 from needle_ros.process_pool import processes
-from needle_study.distribution import distribution
+from needle_study.distribution import distribution, KINDS
 from needle_study.engine import chunk, compute, dask, order, Results
 from needle_study.steering import SteeringScenario
 from needle_study.study import build_study, DESIGNS, Study
@@ -189,8 +189,75 @@ def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
         assert np.abs(off).max() < 5.0 / sqrt(samples)
 
 
+@pytest.mark.parametrize('correlation', [-0.9, 0.5])
+def test_correlations_keep_the_strata_of_a_latin_design(correlation: float) -> None:
+    """One sample per stratum in every dimension, and the rank correlation of a normal copula."""
+    samples, names = 1000, ('target_x', 'target_z', 'tilt_x')
+    drawn = build_study(
+        {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
+         'population': {name: {'uniform': [0.0, 0.5]} for name in names},
+         'correlations': [['target_x', 'tilt_x', correlation]]}
+    ).draw(range(samples))  # fmt: skip
+    strata = np.array([np.floor(drawn[name] / 0.5 * samples) for name in names])
+    assert np.array_equal(np.sort(strata, axis=1), np.tile(np.arange(samples), (3, 1)))
+    found = np.corrcoef(strata)
+    expected = 6 / np.pi * np.arcsin(correlation / 2)
+    # Five standard errors of independent samples.
+    assert found[0, 2] == pytest.approx(expected, abs=5.0 / sqrt(samples))
+    assert np.abs(found[1, ::2]).max() < 5.0 / sqrt(samples)
+
+
+def test_weights_are_relative_probabilities() -> None:
+    """Of the values of a choice; equal weights are no weights, to the bit."""
+    parts = (np.arange(1000) + 0.5) / 1000
+    weighted = distribution('x', {'choice': [3.0, 1.0, 2.0], 'weights': [1, 7, 2]})
+    values, counts = np.unique(weighted.quantiles(parts), return_counts=True)
+    assert values.tolist() == [1.0, 2.0, 3.0]
+    assert counts.tolist() == [700, 200, 100]
+    one, other = (distribution('x', {'choice': [3, 1], **w}) for w in ({}, {'weights': [2, 2]}))
+    assert np.array_equal(one.quantiles(parts), other.quantiles(parts))
+
+
+_OWN = """
+from needle_study.scenario import Metric, Scenario, Variable
+
+class Throw(Scenario):
+    at_once = 10
+    variables = {'speed': Variable(2.0, 'm/s', 'initial speed', 0.0)}
+    metrics = {'height': Metric('m', 'largest height'), 'hit': Metric('', 'above 0.2 m')}
+
+    def __init__(self, settings):
+        self._gravity = settings.get('gravity', 9.81)
+
+    def insert(self, rows, streams):
+        for row in rows:
+            height = row['speed'] ** 2 / (2.0 * self._gravity)
+            yield {'height': height, 'hit': height > 0.2}
+
+    def replay(self, sample, rng):
+        return iter(())
+"""
+
+
+def test_own_scenario_of_a_file_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its address; in this process and in workers the same table."""
+    (tmp_path / 'own_throw.py').write_text(_OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    study = build_study(
+        {'scenario': 'own_throw:Throw', 'samples': 100, 'settings': {'gravity': 1.62},
+         'population': {'speed': {'triangular': [0.1, 0.5, 1.5]}}}
+    )  # fmt: skip
+    rows = study.rows(0, 100)
+    assert np.allclose(rows['height'], rows['speed'] ** 2 / 3.24, rtol=1e-15)
+    results = Results(tmp_path / 'results', study)
+    compute(results, lambda: processes(2), 2, lambda _: None)
+    for name, values in rows.items():
+        assert np.array_equal(column(results.table, name), values)
+
+
 @given(
-    kind=st.sampled_from(['uniform', 'normal', 'lognormal', 'gamma']),
+    kind=st.sampled_from(sorted(KINDS)),
     first=st.floats(0.1, 10.0),
     second=st.floats(0.01, 5.0),
     parts=st.lists(st.floats(1e-6, 1.0 - 1e-6), min_size=2, max_size=20),
@@ -200,11 +267,16 @@ def test_quantiles_are_monotone_and_within_the_range(
     kind: str, first: float, second: float, parts: list[float], cut: tuple[float, float]
 ) -> None:
     """For all kinds of distributions, also truncated."""
-    numbers = [first, first + second] if kind == 'uniform' else [first, second]
+    # Low, mode and high of a triangle; a, b, low and high of a beta distribution.
+    numbers = {
+        'uniform': [first, first + second],
+        'triangular': [first - second, first, first + 2.0 * second],
+        'beta': [first, 0.1 + second, -second, first],
+    }.get(kind, [first, second])
     free = distribution('x', {kind: numbers})
     values = free.quantiles(np.sort(parts))
-    # The inverse of the incomplete gamma function is monotone up to rounding.
-    assert (np.diff(values) >= -1e-12 * np.abs(values[:-1])).all()
+    # The inverses of the incomplete gamma and beta functions are monotone up to rounding.
+    assert (np.diff(values) >= -1e-12 * np.abs(numbers).max()).all()
     low, high = free.quantiles(np.array(cut)).tolist()
     if not low < high:
         return
@@ -489,7 +561,14 @@ def test_damaged_tables_and_other_versions_are_rejected(
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'scenario': 'fishing'}, "scenario must be one of steering, insertion, got"),
+        ({'scenario': 'fishing'}, 'scenario must be one of steering, insertion, or module:Class'),
+        ({'scenario': 'no_module:Class'}, 'cannot be imported: No module'),
+        ({'scenario': 'json:JSONDecoder'}, 'is not a subclass of Scenario'),
+        ({'population': {'skin': {'triangular': [1, 3, 2]}}}, 'must have low <= mode <= high'),
+        ({'population': {'skin': {'beta': [1, 0, 0, 1]}}}, 'a and b from 0.1 to 10000'),
+        ({'population': {'skin': {'choice': [1, 2], 'weights': [1]}}}, 'each value, got (1.0,)'),
+        ({'population': {'skin': {'choice': [1, 2], 'weights': [1, 0]}}}, 'a positive number for'),
+        ({'population': {'skin': {'normal': [1, 2], 'weights': [1]}}}, 'only a choice has'),
         ({'sample': 3}, "unknown parameter 'sample'"),
         ({'samples': 0}, 'samples must be a whole number from 1 to'),
         ({'seed': True}, 'seed must be a whole number from 0'),
@@ -532,7 +611,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'settings': {'prior': {'nose': 1}}}, "unknown parameter 'settings.prior.nose'"),
         ({'settings': 1}, 'settings must be names with values, got 1'),
         ({'population': [1]}, 'population must be names with values, got [1]'),
-        ({'scenario': ['steering']}, 'scenario must be one of steering, insertion, got'),
+        ({'scenario': ['steering']}, "or module:Class, got ['steering']"),
         ({'design': ['sobol']}, 'design must be one of sobol, random, latin, got'),
     ],
 )  # fmt: skip
