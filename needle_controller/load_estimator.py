@@ -54,6 +54,8 @@ class LoadEstimator:
 
     def take_tip(self, stamp: int, deflection: float) -> None:
         """Add a deflection of the tip [m] with its stamp [ns]."""
+        if self._tip is not None and self.observer is not None:
+            self.observer.add_tip(*self._tip)
         self._tip = stamp, deflection
 
     def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
@@ -90,19 +92,14 @@ class LoadEstimator:
         return self._encoders is not None
 
     def update(self) -> None:
-        """Update the load with the measurements since the last update."""
+        """Update the load with the encoder sample that waits, and the wrench and tip before it."""
         observer, encoders, tip = self.observer, self._encoders, self._tip
         self._encoders = self._tip = None
-        if observer is None:
+        if observer is None or encoders is None:
             return
         if tip is not None:
             observer.add_tip(*tip)
-        if encoders is not None:
-            self._update(observer, *encoders)
-
-    def _update(self, observer: Observer, stamp: int, measured: Measurement) -> None:
-        """Process an encoder sample, and the wrench of the same stamp [ns]."""
-        wrench = self._waiting
+        (stamp, measured), wrench = encoders, self._waiting
         own = wrench[1:] if wrench is not None and wrench[0] == stamp else None
         if wrench is not None and wrench[0] <= stamp:
             self._waiting = None

@@ -333,8 +333,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
-        if self.bending.waits:
-            self.estimate()
+        self.estimate()
         refusal = self.safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
@@ -361,6 +360,8 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def estimate(self) -> None:
         """Estimate the load for the next command; the last command does not wait for it."""
+        if not self.bending.waits:
+            return
         try:
             self.bending.update()
         except NeedleError as error:
