@@ -169,7 +169,7 @@ class ControllerNode(ModelNode):
             contract.BASE_WRENCH.name: (topics.wrench, measurers),
             contract.TIP_DEFLECTION.name: (contract.TIP_DEFLECTION, measurers),
         }
-        #: Publishes commands; those of a robot are ROS messages.
+        # The driver of a robot takes ROS messages.
         command, robot = topics.command, self._driver is not None
         self._command = self.publisher(command).publish if robot else self.writer(command)
         take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)

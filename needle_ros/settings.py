@@ -98,7 +98,7 @@ def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
     """
     Return a class from its address ``module:Class``, or from a name of `known` with its address.
 
-    Raises `ParameterError`, which begins with ``what``, if there is none.
+    Raises `ParameterError` for an unknown name and for a failed import; ``what`` is its subject.
     """
     valid = f'{what} must be one of {", ".join(known)}, or module:Class'
     address = known.get(name, name) if isinstance(name, str) else ''

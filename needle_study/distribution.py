@@ -21,7 +21,7 @@ class Kind(NamedTuple):
     frozen: Callable[..., Any]
 
 
-# The quantile functions of gamma and beta are exact in the valid ranges.
+# The quantile function of gamma is exact in its valid range.
 KINDS: Final = {
     'uniform': Kind(
         ('low', 'high'), lambda low, high: low < high, 'low < high',

@@ -188,7 +188,7 @@ class Graph:
             nonlocal sent
             show()
             now = time.monotonic()
-            # Seen in a few of thousands of starts: a client that is never ready for a node.
+            # Seen once in 700 tests: a client that was never ready for an active node.
             if now - start > _CLIENT * len(clients):
                 clients.append(node.create_client(GetState, f'{name}/get_state'))
             if now - sent >= period and clients[-1].service_is_ready():

@@ -1143,6 +1143,24 @@ def test_nees_rejects_wrong_shapes() -> None:
         observer.nees([0.0], [0.0])
 
 
+def test_tips_before_the_encoders_are_not_lost() -> None:
+    """Each tip that waits for an encoder sample reaches the observer, in order."""
+    found = []
+    for waiting in (False, True):
+        observer = Observer(phantom(), ObserverSettings(), PERIOD)
+        bending = LoadEstimator(phantom(), observer)
+        for k in range(20):
+            # The encoders have half the rate of the tip.
+            for stamp in (2 * k * 10**6 - 10**6, 2 * k * 10**6) if k else ():
+                take = bending.take_tip if waiting else observer.add_tip
+                take(stamp, 1e-3)
+            bending.take_encoders(2 * k * 10**6, Measurement(2e-3 * k, 0.1, 0.0))
+            bending.update()
+        found.append(observer.tip_deflection)
+        assert observer.refused == 0
+    assert found[0] == found[1]
+
+
 def test_inconsistent_observer_is_not_used() -> None:
     """An alternating moment gives a warning and zero load; both end with the moment."""
     bending = LoadEstimator(phantom(), Observer(phantom(), ObserverSettings(), PERIOD))
