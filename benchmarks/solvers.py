@@ -344,12 +344,14 @@ class OpenLoopCase:
     def steps(self, step: float, *, graded: bool) -> int:
         """Count the steps of our integrator, by the evaluations of the modes."""
         # Each step rotates the two modes once, counted in the source of the compiled function.
-        sources = {
-            name: cast(Any, getattr(compiled_step, name)).py_func for name in ('advance', '_steps')
-        }
+        boxed, advance, steps = (
+            cast(Any, getattr(compiled_step, name)).py_func
+            for name in ('advance_boxed', 'advance', '_steps')
+        )
         with (
-            mock.patch('needle_dynamics.simulated.integrator.advance', sources['advance']),
-            mock.patch.object(compiled_step, '_steps', sources['_steps']),
+            mock.patch('needle_dynamics.simulated.integrator.advance_boxed', boxed),
+            mock.patch.object(compiled_step, 'advance', advance),
+            mock.patch.object(compiled_step, '_steps', steps),
             mock.patch.object(compiled_step, 'rotate_two', wraps=rotate_two) as call,
         ):
             self.integrate(step, DURATION, graded=graded)

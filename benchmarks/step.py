@@ -22,7 +22,7 @@ from unittest import mock
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.compiled.step import advance, Sums
+from needle_dynamics.compiled.step import advance, Interval
 import numba
 import numpy as np
 
@@ -174,11 +174,11 @@ def operations_of_a_step(steps: int = _STEPS) -> dict[str, float]:
     """Return the mean operations per `Integrator` step (sliding needle, two modes) by kind."""
     counts: list[Counter[str]] = []
 
-    def count(*arguments: Any) -> tuple[float, Sums]:
-        counts.append(count_operations(advance, arguments))
-        return 0.0, Sums(*[0.0] * len(Sums._fields))
+    def count(boxed: Any, *arguments: Any) -> tuple[float, Interval]:
+        counts.append(count_operations(advance, (boxed.value, *arguments)))
+        return 0.0, Interval(*[0.0] * len(Interval._fields))
 
-    with mock.patch('needle_dynamics.simulated.integrator.advance', count):
+    with mock.patch('needle_dynamics.simulated.integrator.advance_boxed', count):
         for taken in (1, steps + 1):
             Integrator(*_start(), _STEP).advance(taken * _STEP, _FORCE)
     # The difference cancels operations per call, and the step from rest.

@@ -99,7 +99,7 @@ class PlantNode(ModelNode):
         'needle_dynamics.compiled.friction',
         'needle_dynamics.compiled.integrals',
         'needle_dynamics.compiled.normal_modes',
-        'needle_dynamics.compiled.step:advance',
+        'needle_dynamics.compiled.step:advance_boxed',
     )
 
     def __init__(self, **node_options: Any) -> None:
@@ -362,6 +362,9 @@ class PlantNode(ModelNode):
         if self._run is None:
             return
         due = self._time.due(self.now())
+        if due == 1:
+            self._sample(self._time.take())
+            return
         self._late += max(0, due - 1)
         end = monotonic_ns() + 0.25 * self._run.constants.own.backlog * NANOSECONDS
         for _ in range(due):

@@ -76,6 +76,8 @@ class SampleClock:
     @property
     def _is_recorded(self) -> bool:
         """Whether all recorders are close enough to the newest sample."""
+        if not self.recorded:
+            return True
         ahead = round(_AHEAD[self._lockstep] * NANOSECONDS / self._rate)
         first = max(self._start, self.stamp - ahead)
         return all(max(stamp, self._start) >= first for stamp in self.recorded.values())

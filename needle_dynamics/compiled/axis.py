@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motion along the insertion axis: friction per length, cutting force, and membranes."""
 
+from __future__ import annotations
+
 from math import copysign, inf, sqrt
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, BoolVector, FloatArray, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.friction import slide
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Indices of the axis state.
 DEPTH: Final = 0
@@ -114,7 +119,7 @@ def _glide(
 
 @kernel
 def push(
-    a: AxisConstants,
+    boxed: Boxed[AxisConstants],
     state: Vector,
     punctured: BoolVector,
     force: float,
@@ -126,6 +131,7 @@ def push(
 
     Returns the time left when the needle leaves the tissue [s], otherwise 0.
     """
+    a = boxed.value
     left = duration
     while left > 0.0:
         t = min(step, left)
@@ -169,7 +175,7 @@ def push(
 
 @kernel
 def carry_on(
-    a: AxisConstants,
+    boxed: Boxed[AxisConstants],
     state: Vector,
     punctured: BoolVector,
     velocity: float,
@@ -182,6 +188,7 @@ def carry_on(
 
     ``forces``, shape (parts,), takes the mean force in equal parts [N]. Returns as `push`.
     """
+    a = boxed.value
     rate = (velocity - state[VELOCITY]) / duration
     left = duration
     for k in range(len(forces)):

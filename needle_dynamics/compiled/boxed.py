@@ -27,17 +27,16 @@ class _BoxedType(types.StructRef):  # type: ignore[misc, name-defined]
 class Boxed(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     """A value that compiled functions take without conversion; its arrays are not copied."""
 
-    value: _Value  #: named tuple of numbers, arrays and named tuples; for compiled functions only
-    _kept: _Value
+    value: _Value  #: named tuple of numbers, arrays and named tuples
 
     def __new__(cls, value: _Value) -> Boxed[_Value]:
         boxed = _box(value)
-        boxed._kept = value
+        boxed.value = value
         return boxed
 
     def __reduce__(self) -> tuple[type[Boxed[_Value]], tuple[_Value]]:
         """Pickle the value, which is converted again in the copy."""
-        return Boxed, (self._kept,)
+        return Boxed, (self.value,)
 
 
 structref.define_proxy(Boxed, _BoxedType, ['value'])

@@ -8,8 +8,10 @@ move the insertion axis under the force, the mean force of the modes and frictio
 Steps end at the borders of tissue layers, and the motion stops at the hub.
 """
 
+from __future__ import annotations
+
 from math import ceil, exp, inf, nan
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
@@ -19,6 +21,9 @@ from needle_dynamics.compiled.matrices import backward, cholesky, forward
 from needle_dynamics.compiled.modal_flow import Elasticity, rotate_many, rotate_two
 from needle_dynamics.compiled.tissue import growth_at, layer_at, Layers, time_to_layer
 import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.boxed import Boxed
 
 #: Relative insertion depth above which graded steps grow in proportion to the depth.
 GRADED_FROM: Final = 0.1
@@ -84,6 +89,23 @@ class Sums(NamedTuple):
     input_work: float
     impact_loss: float  #: energy lost in contacts of the hub [J]
     contact_time: float  #: time of the last hub contact [s]; -1 without contact
+
+
+class Interval(NamedTuple):
+    """Mean values and work over an interval, for sensors that average over the interval."""
+
+    tip_deflection: float  #: mean tip deflection [m]
+    #: Mean forces of the base on the needle along y (positive into the tissue) and z [N], and mean
+    #: moment about x at the base [N m], including the torque; from the momentum balance.
+    axial_force: float
+    lateral_force: float
+    moment: float
+    #: Energy dissipated by friction and tissue damping, and work of force and torque [J].
+    friction_work: float
+    damping_work: float
+    input_work: float
+    impact_loss: float  #: energy dissipated by impacts of the hub [J]
+    contact_time: float  #: time of the last hub contact [s], infinite without contact
 
 
 class _Motion(NamedTuple):
@@ -313,7 +335,22 @@ def _steps(  # noqa: C901
     return _Motion(s, u, acceleration), sums, left
 
 
-@kernel
+@inlined
+def _means(sums: Sums, input_work: float, duration: float, loads: FloatArray) -> Interval:
+    axial, lateral, moment = 0.0, 0.0, 0.0
+    for part in range(loads.shape[0]):
+        axial += loads[part, 0]
+        lateral += loads[part, 1]
+        moment += loads[part, 2]
+    parts = max(1, loads.shape[0])
+    return Interval(
+        sums.tip / duration, axial / parts, lateral / parts, moment / parts, sums.friction_work,
+        sums.damping_work, input_work, sums.impact_loss,
+        sums.contact_time if sums.contact_time >= 0.0 else inf,
+    )  # fmt: skip
+
+
+@compiled
 def advance(
     c: CompiledNeedle,
     state: Vector,
@@ -323,7 +360,7 @@ def advance(
     graded: bool,
     duration: float,
     loads: Matrix,
-) -> tuple[float, Sums]:
+) -> tuple[float, Interval]:
     """
     Advance a state under constant inputs for ``duration`` [s], in place.
 
@@ -334,7 +371,7 @@ def advance(
     along y and z [N] and mean moment about x at the base [N m], by balance of momentum.
 
     Returns the time left undone [s], positive if the insertion depth would leave its range and NaN
-    if the state became non-finite, and the sums over the steps.
+    if the state became non-finite, and the means over the interval; the loads are zero for (0, 3).
     """
     n = c.modes.modes.shape[1]
     # Few arrays: an allocation takes a sixth of the time of a step.
@@ -384,13 +421,25 @@ def advance(
     for i in range(n):
         state[2 + i], state[4 + n + i] = q[i], rates[i]
     input_work = sums.input_work + inputs.torque * turned
-    sums = Sums(
-        sums.tip, sums.reaction, sums.moment, sums.resistance, sums.friction_work,
-        sums.damping_work, input_work, sums.impact_loss, sums.contact_time,
-    )  # fmt: skip
-    size = 0.0
+    size = abs(input_work)
     for value in state:
         size += abs(value)
     for value in sums:
         size += abs(value)
-    return (left if size < inf else nan), sums
+    means = _means(sums, input_work, duration, loads)
+    return (left if size < inf else nan), means
+
+
+@kernel
+def advance_boxed(
+    boxed: Boxed[CompiledNeedle],
+    state: Vector,
+    time: float,
+    inputs: Inputs,
+    longest: float,
+    graded: bool,
+    duration: float,
+    loads: Matrix,
+) -> tuple[float, Interval]:
+    """Call `advance` without a conversion of the constants."""
+    return advance(boxed.value, state, time, inputs, longest, graded, duration, loads)

@@ -10,12 +10,11 @@ Numerical Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly
 problems).
 """
 
-from dataclasses import dataclass, field
 from math import copysign, inf, isfinite, isnan
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.step import advance, Inputs
+from needle_dynamics.compiled.step import advance_boxed, Inputs, Interval
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
@@ -27,25 +26,6 @@ from numpy.typing import ArrayLike
 DEFAULT_STEP: Final = 1e-5
 
 SHORTEST_STEP: Final = 1e-9  #: shortest step [s]; rounding errors dominate far above it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interval:
-    """Mean values and work over an interval, for sensors that average over the interval."""
-
-    tip_deflection: float  #: mean tip deflection [m]
-    #: Mean forces of the base on the needle along y (positive into the tissue) and z [N], and mean
-    #: moment about x at the base [N m], including the torque; from the momentum balance.
-    axial_force: float
-    lateral_force: float
-    moment: float
-    loads: FloatArray = field(compare=False)  #: these loads in each part, shape (parts, 3)
-    #: Energy dissipated by friction and tissue damping, and work of force and torque [J].
-    friction_work: float
-    damping_work: float
-    input_work: float
-    impact_loss: float  #: energy dissipated by impacts of the hub [J]
-    contact_time: float | None  #: time of the last hub contact [s], on the clock of the integrator
 
 
 class Integrator:
@@ -94,6 +74,7 @@ class Integrator:
         self.graded = graded
         self.time = 0.0
         self._state = np.array(state)
+        self._load = np.empty((1, 3))
         self.change(parameters)
 
     def change(self, parameters: NeedleParameters) -> None:
@@ -102,10 +83,13 @@ class Integrator:
 
         If the state is not valid for the new constants, the old constants are kept.
         """
+        from needle_dynamics.compiled.boxed import Boxed
+
         model = NeedleModel(parameters)
         self._state = model.checked_state(self._state)
         self.model = model
-        self._needle = model.compiled
+        self._needle, self._boxed = model.compiled, Boxed(model.compiled)
+        self._middle = model.coordinates
 
     @property
     def state(self) -> FloatArray:
@@ -115,23 +99,30 @@ class Integrator:
     @property
     def depth(self) -> float:
         """Insertion depth s [m]."""
-        return float(self._needle.length - self._state[0])
+        return self._needle.length - float(self._state.item(0))
 
     @property
     def velocity(self) -> float:
         """Insertion velocity s_dot [m/s]."""
-        return float(-self._state[self.model.coordinates])
+        return -float(self._state.item(self._middle))
 
     def advance(
-        self, duration: float, force: float = 0.0, torque: float = 0.0, parts: int = 1
+        self,
+        duration: float,
+        force: float = 0.0,
+        torque: float = 0.0,
+        loads: FloatArray | None = None,
     ) -> Interval:
         """
         Advance for a duration [s] under a constant force f_y [N] and torque tau [N m] at the base.
 
-        Loads are returned for ``parts`` of equal duration, at whose ends steps end.
+        ``loads``, shape (parts, 3), takes the mean forces along y and z [N] and the mean moment
+        about x [N m] of the base in parts of equal duration, at whose ends steps end.
         InsertionDepthError if the depth left its range; the state is then the last valid one.
         """
-        return self._run(duration, Inputs(float(force), float(torque), 0.0, False), parts)
+        if loads is None:
+            loads = self._load
+        return self._run(duration, Inputs(float(force), float(torque), 0.0, False), loads)
 
     def advance_moved(self, duration: float, velocity: float) -> Interval:
         """
@@ -140,7 +131,7 @@ class Integrator:
         The axial force is the force required by the motion, without a limit. At rest, friction
         takes the value within its bounds that minimizes this force.
         """
-        return self._run(duration, Inputs(0.0, 0.0, float(velocity), True), 1)
+        return self._run(duration, Inputs(0.0, 0.0, float(velocity), True), self._load)
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
         """
@@ -165,35 +156,23 @@ class Integrator:
             means = self.advance_moved(duration, copysign(speed_limit, direction))
         return means
 
-    def _run(self, duration: float, inputs: Inputs, parts: int) -> Interval:
+    def _run(self, duration: float, inputs: Inputs, loads: FloatArray) -> Interval:
         if not 0.0 < duration < inf:
             raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
-        for name in ('force', 'torque', 'velocity'):
-            if not isfinite(getattr(inputs, name)):
-                raise ParameterError(f'{name} must be finite, got {getattr(inputs, name)!r}')
+        for name, value in zip(('force', 'torque', 'velocity'), inputs[:3], strict=True):
+            if not isfinite(value):
+                raise ParameterError(f'{name} must be finite, got {value!r}')
         # An integer would cause the step to be compiled for another type.
-        duration, loads = float(duration), np.empty((parts, 3))
-        left, sums = advance(
-            self._needle, self._state, self.time, inputs, self.step, self.graded, duration, loads
+        duration = float(duration)
+        left, means = advance_boxed(
+            self._boxed, self._state, self.time, inputs, self.step, self.graded, duration, loads
         )
         if left != 0.0:
             if left > 0.0:
                 self.time += duration - left
             raise not_completed(self.model, self._state, left)
         self.time += duration
-        axial, lateral, moment = (np.add.reduce(loads) / parts).tolist()
-        return Interval(
-            tip_deflection=sums.tip / duration,
-            axial_force=axial,
-            lateral_force=lateral,
-            moment=moment,
-            loads=loads,
-            friction_work=sums.friction_work,
-            damping_work=sums.damping_work,
-            input_work=sums.input_work,
-            impact_loss=sums.impact_loss,
-            contact_time=sums.contact_time if sums.contact_time >= 0.0 else None,
-        )
+        return means
 
 
 def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:

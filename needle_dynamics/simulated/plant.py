@@ -2,16 +2,16 @@
 """Simulated plant: needle, base and force sensor, advanced one sample at a time."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from statistics import fmean
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.step import Interval
 from needle_dynamics.friction import Friction
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, on_grid, PUSHES
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.integrator import Integrator, Interval
+from needle_dynamics.simulated.integrator import Integrator
 from needle_dynamics.simulated.measured import (
     AT_REST,
     MeasuredShape,
@@ -76,6 +76,7 @@ class Plant(SimulatedPlant):
         self.integrator = integrator
         self.base = base
         self._tip = tip or TipSensor(TipParameters(noise=0.0), rate, 0)
+        self._loads = np.empty((sensor.samples, 3))
         self._wrenches = np.zeros((sensor.samples, 6))
         modes = integrator.model.parameters.modes
         #: Generalized forces on q1..qn, which have no command.
@@ -143,7 +144,7 @@ class Plant(SimulatedPlant):
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:
-            means = needle.advance(interval, force, torque, parts=self._sensor.samples)
+            means = needle.advance(interval, force, torque, self._loads)
         else:
             resolution = base.limits.encoder_resolution
             part, limit = interval / PUSHES, base.limits.speed_limit
@@ -161,23 +162,18 @@ class Plant(SimulatedPlant):
         start = None
         if base is None:
             wrench = self._wrenches
-            wrench[:, 1:4] = means.loads
+            wrench[:, 1:4] = self._loads
         else:
             # Force and velocity that are recorded together must refer to one instant.
             wrench, start = np.zeros((2, 6))
             wrench[1:4] = start[1:4] = axial, means.lateral_force, means.moment
             start[1] -= 2.0 * late
+        state, deflection = needle.state, means.tip_deflection
         depth, velocity = needle.depth, needle.velocity
-        return PlantSample(
-            state=needle.state,
-            depth=depth,
-            velocity=velocity,
-            joint_position=on_grid(depth, resolution),
-            force=axial,
-            wrench=self._sensor.measure(wrench, start=start, moving=abs(velocity) > AT_REST),
-            tip_deflection=means.tip_deflection,
-            tip=self._tip.measure(depth, means.tip_deflection),
-        )
+        reading = self._sensor.measure(wrench, start=start, moving=abs(velocity) > AT_REST)
+        tip = self._tip.measure(depth, deflection)
+        joint = on_grid(depth, resolution)
+        return PlantSample(state, depth, velocity, joint, axial, reading, deflection, tip)
 
 
 def _joined(parts: Sequence[Interval]) -> tuple[Interval, float]:
@@ -185,4 +181,4 @@ def _joined(parts: Sequence[Interval]) -> tuple[Interval, float]:
     rise = (parts[-1].axial_force - parts[0].axial_force) * PUSHES / (PUSHES - 1)
     names = ('tip_deflection', 'axial_force', 'lateral_force', 'moment')
     means: dict[str, Any] = {name: fmean(getattr(part, name) for part in parts) for name in names}
-    return replace(parts[-1], **means), 0.5 * rise
+    return parts[-1]._replace(**means), 0.5 * rise

@@ -80,6 +80,8 @@ class BurstLosses:
 
     def lost(self, interval: float) -> bool:
         """Return whether the sample is lost, an interval [s] after the previous sample."""
+        if not self._fraction:
+            return False
         kept = exp(-interval / self._decay) if self._decay else 0.0
         expected = self._fraction + kept * (self._probability - self._fraction)
         lost = bool(self._random.random() < expected)

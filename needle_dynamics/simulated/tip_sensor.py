@@ -72,6 +72,7 @@ class TipSensor:
             )
         # A message is published with the first plant sample after the delay.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
+        self._shifted = any(parameters.offset)
         self._random = np.random.default_rng([seed, 1])
         self._errors = TipErrors(
             parameters, np.random.default_rng([seed, 4]), np.random.default_rng([seed, 3])
@@ -86,20 +87,28 @@ class TipSensor:
     def measure(self, depth: float, deflection: float, across: float = 0.0) -> TipReading | None:
         """Process depth and mean deflections along z and x [m]; return the reading due now."""
         self._count += 1
-        sums = self._sums
-        sums[0] += across
-        sums[1] += depth
-        sums[2] += deflection
-        if self._count >= round(self._taken * self._every + self._every):
-            number = self._count - round(self._taken * self._every)
-            self._taken += 1
-            x, y, z = (value / number for value in sums)
-            self._sums = [0.0, 0.0, 0.0]
-            self._take(x, y if self._spatial else depth, z, number * self._period)
-        if not self._waiting or self._count - self._waiting[0][0] < self._late:
+        if self._every == 1.0:
+            self._take(across, depth, deflection, self._period)
+        else:
+            self._expose(across, depth, deflection)
+        waiting = self._waiting
+        if not waiting or self._count - waiting[0][0] < self._late:
             return None
-        taken, x, y, z = self._waiting.popleft()
-        return TipReading(age=self._count - taken, depth=y, deflection=z, across=x)
+        taken, x, y, z = waiting.popleft()
+        return TipReading(self._count - taken, y, z, x)
+
+    def _expose(self, x: float, y: float, z: float) -> None:
+        """Add a plant sample to the exposure, and take a sample at the end of the exposure."""
+        sums = self._sums
+        sums[0] += x
+        sums[1] += y
+        sums[2] += z
+        number = self._count - round(self._taken * self._every)
+        if self._count >= round(self._taken * self._every + self._every):
+            self._taken += 1
+            self._sums = [0.0, 0.0, 0.0]
+            mean_depth = sums[1] / number if self._spatial else y
+            self._take(sums[0] / number, mean_depth, sums[2] / number, number * self._period)
 
     def _take(self, x: float, y: float, z: float, interval: float) -> None:
         """Take a sample in the sensor frame an interval after the previous, unless it is lost."""
@@ -107,7 +116,7 @@ class TipSensor:
         if p.turn:
             c, s = cos(p.turn), sin(p.turn)
             x, z = c * x - s * z, s * x + c * z
-        if any(p.offset):
+        if self._shifted:
             x, y, z = x + p.offset[0], y + p.offset[1], z + p.offset[2]
         # A tip outside the slice is not measured; this test is free of errors.
         visible = not p.slice or abs(x) <= p.slice
@@ -116,9 +125,10 @@ class TipSensor:
         else:
             z = self._errors.shifted(x, y, z, interval)[2]
         if p.noise:
-            z += p.noise * float(self._random.standard_normal())
+            draw = self._random.standard_normal
+            z += p.noise * draw()
             if self._spatial:
-                x += p.noise * float(self._random.standard_normal())
-                y += p.noise * float(self._random.standard_normal())
+                x += p.noise * draw()
+                y += p.noise * draw()
         if not self._errors.lost(interval) and visible:
             self._waiting.append((self._count, 0.0 if p.slice else x, y, z))

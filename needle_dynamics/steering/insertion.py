@@ -105,7 +105,7 @@ class Insertion(Displayed):
         if isinstance(step, bool) or not isinstance(step, (int, float)) or not 0.0 < step < inf:
             raise ParameterError(f'step must be positive and finite, got {step!r} s')
         self.needle = SteeredNeedle(needle, steering, seed=seed)
-        self.axis = axis_of(needle, self.needle.steering)
+        self.change(needle)
         self.needle.move(depth=depth)
         self.time = 0.0
         self._step = float(step)
@@ -123,12 +123,12 @@ class Insertion(Displayed):
     @property
     def depth(self) -> float:
         """Depth s of the tip [m]."""
-        return float(self._state[DEPTH] + self._tissue[1])
+        return float(self._state.item(DEPTH) + self._tissue.item(1))
 
     @property
     def velocity(self) -> float:
         """Insertion velocity relative to the guide [m/s]."""
-        return float(self._state[VELOCITY] + self._drift)
+        return float(self._state.item(VELOCITY) + self._drift)
 
     @property
     def punctured(self) -> tuple[bool, ...]:
@@ -137,7 +137,10 @@ class Insertion(Displayed):
 
     def change(self, needle: NeedleParameters) -> None:
         """Change the constants along the axis, such as friction, but not the lateral model."""
+        from needle_dynamics.compiled.boxed import Boxed
+
         self.axis = axis_of(needle, self.needle.steering)
+        self._boxed = Boxed(self.axis)
 
     def push(
         self,
@@ -159,19 +162,20 @@ class Insertion(Displayed):
         InsertionDepthError if the needle left the tissue.
         """
         placement = self._begin(duration, 'force', force, guide, tilt, roll, tissue)
-        state, punctured = self._state.copy(), self._punctured.copy()
-        forces = np.full(1, float(force))
-        left = push(self.axis, state, punctured, forces[0], float(duration), self._step)
-        velocity = float(state[VELOCITY]) + self._drift
+        state, punctured = self._state, self._punctured
+        before = state.copy(), punctured.copy()
+        left = push(self._boxed, state, punctured, float(force), float(duration), self._step)
+        velocity = self.velocity
         if abs(velocity) > speed_limit:
-            state[:], punctured[:] = self._state, self._punctured
-            velocity = copysign(speed_limit, velocity) - self._drift
+            state[:], punctured[:] = before
+            velocity, mean = copysign(speed_limit, velocity), np.empty(1)
             left = carry_on(
-                self.axis, state, punctured, velocity, float(duration), self._step, forces
-            )
-        self._state, self._punctured = state, punctured
+                self._boxed, state, punctured, velocity - self._drift, float(duration),
+                self._step, mean,
+            )  # fmt: skip
+            force = mean.item()
         self._move_needle(duration, left, placement)
-        return float(forces[0])
+        return float(force)
 
     def carry(
         self,
@@ -194,7 +198,7 @@ class Insertion(Displayed):
         placement = self._begin(duration, 'velocity', velocity, guide, tilt, roll, tissue)
         forces = np.empty(1) if forces is None else forces
         left = carry_on(
-            self.axis, self._state, self._punctured, float(velocity) - self._drift,
+            self._boxed, self._state, self._punctured, float(velocity) - self._drift,
             float(duration), self._step, forces,
         )  # fmt: skip
         self._move_needle(duration, left, placement)
@@ -207,7 +211,7 @@ class Insertion(Displayed):
         if not isfinite(value):
             raise ParameterError(f'{name} must be finite, got {value!r}')
         placement = self.needle.checked(*pose)
-        drift = float(placement.tissue[1] - self._tissue[1]) / duration
+        drift = (placement.tissue.item(1) - self._tissue.item(1)) / duration
         self._state[VELOCITY] += self._drift - drift
         self._drift = drift
         return placement
@@ -236,7 +240,7 @@ class Insertion(Displayed):
         the mean position of the friction of its inserted part.
         """
         across = self.needle
-        (force_x, force_z), (moment_x, moment_z) = across.guide_load
+        (force_x, force_z), (moment_x, moment_z) = across.guide_load.tolist()
         shaft = across.needle.length - 0.5 * across.depth
         twist = (across.roll - across.tip_roll) * across.steering.torsional_stiffness / shaft
         # A slope in z turns about x; a slope in x turns about z in the opposite direction.

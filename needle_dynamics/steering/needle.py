@@ -272,7 +272,7 @@ class SteeredNeedle(Displayed):
     @property
     def depth(self) -> float:
         """Depth s of the tip [m]."""
-        return float(self._cut.pose[DEPTH] + self._placement.tissue[1])
+        return float(self._cut.pose.item(DEPTH) + self._placement.tissue.item(1))
 
     @property
     def deepest(self) -> float:

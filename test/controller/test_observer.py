@@ -25,9 +25,9 @@ from needle_dynamics import (
     ShapeError,
 )
 from needle_dynamics.analysis import observability
+from needle_dynamics.compiled.step import Interval
 from needle_dynamics.linearization import linearize, operating_point
 from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
-from needle_dynamics.simulated.integrator import Interval
 from needle_dynamics.simulated.plant import Plant, PlantSample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 import numpy as np

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from math import inf, isfinite
 from typing import Any
 
 from needle_dynamics import (
@@ -49,7 +50,6 @@ def test_contact_of_a_straight_needle_matches_the_closed_form() -> None:
     total = it.advance(0.02, PUSH)
     force = PUSH - 0.56
     # Sums over a thousand steps.
-    assert total.contact_time is not None
     assert_allclose(total.contact_time, np.sqrt(2.0 * p.moving_mass * 0.05 / force), rtol=1e-10)
     assert_allclose(total.impact_loss, force * 0.05, rtol=1e-10)
     assert it.depth == LENGTH
@@ -90,7 +90,6 @@ def test_contact_time_converges_to_an_ode_solver(formulation: str, law: str) -> 
     times, losses = [], []
     for step in (4e-5, 2e-5, 1e-5, 5e-6):
         total = Integrator(p, start, step).advance(0.04, PUSH)
-        assert total.contact_time is not None
         times.append(abs(total.contact_time - exact))
         losses.append(abs(total.impact_loss / energy - 1.0))
     # Where the modes do not act on the axis and its flow is exact, the step makes no error.
@@ -117,7 +116,7 @@ def test_impact_loss_closes_the_energy_balance(moved: bool, name: str) -> None:
         before = it.model.energy(it.state)
         total = it.advance_moved(0.04, 0.5) if moved else it.advance(0.2, 20.0)
         assert it.depth == LENGTH
-        assert total.contact_time is not None
+        assert isfinite(total.contact_time)
         assert total.impact_loss > 1e-6
         change = it.model.energy(it.state) - before
         spent = total.friction_work + total.damping_work + total.impact_loss
@@ -129,23 +128,23 @@ def test_impact_loss_closes_the_energy_balance(moved: bool, name: str) -> None:
 
 
 def test_contact_time_is_on_the_clock_of_the_integrator() -> None:
-    """Each interval reports its own contact, or None."""
+    """Each interval reports its own contact, infinite without one."""
     p = preset('paper_si', viscous_friction=0.0)
     whole = Integrator(p, moving(p, 0.15, 0.0, 0.0)).advance(0.02, PUSH).contact_time
     it = Integrator(p, moving(p, 0.15, 0.0, 0.0))
     seen = [it.advance(1e-3, PUSH) for _ in range(20)]
-    times = [part.contact_time for part in seen if part.contact_time is not None]
+    times = [part.contact_time for part in seen if isfinite(part.contact_time)]
     # No further contact while the needle is held on the hub.
     assert len(times) == 1
     assert times[0] == pytest.approx(whole, rel=1e-9)
     assert [part.impact_loss > 0.0 for part in seen] == [
-        part.contact_time is not None for part in seen
+        isfinite(part.contact_time) for part in seen
     ]
     # Withdrawn and pushed in again: another contact.
     it.advance(2e-3, -PUSH)
-    assert it.advance(1e-3, -PUSH).contact_time is None
+    assert it.advance(1e-3, -PUSH).contact_time == inf
     again = [it.advance(1e-3, PUSH) for _ in range(20)]
-    later = [part.contact_time for part in again if part.contact_time is not None]
+    later = [part.contact_time for part in again if isfinite(part.contact_time)]
     assert len(later) == 1
     assert later[0] > 0.023
 
