@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from needle_controller.steering.law import SteeringFaultError as SteeringFaultError
     from needle_controller.steering.law import SteeringLaw as SteeringLaw
     from needle_controller.steering.law import TipEstimate as TipEstimate
+    from needle_controller.steering.laws.guide_law import GuideLaw as GuideLaw
     from needle_controller.steering.laws.multi_hypothesis import (
         MultiHypothesisLaw as MultiHypothesisLaw,
     )

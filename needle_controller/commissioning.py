@@ -261,7 +261,8 @@ class Commissioning:
             if pull < _WEAKER * friction:
                 raise JobError(
                     f'the needle moves at {pull:.3g} N, the nominal friction is {friction:.3g} N: '
-                    'unit of the driver, hardware.scale, hardware.command or model.*'
+                    'unit of the driver, hardware.scale, hardware.command or model.*, or the '
+                    'needle is not in the tissue'
                 )
             first, end, fastest = 0.1 * grown, time, abs(velocity)
             while abs(velocity) > 0.5 * fastest and time < end + _SETTLING:

@@ -7,7 +7,7 @@ from html import escape
 import re
 from typing import Any, Final, TYPE_CHECKING
 
-from needle_ros.errors import ParameterError
+from needle_ros.errors import missing_extra
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,9 +62,7 @@ class Displayed:
         try:
             from pandas import DataFrame
         except ModuleNotFoundError as error:
-            raise ParameterError(
-                f"to_dataframe needs {error.name}: pip install 'needle_insertion[pandas]'"
-            ) from error
+            raise missing_extra(error, 'to_dataframe', 'pandas') from error
         return DataFrame(self.columns())
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:

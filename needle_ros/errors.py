@@ -45,6 +45,14 @@ def printable(line: str) -> str:
     return shown(f'{line[: _LONGEST - 4]} ...' if len(line) > _LONGEST else line)
 
 
+def missing_extra(error: ModuleNotFoundError, what: str, extra: str) -> ParameterError:
+    """Return the error of a missing module, with the extra of this package that installs it."""
+    return ParameterError(
+        f"{what} needs {error.name}: pip install 'needle_insertion[{extra}]', or in a clone "
+        f"pip install -e '.[{extra}]'"
+    )
+
+
 def missing_ros(error: ModuleNotFoundError, program: str) -> str:
     """Return how to install the missing module of ROS 2; raise the error of any other module."""
     module = str(error.name).partition('.')[0]

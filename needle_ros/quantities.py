@@ -2,7 +2,7 @@
 """Quantities with units as text, such as ``4mm``, ``3N`` and ``20 s``, and targets of the tip."""
 
 from collections.abc import Mapping
-from math import isfinite
+from math import isfinite, pi
 import re
 from typing import Final
 
@@ -16,6 +16,13 @@ _KINDS: Final[Mapping[str, tuple[str, str, Mapping[str, float]]]] = {
     's': ('time', '20 or 20s', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'min': 60.0}),
     'N': ('force', '3 or 3N', {'N': 1.0, 'mN': 1e-3}),
     'm/s': ('velocity', '0.005 or 5mm/s', {f'{name}/s': _LENGTHS[name] for name in _LENGTHS}),
+    'rad': ('angle', '0.1 or 5deg', {'rad': 1.0, 'deg': pi / 180.0}),
+    'm^2': ('area', '1e-6 or 1mm^2', {'m^2': 1.0, 'mm^2': 1e-6}),
+    'm^4': ('area moment', '1e-13 or 0.1mm^4', {'m^4': 1.0, 'mm^4': 1e-12}),
+    'kg': ('mass', '0.1 or 100g', {'kg': 1.0, 'g': 1e-3}),
+    'kg/m^3': ('density', '8000 or 8g/cm^3', {'kg/m^3': 1.0, 'g/cm^3': 1e3}),
+    'Pa': ('pressure', '2e11 or 200GPa', {'Pa': 1.0, 'kPa': 1e3, 'MPa': 1e6, 'GPa': 1e9}),
+    'N/m^2': ('stiffness', '3e4 or 30kPa', {'N/m^2': 1.0, 'Pa': 1.0, 'kPa': 1e3, 'MPa': 1e6}),
 }
 
 #: Example of a quantity by SI unit, as the word for its value in a help text.
@@ -23,6 +30,11 @@ EXAMPLES: Final = {unit: example.split()[-1] for unit, (_, example, _) in _KINDS
 
 #: Help text of a target.
 TARGET_HELP: Final = 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm; m without a unit'
+
+
+def accepted_units(unit: str) -> str:
+    """Return the units of text for a quantity in an SI unit, separated by commas."""
+    return ', '.join(_KINDS[unit][2] if unit in _KINDS else [unit])
 
 
 def quantity(text: str, unit: str) -> float:

@@ -8,10 +8,12 @@ from dataclasses import field, fields
 from difflib import get_close_matches
 from importlib import import_module
 from math import inf, isfinite
+from pathlib import Path
+import sys
 from typing import Any, Final, TypeVar
 
 from needle_ros.errors import ParameterError
-from needle_ros.quantities import quantity
+from needle_ros.quantities import accepted_units, quantity
 
 _Settings = TypeVar('_Settings')
 
@@ -98,6 +100,8 @@ def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
     """
     Return a class from its address ``module:Class``, or from a name of `known` with its address.
 
+    The module may be a file of the current folder.
+
     Raises `ParameterError` for an unknown name and for a failed import; ``what`` is its subject.
     """
     valid = f'{what} must be one of {", ".join(known)}, or module:Class'
@@ -105,6 +109,9 @@ def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
     module, _, of_class = address.partition(':')
     if not module or not of_class:
         raise ParameterError(f'{valid}, got {name!r}')
+    if name not in known and (folder := str(Path.cwd())) not in sys.path:
+        # Last: a file of the user hides no installed module.
+        sys.path.append(folder)
     try:
         return getattr(import_module(module), of_class)
     # The module is any code of the user.
@@ -120,7 +127,9 @@ def check_choice(name: str, value: object, valid: Collection[str]) -> None:
 
 def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParameterError(f'{name} must be a number, got {value!r}')
+        text = isinstance(value, str) and meta.get('unit', '1') != '1'
+        units = f', or text with a unit of {accepted_units(meta["unit"])}' if text else ''
+        raise ParameterError(f'{name} must be a number{units}, got {value!r}')
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
     too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
@@ -185,7 +194,8 @@ def _as_number(value: Any, unit: str) -> Any:
     """Convert integers and text with a unit to float, also in a tuple; keep other values."""
     if isinstance(value, tuple):
         return tuple(_as_number(number, unit) for number in value)
-    if isinstance(value, str) and value[-1:].isalpha():
+    # Also 1e-3, which PyYAML reads as text.
+    if isinstance(value, str) and any(map(str.isalpha, value)):
         with suppress(ParameterError):
             return quantity(value, unit)
     is_integer = isinstance(value, int) and not isinstance(value, bool)

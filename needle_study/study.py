@@ -118,6 +118,18 @@ class StudyTable(Displayed):
     study: Study
     values: Mapping[str, FloatArray]  #: by name, each of shape (n,); 1 for yes, NaN if missing
 
+    def __repr__(self) -> str:
+        parts = [f'{len(self.values["sample"])} samples']
+        for name, one in self.study.scenario.metrics.items():
+            if (known := self.values[name][np.isfinite(self.values[name])]).size:
+                share = f'{100.0 * known.mean():.3g} %'
+                parts.append(
+                    f'median {name} {np.median(known):.4g} {one.unit}'
+                    if one.unit
+                    else f'{name} {share}'
+                )
+        return f'<StudyTable: {", ".join(parts[:3])}>'
+
     def columns(self) -> dict[str, FloatArray]:
         scenario = self.study.scenario
         units = {name: one.unit for name, one in scenario.variables.items()}

@@ -31,6 +31,9 @@ class TopicTable(Displayed):
         except KeyError:
             raise KeyError(f'{name!r}; valid: {", ".join(self.values)}') from None
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
     def __repr__(self) -> str:
         time = self.values['time [s]']
         return f'<TopicTable {self.topic}: {len(time)} messages in {time[-1] - time[0]:.4g} s>'

@@ -64,7 +64,7 @@ _USUAL: Final = {
     'time': TIME_NAMES,
     'depth': ('depth', 'insertion', 'position', 'pos', 'q', 'qm', 'x', 'displacement', 'joint'),
     'speed': ('speed', 'velocity', 'vel', 'v', 'qd', 'dq', 'qdot'),
-    'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce'),
+    'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce', 'faxial'),
 }
 
 #: Exceptions of SciPy for damaged bytes.
@@ -74,7 +74,8 @@ _MATLAB_HEAD: Final = 128  # length of the header of a MATLAB file [bytes]
 _COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
-_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}  # ranges that are rarely in SI units
+#: Probable unit, and the range, or for time the median step, above which it is rarely in SI units.
+_SUSPICIOUS: Final = {'time': ('ms', 0.99), 'depth': ('mm', 2.0), 'speed': ('mm/s', 2.0)}
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
@@ -165,6 +166,9 @@ def guessed(
             if alike:
                 found[role] = alike[0]
                 break
+    by_unit = [name for name in plain if unit_of(name, 'force')]
+    if 'force' in usual_names and len(by_unit) == 1:
+        found.setdefault('force', by_unit[0])
     pairs = [
         (sec, nanosec)
         for sec in plain
@@ -195,11 +199,13 @@ def unit_of(name: str, role: str) -> str | None:
 
 
 def with_unit(role: str, name: str, values: FloatArray) -> str:
-    """Return a column with mm or mm/s if its name states no unit and its values are large in m."""
+    """Return a column with the probable unit if its name states none and its values are large."""
     finite = values[np.isfinite(values)]
-    if unit_of(name, role) is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, inf):
-        return f'{name}[mm{"/s" if role == "speed" else ""}]'
-    return name
+    unit, largest = _SUSPICIOUS.get(role, ('', inf))
+    if unit_of(name, role) is not None or len(finite) < 2:
+        return name
+    size = np.median(np.diff(finite)) if role == 'time' else np.ptp(finite)
+    return f'{name}[{unit}]' if size > largest else name
 
 
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
@@ -230,10 +236,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
         scale *= _factor(table, role, spec, factor)
     found = scale * column
     if unit is None and (other := with_unit(role, name, found)) != name:
-        losses.append(
-            f'{name} has no unit and spans {np.ptp(found[np.isfinite(found)]):.3g}, taken in SI '
-            f'units: perhaps {role}={other}'
-        )
+        losses.append(f'{name} has no unit, taken in SI units: perhaps {role}={other}')
     return np.asarray(found)
 
 
@@ -442,17 +445,19 @@ def _matlab(path: Path) -> Table:
         for name, _ in wanted
         if name in content and not np.iscomplexobj(content[name])
     }
-    lengths = [a.shape[0] for a in arrays.values() if a.ndim in (1, 2)]
-    longest = max(set(lengths), key=lengths.count, default=0)
+    sizes = [size for a in arrays.values() if a.ndim in (1, 2) for size in {*a.shape}]
+    # The longest of the most frequent sizes: a matrix may have a row for each coordinate.
+    longest = max(set(sizes), key=lambda size: (sizes.count(size), size), default=0)
     columns: dict[str, FloatArray] = {}
     for name, values in arrays.items():
         if values.ndim == 1 and len(values) == longest:
             columns[shown(name)] = values
-        elif values.ndim == 2 and values.shape[0] == longest:
-            columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(values.T)}
+        elif values.ndim == 2 and longest in values.shape:
+            by_column = values.T if values.shape[0] == longest else values
+            columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(by_column)}
     scalars = {shown(name): float(values) for name, values in arrays.items() if values.ndim == 0}
     left = sorted(
-        set(arrays) - set(scalars) - {n for n in arrays if arrays[n].shape[:1] == (longest,)}
+        set(arrays) - set(scalars) - {name for name, a in arrays.items() if longest in a.shape}
     )
     losses = [f'{", ".join(map(shown, left))} of another length, left out'] if left else []
     return Table(path, columns, scalars, losses)

@@ -24,13 +24,13 @@ import numpy as np
 #: Roles of the columns; without a roll column the roll is zero.
 STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
 
-#: Usual column names by role, in lower case without separators.
+#: Usual column names by role, in lower case without separators; numbers are columns of a matrix.
 USUAL: Final = {
-    'depth': ('depth', 'insertion', 'insertiondepth', 'guidey', 'basey'),
-    'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
-    'guide_z': ('guidez', 'basez', 'zguide', 'zbase'),
-    'tip_x': ('tipx', 'xtip'),
-    'tip_z': ('tipz', 'ztip'),
+    'depth': ('depth', 'insertion', 'insertiondepth', 'guidey', 'basey', 'guide2', 'base2'),
+    'guide_x': ('guidex', 'basex', 'xguide', 'xbase', 'guide1', 'base1'),
+    'guide_z': ('guidez', 'basez', 'zguide', 'zbase', 'guide3', 'base3'),
+    'tip_x': ('tipx', 'xtip', 'tip1'),
+    'tip_z': ('tipz', 'ztip', 'tip3'),
     'roll': ('roll', 'rotation', 'theta'),
 }
 
@@ -40,7 +40,7 @@ _LATERAL: Final = 0.1  # largest lateral motion [m]
 _FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
 _ALONG: Final = 0.5  # least motion of the tip along the needle over the insertion
-_TIP_ALONG: Final = {'along': ('tipy', 'ytip')}  # position along the needle
+_TIP_ALONG: Final = {'along': ('tipy', 'ytip', 'tip2')}  # position along the needle
 _MOVED: Final = ('depth', 'guide_x', 'guide_z')
 _COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)  # ``x`` of ``Base x``
 
@@ -84,7 +84,9 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
     """Return the unit of each role, '' if unknown or in SI units."""
     stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
     moved = {role: _measured(table.columns[name]) for role, name in specs.items()}
-    bodies = {role: re.sub(r'^[xyz]|[xyz]$', '', plain_name(name)) for role, name in specs.items()}
+    bodies = {
+        role: re.sub(r'^[xyz]|[xyz123]$', '', plain_name(name)) for role, name in specs.items()
+    }
     span = float(np.ptp(moved['depth']))
     deep = stated['depth'] or ('' if span <= _LARGE else 'mm' if span >= _SMALL else None)
     found = {'depth': deep or ''}

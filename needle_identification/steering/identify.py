@@ -47,6 +47,8 @@ _AS_GOOD: Final = 0.02  # relative difference of residuals below which fits are 
 _WORSE: Final = 1.5  # smallest ratio of held-out errors and residuals that is reported
 _LENGTHS: Final = 2  # number of nonlinear constants of a medium
 _LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and predictions
+#: Path noise that is reported [rad^2/m]: the path turns by 2 degrees in 0.1 m.
+_WANDERS: Final = 0.01
 _ROTATED: Final = 0.06  # rotation between frames that is reported [rad]
 _LARGEST: Final = 0.5  # largest error of a drift constant that is determined [rad or 1/m]
 
@@ -285,6 +287,12 @@ def _warnings(
             yield (
                 f'{name}: a recording is predicted from the others with an error of '
                 f'{1e3 * one.held_out.rms:.3f} mm, the residuals have {1e3 * one.rms:.3f} mm'
+            )
+        if one.path_noise > _WANDERS:
+            yield (
+                f'{name}: this needle explains little of the motion of the tip: a path noise of '
+                f'{one.path_noise:.2g} rad^2/m is beyond that of tissue; check columns, units and '
+                'directions'
             )
         for constant in one.parameters:
             if constant.name.startswith('frame') and abs(constant.value) > _ROTATED:

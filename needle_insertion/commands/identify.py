@@ -298,7 +298,7 @@ def completed(words: Sequence[str]) -> list[str]:
         except (NeedleError, OSError) as error:
             reasons.append(str(error))
             continue
-        if found.command and not found.lacking:
+        if found.command and ('--columns' in words or not found.lacking):
             break
         reasons.append(f'{found.path}: {found.lacking or "; ".join(found.words)}')
     else:

@@ -14,7 +14,7 @@ from typing import Any, Final
 from needle_insertion.commands.common import check_folder, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.text import table
-from needle_ros.errors import JobError, ParameterError
+from needle_ros.errors import JobError, missing_extra, ParameterError
 from needle_ros.process_pool import processes
 
 _PATIENCE: Final = 10  #: timeout for the answer of a scheduler, and for its first worker [s]
@@ -46,9 +46,7 @@ def run(options: argparse.Namespace) -> int:
         from needle_insertion.report.study_page import write_study
         from needle_study import engine
     except ModuleNotFoundError as error:
-        raise ParameterError(
-            f"needle study needs {error.name}: pip install 'needle_insertion[study]'"
-        ) from error
+        raise missing_extra(error, 'needle study', 'study') from error
     from needle_study.study import read_study
 
     study = read_study(options.study)
@@ -104,9 +102,7 @@ def _executor(
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        raise ParameterError(
-            "--scheduler needs Dask: pip install 'needle_insertion[dask]'"
-        ) from error
+        raise missing_extra(error, '--scheduler', 'dask') from error
     try:
         client: Any = Client(scheduler, timeout=_PATIENCE)
     except (OSError, ValueError, TimeoutError) as error:

@@ -17,7 +17,7 @@ from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
-from needle_insertion.live.terminal import Terminal
+from needle_insertion.live.terminal import START_GRACE, Terminal
 from needle_ros import contract
 from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
@@ -123,7 +123,13 @@ def _bring_up(
     # The node `steering` reads the topic of the contract.
     others = own + ('steering' in session.nodes and state != contract.JOINT_STATES.name)
 
+    told, quiet = set[str](), monotonic() + START_GRACE
+
     def listen() -> bool:
+        for name, latest in operator.states.items() if monotonic() > quiet else ():
+            if latest.level and latest.message not in told:
+                told.add(latest.message)
+                screen.say(f'{name}: {latest.message}')
         # This process subscribes, too.
         subscribed = node.count_subscribers(state) >= len(processes) + 1 + holds - others
         aimed = node.count_subscribers(contract.TARGET.name) >= len(processes) - own

@@ -75,6 +75,9 @@ WORDS: Final = {
 }
 
 
+START_GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
+
+
 class Terminal(Cmd):
     """Execute commands, one line after another; the commands spin the graph."""
 
@@ -90,8 +93,8 @@ class Terminal(Cmd):
         self._printed: dict[tuple[str, str], float] = {}
         #: Phase of the check of a robot that was printed last.
         self._checked: CommissioningPhase | None = None
-        #: Whether all nodes have begun.
-        self._begun = False
+        #: Until then warnings are not printed: during the start the nodes wait for each other.
+        self._quiet = monotonic() + START_GRACE
         #: Whether the latest motion is a steered insertion.
         self._steers = False
 
@@ -104,7 +107,7 @@ class Terminal(Cmd):
                 accepted = partial(self._has_accepted, name, topic)
                 self._spin_until(accepted, f'{topic}, an input of {name}', _ANSWER)
                 self._spin_until(self._readings.insertion, 'a measurement', _ANSWER)
-        self._begun = True
+        self._quiet = 0.0
 
     def _has_accepted(self, node: str, topic: str) -> bool:
         status = self._state(node).status
@@ -172,8 +175,7 @@ class Terminal(Cmd):
 
     def _print_warnings(self) -> None:
         """Print new warnings and errors of the nodes; raise `GraphError` without a recording."""
-        if not self._begun:
-            # During the start the nodes wait for each other.
+        if monotonic() < self._quiet:
             return
         for name, state in self._operator.states.items():
             status = state.status

@@ -109,6 +109,7 @@ def identify_all(
     with ProgressLine('identification', brief=True) as show:
         for number, bag in enumerate(bags, 1):
             show(f'recording {number} of {len(bags)}')
+            recording = None
             try:
                 recording = read(bag)
                 if recording.digest in known:
@@ -117,7 +118,9 @@ def identify_all(
                 known[recording.digest] = recording.name
                 estimates.append(identify(recording))
             except (NeedleError, OSError) as error:
-                failures.append((str(bag), str(error)))
+                # What was corrected or assumed may be the cause.
+                assumed = () if recording is None else recording.losses
+                failures.append((str(bag), '; '.join([str(error), *assumed])))
                 continue
             sources.append(
                 RecordingSource(

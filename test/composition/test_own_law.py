@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+import sys
 from typing import Any
 
 from needle_controller import build_law, GuideSetpoint, SteeringLimits, SteeringModel
@@ -68,6 +69,21 @@ def test_own_law_steers_in_the_command(capsys: pytest.CaptureFixture[str]) -> No
     found = json.loads(capsys.readouterr().out)
     assert found['miss [m]'] < 5e-4 < 5e-3 < found['miss open loop [m]']
     assert found['expected tip [m]'] is None
+
+
+def test_law_of_the_current_folder_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'law_of_this_folder.py').write_text(
+        'from needle_controller import GuideLaw\n\n\n'
+        'class Gain(GuideLaw):\n'
+        '    def choose(self, tip, at):\n'
+        '        return 0.5 * (tip - self.target)\n'
+    )
+    monkeypatch.setattr('sys.path', [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    assert main(['steer', '--json', '--law', 'law_of_this_folder:Gain']) == 0
+    assert json.loads(capsys.readouterr().out)['miss [m]'] > 0.0
 
 
 def test_own_law_steers_in_a_study() -> None:

@@ -41,7 +41,7 @@ ANSWERS = {
     'simulate --depth 5': '--depth must be <= length = 0.2 m, got 5 m: lengths without a unit',
     'simulate --force 3kg': 'is not a force, such as 3 or 3N',
     'simulate --duration 1s': 'try --needle phantom',
-    'simulate --needle phantom --set length=150N': "length must be a number, got '150N'",
+    'simulate --needle phantom --set length=150N': "with a unit of m, cm, mm, um, got '150N'",
     'simulate --needle phantom --depth 500mm': 'outside [0.001, 0.2] m',
     'simulate --frce 3N': 'did you mean --force?',
     'analyze --depth -10mm': 'outside [0.001, 0.2] m',

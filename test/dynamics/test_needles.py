@@ -66,8 +66,8 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ('needle: [1]\nlength: 1\n', 'must have constants by name'),
         ('1: 2\n', "mine.yaml: unknown parameter '1'"),
         ('lenght: 1\n', "mine.yaml: unknown parameter 'lenght'; did you mean 'length'"),
-        ('length: long\n', "mine.yaml: length must be a number, got 'long'"),
-        ('length: 3N\n', "mine.yaml: length must be a number, got '3N'"),
+        ('length: long\n', "with a unit of m, cm, mm, um, got 'long'"),
+        ('length: 3N\n', 'mine.yaml: length must be a number, or text with a unit of m'),
         ('a: [', 'mine.yaml cannot be read: is not YAML'),
     ],
 )

@@ -13,6 +13,7 @@ from needle_identification.errors import RecordingError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.io import savemat
 
 
 def written(path: Path, names: str, columns: FloatArray) -> Path:
@@ -52,6 +53,35 @@ def test_each_body_has_its_own_unit(tmp_path: Path, layout: str) -> None:
     assert_allclose(found.depth, depth, atol=1e-12)
     assert_allclose(found.guide, guide, atol=1e-12)
     assert_allclose(found.tip, tip, atol=1e-12)
+
+
+def test_matrices_of_matlab_have_a_row_for_each_coordinate(tmp_path: Path) -> None:
+    """Position of the guide and pose of the tip as matrices of either direction."""
+    rng = np.random.default_rng(6)
+    depth = np.linspace(0.0, 0.1, 21)
+    guide, tip = 4e-3 * rng.normal(size=(2, 21, 2))
+    base = 1e3 * np.column_stack([guide[:, 0], -depth, guide[:, 1]])
+    pose = np.column_stack([tip[:, 0], 0.01 - depth, tip[:, 1], np.ones(21), np.zeros((21, 3))])
+    pose[:, :3] *= 1e3
+    for turned in (False, True):
+        path = tmp_path / f'run_{turned}.mat'
+        whole = {'base': base.T if turned else base, 'tip': pose.T if turned else pose}
+        savemat(path, {**whole, 't': np.arange(21.0), 'target': np.ones((3, 1))})
+        found = read_steering_recording(path)
+        assert_allclose(found.depth, depth, atol=1e-12)
+        assert_allclose(found.guide, guide, atol=1e-12)
+        assert_allclose(found.tip, tip, atol=1e-12)
+        assert any('target of another length, left out' in line for line in found.losses)
+
+
+def test_rows_before_the_skin_are_left_out(tmp_path: Path) -> None:
+    """A robot may move back before it inserts the needle."""
+    depth = np.array([0.0, -2.0, -5.0, -2.0, 0.0, *np.linspace(5.0, 100.0, 20)])
+    rows = np.column_stack([depth, *np.full((3, len(depth)), 3.0), np.arange(len(depth))])
+    names = 'depth_mm,guide_x_mm,guide_z_mm,tip_x_mm,tip_z_mm'
+    found = read_steering_recording(written(tmp_path / 'run.csv', names, rows))
+    assert_allclose(found.depth, 1e-3 * depth[depth >= 0.0], atol=1e-12)
+    assert '3 rows out of the skin, left out' in found.losses
 
 
 def test_a_depth_in_mm_or_cm_needs_its_unit(tmp_path: Path) -> None:

@@ -10,7 +10,12 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_identification import identify_friction, read_friction_recording, RecordingError
+from needle_identification import (
+    identify_friction,
+    inspect_recording,
+    read_friction_recording,
+    RecordingError,
+)
 from needle_identification.recordings import tables
 from needle_identification.recordings.tables import column_roles, guessed, read_table
 import numpy as np
@@ -107,6 +112,19 @@ def test_matlab_files_have_columns_and_factors(run: tuple[Any, Any, Any], tmp_pa
     read = read_friction_recording(tmp_path / 'run.mat', columns={'force': 'current*k'})
     assert_allclose(read.force, force, rtol=1e-12)
     assert_allclose(read.depth, depth)
+
+
+def test_probable_units_and_forces_are_found(run: tuple[Any, Any, Any], tmp_path: Path) -> None:
+    """Times in ms, a depth in mm, and the only column in N under a name of its own."""
+    time, depth, force = run
+    path = tmp_path / 'run.csv'
+    rows = np.column_stack([1e3 * time, 1e3 * depth, force])
+    np.savetxt(path, rows, delimiter=',', header='time,depth,Push [N]', comments='')
+    read = read_friction_recording(path)
+    assert_allclose(read.force, force)
+    for hint in ('perhaps time=time[ms]', 'perhaps depth=depth[mm]'):
+        assert any(hint in line for line in read.losses), read.losses
+    assert 'time=time[ms],depth=depth[mm],force=Push [N]' in inspect_recording(path).command
 
 
 def test_velocities_without_depth_are_integrated(tmp_path: Path) -> None:

@@ -254,6 +254,29 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     assert 'no measurements' not in said
 
 
+def test_wrong_topic_of_a_robot_is_reported_during_the_start(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """The session waits for the robot, and prints what the controller misses."""
+    drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
+    remaps = ['--ros-args', '-r', 'joint_states:=stage/states']
+    ros_graph.add(drivers['PositionRobot'], cli_args=remaps)
+    given = {'state_topic': 'stage/other', 'joint': 'stage', 'commissioning.enabled': 'false'}
+    words = [f'-pcontroller.hardware.{name}={value}' for name, value in given.items()]
+    words.append('-pcontroller.deflection_feedback=none')
+    line, environment = command(ros_graph, tmp_path / 'run', '--hardware', *words)
+    expected = 'sensor_msgs/msg/JointState is published on /stage/states (hardware.state_topic)'
+    output = tmp_path / 'output'
+    with output.open('w') as file:
+        session = subprocess.Popen(line, env=environment, stdout=file, stderr=file)
+    begin = time.monotonic()
+    while expected not in output.read_text() and time.monotonic() - begin < _LONGEST:
+        ros_graph.executor.spin_once(timeout_sec=0.05)
+    session.send_signal(signal.SIGINT)
+    session.wait(60.0)
+    assert expected in output.read_text()
+
+
 def test_second_plant_is_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Before any motion."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, pi
 
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import EXAMPLES, quantities, quantity, target
@@ -38,6 +38,13 @@ def test_examples_are_quantities() -> None:
         's': 20.0,
         'N': 3.0,
         'm/s': 0.005,
+        'rad': pytest.approx(pi / 36.0, rel=1e-15),
+        'm^2': 1e-6,
+        'm^4': 0.1e-12,
+        'kg': 0.1,
+        'kg/m^3': 8000.0,
+        'Pa': 200e9,
+        'N/m^2': 30e3,
     }
 
 
@@ -48,7 +55,7 @@ def test_examples_are_quantities() -> None:
         ('mm', 'm', "'mm' is not a length, such as 0.05 or 50mm"),
         ('3 kg', 'N', "'3 kg' is not a force, such as 3 or 3N"),
         ('4mm 5mm', 'm', "'4mm 5mm' is not a length, such as 0.05 or 50mm"),
-        ('x', 'rad', "'x' is not a quantity, such as 1.5 or 1.5rad"),
+        ('x', '1/s', "'x' is not a quantity, such as 1.5 or 1.51/s"),
     ],
 )
 def test_error_names_the_text_and_an_example(text: str, unit: str, message: str) -> None:

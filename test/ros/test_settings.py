@@ -105,7 +105,7 @@ def test_none_is_an_empty_tuple() -> None:
         ({'gain': 10**400}, 'arm.gain must be finite, got an integer of too many digits'),
         ({'offset': -2}, 'arm.offset must be finite, >= -1, got -2.0'),
         ({'levels': [1.0, float('nan')]}, 'arm.levels must be finite, >= 0 N, got nan'),
-        ({'levels': ['a']}, "arm.levels must be a number, got 'a'"),
+        ({'levels': ['a']}, "arm.levels must be a number, or text with a unit of N, mN, got 'a'"),
         ({'gains': 1.0}, "unknown parameter 'arm.gains'; did you mean 'arm.gain'?"),
         (
             {'xyzzy': 1.0},
@@ -139,5 +139,9 @@ def test_message_about_several_fields_names_their_group() -> None:
 def test_units_in_text_and_single_numbers_are_accepted() -> None:
     assert from_values(Robot, {'levels': '3N'}).levels == (3.0,)
     assert from_values(Robot, {'levels': ['30mN', 2]}).levels == (0.03, 2.0)
-    with pytest.raises(ParameterError, match=r"^levels must be a number, got '3mm'$"):
+    # PyYAML reads a number without a point as text.
+    assert from_values(Robot, {'levels': ['1e-3']}).levels == (1e-3,)
+    with pytest.raises(
+        ParameterError, match=r"^levels must be .* text with a unit of N, mN, got '3mm'$"
+    ):
         from_values(Robot, {'levels': '3mm'})

@@ -43,6 +43,7 @@ class GuideLaw(ABC):
         """Compute constants before the first step; the default computes nothing."""
 
     def aim(self, target: ArrayLike) -> None:
+        """Set the target, x and z of the tip at the last depth [m]."""
         self.target = checked_target(target)
 
     def update(
