@@ -19,14 +19,15 @@ class PlantCommanders:
         node: BaseNode,
         on_wrench: Callable[[Reading], None],
         on_joints: Callable[[Reading], None],
-        on_change: Callable[[int], None],
+        on_change: Callable[[int | None], None],
     ) -> None:
         self._node = node
-        self._leases = Publishers(node, contract.COMMANDER, lambda: on_change(0))
+        self._leases = Publishers(node, contract.COMMANDER, lambda: on_change(None))
         self._wrenches = node.listen(contract.WRENCH_COMMAND, on_wrench, on_change)
         self._joints = node.listen(contract.JOINT_COMMANDS, on_joints, on_change)
         #: Number of publishers matched by DDS, including stale entries, and time of change [ns].
         self._matched, self._matched_at = 0, 0
+        self._announced = 0  #: Number of publishers that were counted before the event of a match.
         #: On a steady clock.
         self.rate = RateCounter()
 
@@ -39,13 +40,19 @@ class PlantCommanders:
         """Whether publishers appeared or disappeared since the last `update`."""
         return sum(self._count_matched()) != self._matched
 
-    def update(self, new: int) -> bool:
-        """Update the publishers; return whether there may have been several, if only briefly."""
+    def update(self, new: int | None) -> bool:
+        """
+        Update the publishers; return whether there may have been several, if only briefly.
+
+        ``new`` is the number of new ones of an event, which may be late; None without an event.
+        """
         before, matched = self._matched, sum(self._count_matched())
         if matched != before:
             self._matched, self._matched_at = matched, monotonic_ns()
+        announced = self._announced + max(0, matched - before)
+        self._announced = announced if new is None else 0
         several = max(before, matched) > 1
-        return bool((several and matched != before) or (before and new))
+        return bool((several and matched != before) or (before and (new or 0) > announced))
 
     def count(self) -> int:
         """Return the number of live publishers."""

@@ -385,7 +385,7 @@ class PlantNode(ModelNode):
             self._samples.repeat()
         self.report_change()
 
-    def _check_commanders(self, new: int = 0) -> None:
+    def _check_commanders(self, new: int | None = None) -> None:
         """Count the command publishers; no force acts while there are several."""
         if self._run is None:
             return

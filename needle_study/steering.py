@@ -54,7 +54,7 @@ _ERRORS: Final = {
 
 METRICS: Final[Mapping[str, Metric]] = {
     'miss': Metric('m', 'distance of the tip from the target at the end'),
-    'hit': Metric('', 'the tip ends within `hit_radius` of the target'),
+    'hit': Metric('', 'the tip ends within the hit radius of the target'),
     'tip_x': Metric('m', 'final tip position, in the frame of the sensor'),
     'tip_z': Metric('m', 'final tip position, in the frame of the sensor'),
     'guide_travel': Metric('m', 'distance traveled by the guide'),

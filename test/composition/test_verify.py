@@ -809,7 +809,7 @@ def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('rate', 'x', "rate must be a number, got 'x'"),
+        ('rate', 'x', "rate must be a number, or text with a unit of Hz, got 'x'"),
         ('rate', 0, 'rate must be finite, >= 1 and <= 8000 Hz, got 0.0'),
         ('rate', float('nan'), 'rate must be finite, >= 1 and <= 8000 Hz, got nan'),
         ('seed', -1, 'seed must be an integer from 0 to 2^62, got -1'),

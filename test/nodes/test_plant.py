@@ -279,7 +279,7 @@ def test_invalid_parameters_end_the_process(
     ('parameters', 'complaint'),
     [
         ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
-        ({'model.length': 'long'}, "model.length must be a number, got 'long'"),
+        ({'model.length': 'long'}, 'model.length must be a number, or text with a unit of m'),
         ({'sensor.filter': 7}, 'sensor.filter must be an integer from 0 (none) to 6, got 7'),
         (
             {'sensor.rate': 1500.0},
@@ -766,6 +766,22 @@ def test_controller_friction_may_change_if_gains_stay_stable(ros_graph: RosGraph
     assert node.get_parameter('model.viscous_friction').value == 200.0
 
 
+def test_publisher_is_counted_once_before_and_at_its_event(ros_graph: RosGraph) -> None:
+    """A timer may count a publisher of commands before the event of its match is executed."""
+    plant = ros_graph.add(PlantNode, parameters={'paused': True})
+    ros_graph.node('commander').create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    deadline = time.monotonic() + 60.0
+    while not plant._commanders.changed and time.monotonic() < deadline:
+        time.sleep(0.01)
+    now = plant._time.simulated(plant.now())
+    plant._check_commanders()
+    plant._check_commanders(1)
+    assert plant._run.commands.may_move(now)
+    # Another one, which has disappeared since.
+    plant._check_commanders(1)
+    assert not plant._run.commands.may_move(now)
+
+
 @pytest.mark.parametrize(
     ('kind', 'name', 'value', 'reason'),
     [
@@ -779,7 +795,7 @@ def test_controller_friction_may_change_if_gains_stay_stable(ros_graph: RosGraph
             PlantNode,
             'model.coulomb_friction',
             'much',
-            "model.coulomb_friction must be a number, got 'much'",
+            "model.coulomb_friction must be a number, or text with a unit of N, mN, got 'much'",
         ),
         (
             PlantNode,
