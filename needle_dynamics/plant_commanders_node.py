@@ -44,7 +44,8 @@ class PlantCommanders:
         """
         Update the publishers; return whether there may have been several, if only briefly.
 
-        ``new`` is the number of new ones of an event, which may be late; None without an event.
+        ``new`` is the number of new ones of an event, which may be late; None without an event. An
+        event ends the count before it: a doubt means several.
         """
         before, matched = self._matched, sum(self._count_matched())
         if matched != before:

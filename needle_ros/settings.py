@@ -3,7 +3,6 @@
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import field, fields
 from difflib import get_close_matches
 from importlib import import_module
@@ -109,10 +108,10 @@ def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
     module, _, of_class = address.partition(':')
     if not module or not of_class:
         raise ParameterError(f'{valid}, got {name!r}')
-    if name not in known and (folder := str(Path.cwd())) not in sys.path:
-        # Last: a file of the user hides no installed module.
-        sys.path.append(folder)
     try:
+        if name not in known and (folder := str(Path.cwd())) not in sys.path:
+            # Last: a file of the user hides no installed module.
+            sys.path.append(folder)
         return getattr(import_module(module), of_class)
     # The module is any code of the user.
     except Exception as error:
@@ -127,9 +126,7 @@ def check_choice(name: str, value: object, valid: Collection[str]) -> None:
 
 def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        text = isinstance(value, str) and meta.get('unit', '1') != '1'
-        units = f', or text with a unit of {accepted_units(meta["unit"])}' if text else ''
-        raise ParameterError(f'{name} must be a number{units}, got {value!r}')
+        raise ParameterError(f'{name} must be a number, got {value!r}')
     if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
     too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
@@ -177,7 +174,7 @@ def from_values(
         several = isinstance(item.default, tuple)
         taken = tuple(value or ()) if several and isinstance(value, _LISTS) else value
         if 'unit' in item.metadata:
-            taken = _as_number(taken, item.metadata['unit'])
+            taken = _as_number(f'{prefix}{name}', taken, item.metadata['unit'])
             only_tuple = several and 'float |' not in str(item.type)
             taken = (taken,) if only_tuple and isinstance(taken, float) else taken
         given[name] = taken
@@ -190,14 +187,17 @@ def from_values(
         raise ParameterError(f'{begin}{error}') from error
 
 
-def _as_number(value: Any, unit: str) -> Any:
+def _as_number(name: str, value: Any, unit: str) -> Any:
     """Convert integers and text with a unit to float, also in a tuple; keep other values."""
     if isinstance(value, tuple):
-        return tuple(_as_number(number, unit) for number in value)
+        return tuple(_as_number(name, number, unit) for number in value)
     # Also 1e-3, which PyYAML reads as text.
     if isinstance(value, str) and any(map(str.isalpha, value)):
-        with suppress(ParameterError):
+        try:
             return quantity(value, unit)
+        except ParameterError as error:
+            units = f', or text with a unit of {accepted_units(unit)}' if unit != '1' else ''
+            raise ParameterError(f'{name} must be a number{units}, got {value!r}') from error
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 

@@ -120,15 +120,11 @@ class StudyTable(Displayed):
 
     def __repr__(self) -> str:
         parts = [f'{len(self.values["sample"])} samples']
-        for name, one in self.study.scenario.metrics.items():
-            if (known := self.values[name][np.isfinite(self.values[name])]).size:
-                share = f'{100.0 * known.mean():.3g} %'
-                parts.append(
-                    f'median {name} {np.median(known):.4g} {one.unit}'
-                    if one.unit
-                    else f'{name} {share}'
-                )
-        return f'<StudyTable: {", ".join(parts[:3])}>'
+        for name, one in list(self.study.scenario.metrics.items())[:2]:
+            known = self.values[name][np.isfinite(self.values[name])]
+            median = f'median {name} {np.median(known):.4g} {one.unit}'.removesuffix(' 1')
+            parts += [median if one.unit else f'{name} {known.mean():.1%}'] * bool(len(known))
+        return f'<StudyTable: {", ".join(parts)}>'
 
     def columns(self) -> dict[str, FloatArray]:
         scenario = self.study.scenario

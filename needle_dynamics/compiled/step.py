@@ -371,7 +371,8 @@ def advance(
     along y and z [N] and mean moment about x at the base [N m], by balance of momentum.
 
     Returns the time left undone [s], positive if the insertion depth would leave its range and NaN
-    if the state became non-finite, and the means over the interval; the loads are zero for (0, 3).
+    if the state became non-finite, and the means over the interval: undefined with time left, and
+    zero loads for (0, 3).
     """
     n = c.modes.modes.shape[1]
     # Few arrays: an allocation takes a sixth of the time of a step.

@@ -18,7 +18,7 @@ from needle_dynamics.compiled.step import advance_boxed, Inputs, Interval
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
-from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.errors import NeedleError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -122,6 +122,13 @@ class Integrator:
         """
         if loads is None:
             loads = self._load
+        elif loads.shape[1:] != (3,) or not (
+            loads.size and loads.flags.carray and loads.dtype == np.float64
+        ):
+            raise ShapeError(
+                'loads must be writable, contiguous, of shape (parts, 3), got '
+                f'{loads.shape}, {loads.dtype}'
+            )
         return self._run(duration, Inputs(float(force), float(torque), 0.0, False), loads)
 
     def advance_moved(self, duration: float, velocity: float) -> Interval:

@@ -107,7 +107,8 @@ class TipErrors:
     """
     Errors of a tip sensor in time and space, independent of its white noise.
 
-    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each.
+    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each
+    with a dropout.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
-from math import inf, pi
+from math import pi
 import os
 from pathlib import Path
 import re
@@ -75,7 +75,12 @@ _COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
 #: Probable unit, and the range, or for time the median step, above which it is rarely in SI units.
-_SUSPICIOUS: Final = {'time': ('ms', 0.99), 'depth': ('mm', 2.0), 'speed': ('mm/s', 2.0)}
+_SUSPICIOUS: Final = {
+    'time': (('ms', 0.99), ('us', 990.0), ('ns', 9.9e5)),
+    'depth': (('mm', 2.0),),
+    'speed': (('mm/s', 2.0),),
+}
+_SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
@@ -201,11 +206,11 @@ def unit_of(name: str, role: str) -> str | None:
 def with_unit(role: str, name: str, values: FloatArray) -> str:
     """Return a column with the probable unit if its name states none and its values are large."""
     finite = values[np.isfinite(values)]
-    unit, largest = _SUSPICIOUS.get(role, ('', inf))
-    if unit_of(name, role) is not None or len(finite) < 2:
+    if unit_of(name, role) is not None or len(finite) < 2 or plain_name(name) in _SECONDS:
         return name
     size = np.median(np.diff(finite)) if role == 'time' else np.ptp(finite)
-    return f'{name}[{unit}]' if size > largest else name
+    probable = [f'{name}[{unit}]' for unit, least in _SUSPICIOUS.get(role, ()) if size > least]
+    return probable[-1] if probable else name
 
 
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
@@ -445,19 +450,18 @@ def _matlab(path: Path) -> Table:
         for name, _ in wanted
         if name in content and not np.iscomplexobj(content[name])
     }
-    sizes = [size for a in arrays.values() if a.ndim in (1, 2) for size in {*a.shape}]
-    # The longest of the most frequent sizes: a matrix may have a row for each coordinate.
-    longest = max(set(sizes), key=lambda size: (sizes.count(size), size), default=0)
+    # A matrix may have a row for each coordinate.
+    sizes = [max(a.shape) for a in arrays.values() if a.ndim in (1, 2)]
+    longest = max(set(sizes), key=sizes.count, default=0)
+    used = {n for n, a in arrays.items() if a.ndim in (1, 2) and max(a.shape) == longest}
     columns: dict[str, FloatArray] = {}
     for name, values in arrays.items():
-        if values.ndim == 1 and len(values) == longest:
+        if name in used and values.ndim == 1:
             columns[shown(name)] = values
-        elif values.ndim == 2 and longest in values.shape:
+        elif name in used:
             by_column = values.T if values.shape[0] == longest else values
             columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(by_column)}
     scalars = {shown(name): float(values) for name, values in arrays.items() if values.ndim == 0}
-    left = sorted(
-        set(arrays) - set(scalars) - {name for name, a in arrays.items() if longest in a.shape}
-    )
+    left = sorted(set(arrays) - set(scalars) - used)
     losses = [f'{", ".join(map(shown, left))} of another length, left out'] if left else []
     return Table(path, columns, scalars, losses)

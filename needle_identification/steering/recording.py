@@ -132,11 +132,12 @@ def recorded_insertion(
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')
         depth = depth - depth[0]
-    if depth.min() < -_JITTER and depth.max() > -depth.min():
-        inside = depth >= -_JITTER
-        losses.append(f'{np.count_nonzero(~inside)} rows out of the skin, left out')
-        values = {role: column[inside] for role, column in values.items()}
-        depth = depth[inside]
+    outside = np.flatnonzero(depth[: np.argmax(depth)] < -_JITTER)
+    if len(outside) and depth.min() >= -_AT_THE_SKIN:
+        first = int(outside[-1]) + 1
+        losses.append(f'{first} rows before the needle enters the skin, left out')
+        values = {role: column[first:] for role, column in values.items()}
+        depth = depth[first:]
     if depth.min() < -_JITTER:
         raise RecordingError(
             f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '

@@ -27,6 +27,7 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings.tables import column_roles, ROLES
+from needle_identification.steering.columns import STEERING_ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
 from needle_insertion.commands.identify_steering import (
@@ -290,6 +291,8 @@ def completed(words: Sequence[str]) -> list[str]:
     if first in KINDS or first.startswith('-') or not _is_recording(first):
         return list(words)
     given = list(takewhile(lambda word: not word.startswith('-'), words))
+    #: Columns of the user, in place of those that are found.
+    own = [word for word in words if word.startswith('--columns')]
     reasons = []
     for name in given:
         try:
@@ -298,13 +301,16 @@ def completed(words: Sequence[str]) -> list[str]:
         except (NeedleError, OSError) as error:
             reasons.append(str(error))
             continue
-        if found.command and ('--columns' in words or not found.lacking):
+        if found.command and (own or not found.lacking):
             break
         reasons.append(f'{found.path}: {found.lacking or "; ".join(found.words)}')
     else:
         # The reason of the first recording: the others are probably alike.
         raise IdentificationError(reasons[0])
     kind, _, *options = shlex.split(found.command)[2:]
+    if own:
+        steered = any(f'{role}=' in word for word in words for role in STEERING_ROLES[1:])
+        kind, options = 'steering' if steered else kind, []
     chosen = [kind, *given, *options, *words[len(given) :]]
     # Values with a minus sign are quoted where the terminal needs it.
     sys.stderr.write(shown(f'chosen: {shlex.join(["needle", "identify", *chosen])}') + '\n')

@@ -84,13 +84,13 @@ def add_steering(what: Any) -> None:
     fitting.add_argument(
         '--terms',
         metavar='TERM,...',
-        help=f'causes of drift, from {", ".join(TERMS)} (default: the cause with the best fit)',
+        help=f'causes of drift, from {", ".join(TERMS)} (default: the most likely cause)',
     )
     fitting.add_argument(
         '--order',
         choices=ORDERS,
         help='order of motion between samples: guide and needle together, or the guide first '
-        '(default: the order with the best fit)',
+        '(default: the most likely order)',
     )
     fitting.add_argument(
         '--free-length', help='known free length (default: fitted)', **with_unit('m')

@@ -17,7 +17,7 @@ from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
-from needle_insertion.live.terminal import START_GRACE, Terminal
+from needle_insertion.live.terminal import Terminal, Warnings
 from needle_ros import contract
 from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
@@ -81,8 +81,11 @@ def run(session: Session) -> int:
         witness = (
             Witness(node, lambda sample: sample.time < WARM_UP, lockstep=True) if holds else None
         )
-        processes, readings = _bring_up(session, graph, node, operator, screen, holds=holds)
-        terminal = Terminal(graph, operator, readings, screen)
+        warnings = Warnings(screen.say)
+        processes, readings = _bring_up(
+            session, graph, node, operator, screen, warnings, holds=holds
+        )
+        terminal = Terminal(graph, operator, readings, screen, warnings)
         terminal.begin(session.nodes)
         screen.say(f'on domain {graph.domain}; `help` lists the words')
         # Suspended, the session could not stop the needle.
@@ -104,7 +107,14 @@ def run(session: Session) -> int:
 
 
 def _bring_up(
-    session: Session, graph: Graph, node: Node, operator: Operator, screen: Screen, *, holds: bool
+    session: Session,
+    graph: Graph,
+    node: Node,
+    operator: Operator,
+    screen: Screen,
+    warnings: Warnings,
+    *,
+    holds: bool,
 ) -> tuple[list[NodeProcess], Readings]:
     """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
     begin = monotonic()
@@ -123,13 +133,8 @@ def _bring_up(
     # The node `steering` reads the topic of the contract.
     others = own + ('steering' in session.nodes and state != contract.JOINT_STATES.name)
 
-    told, quiet = set[str](), monotonic() + START_GRACE
-
     def listen() -> bool:
-        for name, latest in operator.states.items() if monotonic() > quiet else ():
-            if latest.level and latest.message not in told:
-                told.add(latest.message)
-                screen.say(f'{name}: {latest.message}')
+        warnings.show(operator.states)
         # This process subscribes, too.
         subscribed = node.count_subscribers(state) >= len(processes) + 1 + holds - others
         aimed = node.count_subscribers(contract.TARGET.name) >= len(processes) - own

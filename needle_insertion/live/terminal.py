@@ -2,7 +2,7 @@
 """Execute the commands of `needle run`, typed by a person or read from a script."""
 
 from cmd import Cmd
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from math import inf
@@ -75,26 +75,51 @@ WORDS: Final = {
 }
 
 
-START_GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
+_GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
+
+
+class Warnings:
+    """Print new warnings and errors of nodes; at first they wait for each other."""
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say, self.quiet = say, monotonic() + _GRACE
+        #: Latest message of each node without its numbers, and when it was printed.
+        self._last: dict[str, str] = {}
+        self._printed: dict[tuple[str, str], float] = {}
+
+    def show(self, states: Mapping[str, State]) -> None:
+        now = monotonic()
+        for name, state in states.items() if now >= self.quiet else ():
+            level, message = state.level, state.message
+            if state.age > _SILENT:
+                level, message = _ERROR, f'no status for {_SILENT:g} s'
+            # A changed number is not a new warning.
+            kind = re.sub(r'\d+', '', message)
+            again = level >= _ERROR or now - self._printed.get((name, kind), -inf) > _AGAIN
+            if level and kind != self._last.get(name) and again:
+                self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
+                self._printed[name, kind] = now
+            self._last[name] = kind
 
 
 class Terminal(Cmd):
     """Execute commands, one line after another; the commands spin the graph."""
 
     def __init__(
-        self, graph: Graph, operator: Operator, readings: Readings, screen: Screen
+        self,
+        graph: Graph,
+        operator: Operator,
+        readings: Readings,
+        screen: Screen,
+        warnings: Warnings,
     ) -> None:
         super().__init__()
+        self._warnings = warnings
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
-        #: Latest message of each node without its numbers, and when it was printed.
-        self._last: dict[str, str] = {}
-        self._printed: dict[tuple[str, str], float] = {}
         #: Phase of the check of a robot that was printed last.
         self._checked: CommissioningPhase | None = None
-        #: Until then warnings are not printed: during the start the nodes wait for each other.
-        self._quiet = monotonic() + START_GRACE
         #: Whether the latest motion is a steered insertion.
         self._steers = False
 
@@ -107,7 +132,7 @@ class Terminal(Cmd):
                 accepted = partial(self._has_accepted, name, topic)
                 self._spin_until(accepted, f'{topic}, an input of {name}', _ANSWER)
                 self._spin_until(self._readings.insertion, 'a measurement', _ANSWER)
-        self._quiet = 0.0
+        self._warnings.quiet = 0.0
 
     def _has_accepted(self, node: str, topic: str) -> bool:
         status = self._state(node).status
@@ -175,8 +200,7 @@ class Terminal(Cmd):
 
     def _print_warnings(self) -> None:
         """Print new warnings and errors of the nodes; raise `GraphError` without a recording."""
-        if monotonic() < self._quiet:
-            return
+        self._warnings.show(self._operator.states)
         for name, state in self._operator.states.items():
             status = state.status
             if isinstance(status, RecorderStatus) and status.failure:
@@ -185,16 +209,6 @@ class Terminal(Cmd):
                 self._checked = status.commissioning
                 phase = self._checked.value if self._checked else ''
                 self._say(f'{name}: first motion {phase} {status.commissioning_result}'.rstrip())
-            level, message, now = state.level, state.message, monotonic()
-            if state.age > _SILENT:
-                level, message = _ERROR, f'no status for {_SILENT:g} s'
-            # A changed number is not a new warning.
-            kind = re.sub(r'\d+', '', message)
-            again = level >= _ERROR or now - self._printed.get((name, kind), -inf) > _AGAIN
-            if level and kind != self._last.get(name) and again:
-                self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
-                self._printed[name, kind] = now
-            self._last[name] = kind
 
     def do_target(self, words: list[str]) -> None:
         aims = self._operator.aims

@@ -88,7 +88,9 @@ def test_samples_are_independent_of_chunks(design: str) -> None:
 
 def test_progress_does_not_change_the_samples() -> None:
     study, calls = build_study({**SMALL, 'samples': 60}), list[None]()
-    found = study.simulate(progress=lambda: calls.append(None)).values
+    table = study.simulate(progress=lambda: calls.append(None))
+    found = table.values
+    assert re.match(r'<StudyTable: 60 samples, median miss \S+ m, hit \S+%>', repr(table))
     # At most 50 parts.
     assert len(calls) == 50
     whole = study.rows(0, 60)

@@ -719,6 +719,18 @@ def test_base_loads_of_parts_equal_loads_of_single_intervals(
     assert_allclose([total.contact_time], last or [inf], rtol=1e-9)
 
 
+@pytest.mark.parametrize(
+    'loads',
+    [np.empty((5, 2)), np.empty((0, 3)), np.empty(3), np.empty((3, 5)).T, np.empty((5, 3), 'f4')],
+    ids=['columns', 'no rows', 'vector', 'order', 'type'],
+)
+def test_array_of_loads_is_checked(loads: FloatArray) -> None:
+    it = needle()
+    with pytest.raises(ShapeError, match=r'^loads must be writable, contiguous, of shape'):
+        it.advance(1e-3, PUSH, loads=loads)
+    assert it.time == 0.0
+
+
 @pytest.mark.parametrize('damping', [0.0, 16.0])
 @pytest.mark.parametrize('moved', [False, True])
 def test_means_agree_with_fine_samples_of_the_motion(moved: bool, damping: float) -> None:

@@ -66,12 +66,12 @@ def test_matrices_of_matlab_have_a_row_for_each_coordinate(tmp_path: Path) -> No
     for turned in (False, True):
         path = tmp_path / f'run_{turned}.mat'
         whole = {'base': base.T if turned else base, 'tip': pose.T if turned else pose}
-        savemat(path, {**whole, 't': np.arange(21.0), 'target': np.ones((3, 1))})
+        savemat(path, {**whole, 'target': np.ones((3, 1)), 'frames': np.ones((4, 4, 21))})
         found = read_steering_recording(path)
         assert_allclose(found.depth, depth, atol=1e-12)
         assert_allclose(found.guide, guide, atol=1e-12)
         assert_allclose(found.tip, tip, atol=1e-12)
-        assert any('target of another length, left out' in line for line in found.losses)
+        assert any('frames, target of another length' in line for line in found.losses)
 
 
 def test_rows_before_the_skin_are_left_out(tmp_path: Path) -> None:
@@ -80,8 +80,12 @@ def test_rows_before_the_skin_are_left_out(tmp_path: Path) -> None:
     rows = np.column_stack([depth, *np.full((3, len(depth)), 3.0), np.arange(len(depth))])
     names = 'depth_mm,guide_x_mm,guide_z_mm,tip_x_mm,tip_z_mm'
     found = read_steering_recording(written(tmp_path / 'run.csv', names, rows))
-    assert_allclose(found.depth, 1e-3 * depth[depth >= 0.0], atol=1e-12)
-    assert '3 rows out of the skin, left out' in found.losses
+    assert_allclose(found.depth, 1e-3 * depth[4:], atol=1e-12)
+    assert '4 rows before the needle enters the skin, left out' in found.losses
+    # Too far for a motion at the skin.
+    rows[:5, 0] *= 10.0
+    with pytest.raises(RecordingError, match='out of the skin'):
+        read_steering_recording(written(tmp_path / 'wrong.csv', names, rows))
 
 
 def test_a_depth_in_mm_or_cm_needs_its_unit(tmp_path: Path) -> None:

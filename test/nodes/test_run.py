@@ -268,12 +268,17 @@ def test_wrong_topic_of_a_robot_is_reported_during_the_start(
     expected = 'sensor_msgs/msg/JointState is published on /stage/states (hardware.state_topic)'
     output = tmp_path / 'output'
     with output.open('w') as file:
-        session = subprocess.Popen(line, env=environment, stdout=file, stderr=file)
+        session = subprocess.Popen(
+            line, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file
+        )
     begin = time.monotonic()
-    while expected not in output.read_text() and time.monotonic() - begin < _LONGEST:
-        ros_graph.executor.spin_once(timeout_sec=0.05)
-    session.send_signal(signal.SIGINT)
-    session.wait(60.0)
+    try:
+        while expected not in output.read_text() and time.monotonic() - begin < _LONGEST:
+            ros_graph.executor.spin_once(timeout_sec=0.05)
+        session.send_signal(signal.SIGINT)
+        session.wait(60.0)
+    finally:
+        session.kill()
     assert expected in output.read_text()
 
 
