@@ -362,9 +362,6 @@ class PlantNode(ModelNode):
         if self._run is None:
             return
         due = self._time.due(self.now())
-        if due == 1:
-            self._sample(self._time.take())
-            return
         self._late += max(0, due - 1)
         end = monotonic_ns() + 0.25 * self._run.constants.own.backlog * NANOSECONDS
         for _ in range(due):

@@ -770,6 +770,7 @@ def test_publisher_is_counted_once_before_and_at_its_event(ros_graph: RosGraph) 
     """A timer may count a publisher of commands before the event of its match is executed."""
     plant = ros_graph.add(PlantNode, parameters={'paused': True})
     ros_graph.node('commander').create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    # Without spinning: the event of the match stays queued.
     deadline = time.monotonic() + 60.0
     while not plant._commanders.changed and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -33,6 +33,7 @@ def test_quantity_is_read_with_or_without_unit(text: str, unit: str, value: floa
 
 
 def test_examples_are_quantities() -> None:
+    # 5 degrees: up to the rounding of the factor.
     assert {unit: quantity(text, unit) for unit, text in EXAMPLES.items()} == {
         'm': 0.05,
         's': 20.0,
