@@ -80,8 +80,6 @@ class BurstLosses:
 
     def lost(self, interval: float) -> bool:
         """Return whether the sample is lost, an interval [s] after the previous sample."""
-        if not self._fraction:
-            return False
         kept = exp(-interval / self._decay) if self._decay else 0.0
         expected = self._fraction + kept * (self._probability - self._fraction)
         lost = bool(self._random.random() < expected)
@@ -107,8 +105,7 @@ class TipErrors:
     """
     Errors of a tip sensor in time and space, independent of its white noise.
 
-    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each
-    with a dropout.
+    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each.
     """
 
     def __init__(
