@@ -9,6 +9,7 @@ from typing import Final
 
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
+from needle_controller import SteeringModel
 from needle_dynamics import FloatArray, insert_batch, NeedleParameters, NEEDLES, SteeredNeedle
 import numpy as np
 from scipy.linalg import solveh_banded
@@ -135,6 +136,15 @@ def compare(tick: Tick) -> Answer:
     short = least_times(
         {'alone': ours, 'by hand': theirs, 'solution': lambda: solved.guide_load}, _ROUNDS
     )
+    tick('plans')
+    grids = [np.linspace(0.0, _DEPTH, steps + 1) for steps in (100, 200)]
+    plans = least_times(
+        {
+            '100': lambda: SteeringModel(needle, steering, grids[0]),
+            '200': lambda: SteeringModel(needle, steering, grids[1]),
+        },
+        _ROUNDS,
+    )
     tick('batches')
     long = least_times(
         {
@@ -145,12 +155,15 @@ def compare(tick: Tick) -> Answer:
     )
     each = long['one'] / _BATCH
     faster, cores = short['by hand'] / each, long['one'] / long['two']
+    grows = plans['200'] / plans['100']
     off = abs(ours()[0, -1, 2] - theirs())
     rows = [
         ('an insertion, alone', f'{1e6 * short["alone"]:.0f} us'),
         ('an insertion in a batch, one core', f'{1e6 * each:.0f} us'),
         ('the same with NumPy and SciPy', f'{1e3 * short["by hand"]:.1f} ms'),
         ('solution at 40 elements', f'{1e6 * short["solution"]:.1f} us'),
+        ('a plan of 200 steps', f'{1e3 * plans["200"]:.0f} ms'),
+        ('a plan of 200 steps over one of 100', f'{grows:.1f} times'),
         ('two cores over one', f'{cores:.2f} times'),
         ('difference of the tips', f'{1e6 * off:.2f} um'),
     ]
@@ -165,6 +178,8 @@ def compare(tick: Tick) -> Answer:
         Bar('an insertion in a batch, one core', 1e3 * each, 0.5, 'ms'),
         Bar('solution at 40 elements', 1e6 * short['solution'], 10.0, 'us'),
         Bar('NumPy and SciPy over it', faster, 300.0, 'times', at_least=True),
+        # The result has four times the entries; eight times is the cube of the steps.
+        Bar('a plan of 200 steps over one of 100', grows, 5.0, 'times'),
         Bar('two cores over one', cores, 1.8, 'times', at_least=True),
     ]
     return [section], bars
