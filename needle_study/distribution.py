@@ -2,12 +2,15 @@
 """Distributions of one variable, as defined in a study file."""
 
 from collections.abc import Callable, Mapping, Sequence
+from csv import DictReader
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
+from needle_ros.settings import find_class
 import numpy as np
 from scipy import stats
 
@@ -60,16 +63,19 @@ _LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
 _WEIGHTS: Final = 'weights'
+_ROWS, _OF = 'rows', 'of'
+TABLE: Final = 'table'  #: of a study file; the study has the rows of its column
 
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
     """Distribution of one variable."""
 
-    kind: str  #: one of `KINDS`, or ``choice``
+    kind: str  #: one of `KINDS`, ``choice``, or the address of a class with ``ppf`` and ``cdf``
     numbers: tuple[float, ...]  #: parameters of the kind, or values to choose from
     within: tuple[float, float] = (-np.inf, np.inf)  #: ends of a truncated distribution
     weights: tuple[float, ...] = ()  #: relative probabilities of the values; empty: equal ones
+    rows: str = ''  #: name of a table; all variables of a table have values of the same row
 
     def quantiles(self, parts: FloatArray) -> FloatArray:
         """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""
@@ -96,8 +102,19 @@ class Distribution:
 
 @lru_cache(maxsize=256)
 def _frozen(kind: str, numbers: tuple[float, ...]) -> Any:
-    """Return the distribution of SciPy, which takes 0.5 ms to construct."""
-    return KINDS[kind].frozen(*numbers)
+    """Return the distribution of SciPy, which takes 0.5 ms to construct, or of the user."""
+    if kind in KINDS:
+        return KINDS[kind].frozen(*numbers)
+    of_class = find_class('a distribution', kind, {})
+    try:
+        found = of_class(*numbers)
+        found.cdf(found.ppf(0.5))
+    # Any code of the user.
+    except Exception as error:
+        raise ParameterError(
+            f'{kind} with {list(numbers)} must have ppf and cdf: {error}'
+        ) from error
+    return found
 
 
 def distribution(name: str, given: Any) -> Distribution:
@@ -106,28 +123,21 @@ def distribution(name: str, given: Any) -> Distribution:
         return Distribution(_CHOICE, (float(given),))
     if not isinstance(given, Mapping):
         raise ParameterError(f'{name} must be a number or one of {_kinds()}, got {given!r}')
-    kinds = [kind for kind in given if kind not in (_WITHIN, _WEIGHTS)]
-    if len(kinds) != 1 or kinds[0] not in (*KINDS, _CHOICE):
+    kinds = [str(kind) for kind in given if kind not in (_WITHIN, _WEIGHTS, _OF)]
+    if len(kinds) != 1 or not (kinds[0] in (*KINDS, _CHOICE, _ROWS) or ':' in kinds[0]):
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
     numbers = _numbers(f'{name}: {kind}', given[kind])
-    if kind == _CHOICE:
-        weights = _numbers(f'{name}: {_WEIGHTS}', given.get(_WEIGHTS, ()))
-        if not numbers or _WITHIN in given:
-            raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
-        if len(weights) not in (0, len(numbers)) or min(weights, default=1.0) <= 0.0:
-            raise ParameterError(
-                f'{name}: {_WEIGHTS} must have a positive number for each value, got {weights}'
-            )
-        return Distribution(kind, numbers, weights=weights)
-    if _WEIGHTS in given:
-        raise ParameterError(f'{name}: only a {_CHOICE} has {_WEIGHTS}')
-    row = KINDS[kind]
-    if len(numbers) != len(row.parameters):
-        takes = ', '.join(row.parameters)
-        raise ParameterError(f'{name}: {kind} takes [{takes}], got {list(numbers)}')
-    if not row.valid(*numbers):
-        raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
+    if kind in (_CHOICE, _ROWS):
+        return _choice(name, kind, numbers, given)
+    if _WEIGHTS in given or _OF in given:
+        raise ParameterError(f'{name}: only a {_CHOICE} has {_WEIGHTS}, and only {_ROWS} {_OF}')
+    if (row := KINDS.get(kind)) is not None:
+        if len(numbers) != len(row.parameters):
+            takes = ', '.join(row.parameters)
+            raise ParameterError(f'{name}: {kind} takes [{takes}], got {list(numbers)}')
+        if not row.valid(*numbers):
+            raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
     if _WITHIN not in given:
         return Distribution(kind, numbers)
     ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN])
@@ -140,9 +150,47 @@ def distribution(name: str, given: Any) -> Distribution:
     return Distribution(kind, numbers, ends)
 
 
+def _choice(
+    name: str, kind: str, numbers: tuple[float, ...], given: Mapping[str, Any]
+) -> Distribution:
+    """Parse values to choose from, or the rows of a table."""
+    weights = _numbers(f'{name}: {_WEIGHTS}', given.get(_WEIGHTS, ()))
+    if not numbers or _WITHIN in given:
+        raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
+    if len(weights) not in (0, len(numbers)) or min(weights, default=1.0) <= 0.0:
+        raise ParameterError(
+            f'{name}: {_WEIGHTS} must have a positive number for each value, got {weights}'
+        )
+    if (kind == _ROWS) != (_OF in given) or (kind == _ROWS and weights):
+        raise ParameterError(f'{name}: {_ROWS} must have {_OF}, a name, and no {_WEIGHTS}')
+    return Distribution(_CHOICE, numbers, weights=weights, rows=str(given.get(_OF, '')))
+
+
 def _kinds() -> str:
     kinds = [f'{{{kind}: [{", ".join(row.parameters)}]}}' for kind, row in KINDS.items()]
-    return ', '.join([*kinds, f'{{{_CHOICE}: [values], {_WEIGHTS}: [numbers]}}'])
+    others = f'{{{_CHOICE}: [values], {_WEIGHTS}: [numbers]}}', f'{{{TABLE}: [file, column]}}'
+    return ', '.join([*kinds, *others, '{module:Class: [numbers]}'])
+
+
+def from_table(name: str, given: Any, folder: Path) -> Any:
+    """Return a distribution of a file with the rows of its table, if it names one."""
+    if not (isinstance(given, Mapping) and TABLE in given):
+        return given
+    where = given[TABLE]
+    if len(given) > 1 or not (
+        isinstance(where, list) and len(where) == 2 and all(isinstance(one, str) for one in where)
+    ):
+        raise ParameterError(f'{name}: {TABLE} takes [file, column], got {dict(given)!r}')
+    file, column = where
+    try:
+        with (folder / file).open(encoding='utf-8-sig', newline='') as stream:
+            rows = list(DictReader(stream))
+        return {_ROWS: [float(row[column]) for row in rows], _OF: file}
+    except KeyError:
+        has = ', '.join(rows[0])
+        raise ParameterError(f'{name}: {file} has no column {column!r}, it has {has}') from None
+    except (OSError, ValueError, TypeError) as error:
+        raise ParameterError(f'{name}: {file} cannot be read: {error}') from error
 
 
 def is_number(value: Any) -> bool:

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
@@ -16,12 +15,10 @@ from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_ros.settings import find_class
-from needle_study.distribution import Distribution, distribution, is_number
+from needle_study.designs import BELOW, DESIGNS, INSIDE, RandomDesign, SobolDesign
+from needle_study.distribution import Distribution, distribution, from_table, is_number
 from needle_study.scenario import check_names, mapping, one_of, Scenario, SCENARIOS
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import qmc
 
 if TYPE_CHECKING:
     # Take half a second to import.
@@ -32,15 +29,7 @@ if TYPE_CHECKING:
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
 _PARTS: Final = 50  #: largest number of parts of a study that shows its progress
-DESIGNS: Final = ('sobol', 'random', 'latin')  #: sampling designs
 _MOST: Final = 2**30  #: largest number of samples, as limited by the Sobol sequence
-
-#: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
-_MOST_LATIN: Final = 2**24
-
-#: Smallest and largest probability at which a quantile is evaluated.
-_INSIDE: Final = 2.0**-54
-_BELOW: Final = 1.0 - 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,46 +37,19 @@ class Study:
     """A study, as read from a file."""
 
     scenario: Scenario
-    samples: int
-    seed: int
-    design: str  #: one of `DESIGNS`
+    design: RandomDesign  #: samples, with their seed
     population: Mapping[str, Distribution]  #: by variable; the others have their defaults
-    factor: FloatArray  #: Cholesky factor of the correlations of the normal scores, shape (d, d)
     document: Mapping[str, Any]  #: content of the study file
 
     def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
         """Return the sampled values of consecutive sample numbers by variable."""
-        parts = np.clip(self._parts(int(numbers[0]), len(numbers)), _INSIDE, _BELOW)
-        if self.design != 'latin' and not np.array_equal(self.factor, np.eye(len(self.factor))):
-            scores = ndtri(parts)
-            parts = np.array([ndtr(_mixed(row, scores.T)) for row in self.factor]).T
-            parts = np.clip(parts, _INSIDE, _BELOW)
-        return {
-            name: one.quantiles(part)
-            for (name, one), part in zip(self.population.items(), parts.T, strict=True)
-        }
+        parts = self.design.parts(int(numbers[0]), len(numbers))
+        of = dict(zip(dimensions(self.population), parts.T, strict=True))
+        return {name: one.quantiles(of[one.rows or name]) for name, one in self.population.items()}
 
-    def _parts(self, first: int, count: int) -> FloatArray:
-        """Return uniform numbers in (0, 1), shape (count, d)."""
-        dimensions = len(self.population)
-        if self.design == 'sobol' and dimensions:
-            sequence = qmc.Sobol(dimensions, seed=np.random.default_rng(self.seed))
-            if first:
-                sequence.fast_forward(first)
-            # A single sample first: scipy warns of a first draw that is not a power of 2.
-            return np.concatenate([sequence.random(1), sequence.random(count - 1)])
-        uniform = np.array(
-            [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
-        ).reshape(count, dimensions)
-        if self.design != 'latin':
-            return uniform
-        rows = map(tuple, self.factor.tolist())
-        strata = [_strata(self.samples, self.seed, row)[first : first + count] for row in rows]
-        return np.asarray((np.transpose(strata) + uniform) / self.samples).reshape(uniform.shape)
-
-    def rng(self, number: int, stream: int) -> np.random.Generator:
-        """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
+    @property
+    def samples(self) -> int:
+        return self.design.samples
 
     def simulate(self, progress: Progress | None = None) -> StudyTable:
         """Simulate all samples in this process; `needle study` uses all cores, and files."""
@@ -103,7 +65,7 @@ class Study:
         """Compute samples from a number on: number, sampled values and metrics."""
         numbers = range(first, first + count)
         drawn = self.draw(numbers)
-        streams = [self.rng(number, 1) for number in numbers]
+        streams = [self.design.noise(number) for number in numbers]
         return {
             'sample': np.arange(first, first + count, dtype=np.float64),
             **drawn,
@@ -148,41 +110,22 @@ class StudyTable(Displayed):
         return found
 
 
-def _mixed(row: Sequence[float], scores: Iterable[FloatArray]) -> FloatArray:
-    # No matrix product: its bits may depend on the number of rows.
-    return np.asarray(sum(f * one for f, one in zip(row, scores, strict=False)))
-
-
-@lru_cache(maxsize=64)
-def _strata(count: int, seed: int, row: tuple[float, ...]) -> NDArray[np.uint32]:
-    """
-    Return the strata of a dimension by sample, with its row of the Cholesky factor.
-
-    Each has one sample, also with correlations: they are in the order of correlated normal scores.
-    Source: R. L. Iman, W. J. Conover, Communications in Statistics B 11 (1982), 311.
-    """
-    dimension = max(np.flatnonzero(row))
-    if dimension and any(row[:dimension]):
-        scores = (
-            ndtri((_permutation(count, seed, k) + 0.5) / count) for k in range(dimension + 1)
-        )
-        strata = np.empty(count, dtype=np.uint32)
-        strata[np.argsort(_mixed(row, scores), kind='stable')] = np.arange(count)
-        return strata
-    return _permutation(count, seed, int(dimension))
-
-
-def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.uint32]:
-    # The generators of samples have two numbers in their key, this generator has three.
-    key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
-    return np.random.default_rng(key).permutation(np.arange(count, dtype=np.uint32))
+def dimensions(population: Mapping[str, Distribution]) -> list[str]:
+    """Return the independent dimensions of a population: variables, and tables of variables."""
+    return list(dict.fromkeys(one.rows or name for name, one in population.items()))
 
 
 def read_study(path: Path | str) -> Study:
     """Read a study file (.yaml), or raise `ParameterError` with its name."""
     path = Path(path)
     try:
-        return build_study(read_document(path.read_text(encoding='utf-8')))
+        document = read_document(path.read_text(encoding='utf-8'))
+        if isinstance(document, dict) and isinstance(given := document.get('population'), dict):
+            document['population'] = {
+                name: from_table(f'population: {name}', one, path.parent)
+                for name, one in given.items()
+            }
+        return build_study(document)
     except (DocumentError, ParameterError) as error:
         raise ParameterError(f'{path}: {error}') from error
     except (OSError, UnicodeDecodeError) as error:
@@ -199,32 +142,26 @@ def build_study(document: Any) -> Study:
     if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
         raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
-    design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
-    if design == 'latin' and samples > _MOST_LATIN:
-        raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
+    design = one_of('design', document.get('design', SobolDesign.name), DESIGNS)
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
     scenario: Scenario = of_class(settings)
     known = scenario.variables
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.
     population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
+    lengths = {(one.rows, len(one.numbers)) for one in population.values() if one.rows}
+    if len({rows for rows, _ in lengths}) < len(lengths):
+        raise ParameterError('population: variables of the same table must have as many rows')
     for name, one in population.items():
-        least, most = one.ends(_INSIDE, _BELOW)
+        least, most = one.ends(INSIDE, BELOW)
         low, high, unit = known[name].low, known[name].high, known[name].unit
         if not low <= least <= most <= high or not isfinite(least) or not isfinite(most):
             raise ParameterError(
                 f'population: {name} must be finite and in [{low:g}, {high:g}] {unit}, and would '
                 f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
             )
-    return Study(
-        scenario=scenario,
-        samples=samples,
-        seed=seed,
-        design=design,
-        population=population,
-        factor=_factor(document.get('correlations', []), list(population)),
-        document=dict(document),
-    )
+    factor = _factor(document.get('correlations', []), dimensions(population))
+    return Study(scenario, DESIGNS[design](samples, seed, factor), population, dict(document))
 
 
 def _whole(document: Mapping[str, Any], key: str, low: int) -> int:

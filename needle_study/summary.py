@@ -1,13 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable."""
+"""
+Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable.
 
-from collections.abc import Iterable, Iterator, Sequence
+References
+----------
+.. [Janon2014] A. Janon et al., "Asymptotic normality and efficiency of two Sobol index
+   estimators", ESAIM: Probability and Statistics 18, 2014.
+.. [Korn1998] E. L. Korn, B. I. Graubard, "Confidence intervals for proportions with small expected
+   number of positive counts estimated from survey data", Survey Methodology 24, 1998.
+
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import sqrt
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
+from needle_study.designs import RandomDesign, REPLICATES, SaltelliDesign
+from needle_study.study import dimensions, Study
 import numpy as np
+from scipy.special import stdtrit
 from scipy.stats import binom
 
 _NORMAL: Final = 1.96  #: half-width of a 95 % interval over the standard deviation
@@ -17,6 +30,10 @@ _TAIL: Final = 0.025  #: probability of an interval above the true value, and be
 _GROUPS, _FEWEST = 32, 200
 
 
+#: Name of the noise among the variables.
+NOISE: Final = 'noise'
+
+
 class Estimate(NamedTuple):
     """A value with its 95 % interval, from a number of samples."""
 
@@ -24,6 +41,13 @@ class Estimate(NamedTuple):
     low: float
     high: float
     samples: int
+
+
+class Indices(NamedTuple):
+    """Fractions of a variance that vary with one variable."""
+
+    first: Estimate  #: explained by the variable alone
+    total: Estimate | None = None  #: with its interactions; None if not estimated
 
 
 def batches(table: Path, name: str) -> Iterator[FloatArray]:
@@ -57,49 +81,146 @@ def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
     return found
 
 
-def probability(parts: Iterable[FloatArray]) -> Estimate:
-    """Estimate the fraction of ones among 1 and 0, with the interval of Wilson; NaN is ignored."""
-    n, yes = 0, 0.0
+def probability(parts: Iterable[FloatArray], design: RandomDesign | None = None) -> Estimate:
+    """
+    Estimate the fraction of ones among 1 and 0, with the interval of Wilson; NaN is ignored.
+
+    The replicates of a design give the number of independent samples that have the same variance
+    [Korn1998]_.
+    """
+    sums = np.zeros((2, max(1, design.replicates if design else 0)))
+    first = 0
     for values in parts:
-        finite = values[np.isfinite(values)]
-        n, yes = n + len(finite), yes + float(finite.sum())
+        finite = np.isfinite(values)
+        sums += _sums(values[finite], np.flatnonzero(finite) + first, design, sums.shape[1])
+        first += len(values)
+    n, yes = sums.sum(axis=1).tolist()
     if n == 0:
         return Estimate(np.nan, 0.0, 1.0, 0)
-    p, z = yes / n, _NORMAL
-    middle = (p + z * z / (2 * n)) / (1.0 + z * z / n)
-    half = z / (1.0 + z * z / n) * sqrt(p * (1.0 - p) / n + z * z / (4 * n * n))
-    return Estimate(p, max(0.0, middle - half), min(1.0, middle + half), n)
+    p, (size, z) = yes / n, _size(sums)
+    middle = (p + z * z / (2 * size)) / (1.0 + z * z / size)
+    half = z / (1.0 + z * z / size) * sqrt(p * (1.0 - p) / size + z * z / (4 * size * size))
+    return Estimate(p, max(0.0, middle - half), min(1.0, middle + half), int(n))
 
 
-def quantile(values: FloatArray, part: float) -> Estimate:
+def _sums(
+    values: FloatArray, numbers: IntArray, design: RandomDesign | None, replicates: int
+) -> FloatArray:
+    """Return number and sum of the values of each replicate, shape (2, replicates)."""
+    at = design.replicate(numbers) if design and replicates > 1 else np.zeros_like(numbers)
+    return np.array([np.bincount(at, one, replicates) for one in (np.ones(len(values)), values)])
+
+
+def _size(sums: FloatArray) -> tuple[float, float]:
+    """Return the equivalent number of independent samples, and the half-width of an interval."""
+    n, yes = sums
+    count, p = len(n), float(yes.sum() / n.sum())
+    apart = yes - p * n
+    variance = count / max(1, count - 1) * float(apart @ apart) / n.sum() ** 2
+    if variance == 0.0 or not n.all():
+        return float(n.sum()), _NORMAL
+    return p * (1.0 - p) / variance, float(stdtrit(count - 1, 1.0 - _TAIL))
+
+
+def quantile(values: FloatArray, part: float, design: RandomDesign | None = None) -> Estimate:
     """Estimate the quantile below which a part of the values is; NaN is ignored."""
-    finite = np.sort(values[np.isfinite(values)])
+    known = np.flatnonzero(np.isfinite(values))
+    finite = np.sort(values[known])
     n = len(finite)
     if n == 0:
         return Estimate(np.nan, -np.inf, np.inf, 0)
+    value = float(np.quantile(finite, part))
+    size = n
+    if design and design.replicates:
+        below = (values[known] <= value).astype(np.float64)
+        size = max(1, round(_size(_sums(below, known, design, design.replicates))[0]))
     # Ranks, from 1: the true value is below the first, and above the second, in one of 40 studies
     # each.
-    low, high = (int(binom.ppf(tail, n, part)) for tail in (_TAIL, 1.0 - _TAIL))
+    tails = (_TAIL, 1.0 - _TAIL)
+    low, high = (int(binom.ppf(tail, size, part) * n / size) for tail in tails)
     return Estimate(
-        float(np.quantile(finite, part)),
+        value,
         float(finite[low - 1]) if low >= 1 else -np.inf,
         float(finite[high]) if high < n else np.inf,
         n,
     )
 
 
-def share(values: FloatArray, by: FloatArray) -> float:
-    """Return the first-order Sobol index of a variable; NaN for fewer than 200 samples."""
+def indices(
+    values: FloatArray, columns: Mapping[str, FloatArray], study: Study
+) -> dict[str, Indices]:
+    """
+    Estimate the Sobol' indices of each variable, by variable; empty for fewer than 200 samples.
+
+    The groups of a design `saltelli` also have the index of the noise, total indices
+    [Janon2014]_, and for all variables of a table one index, by its name. For other designs the
+    samples are grouped by each variable. The intervals are of the jackknife over the replicates of
+    the design, or over as many parts.
+    """
+    if np.count_nonzero(np.isfinite(values)) < _FEWEST:
+        return {}
+    if isinstance(study.design, SaltelliDesign):
+        return _grouped(values, dimensions(study.population), study.design)
+    parts = study.design.replicate(np.arange(len(values))) % REPLICATES
+    return {name: Indices(_sorted(values, one, parts)) for name, one in columns.items()}
+
+
+def _grouped(
+    values: FloatArray, names: Sequence[str], design: SaltelliDesign
+) -> dict[str, Indices]:
+    """Correlate the samples of the groups that have one variable, or all but one, in common."""
+    count = len(values) // design.group
+    groups = values[: count * design.group].reshape(count, design.group).T
+    kept = np.isfinite(groups).all(axis=0)
+    replicates = (np.arange(count) % REPLICATES)[kept]
+    first, second, *others = groups[:, kept]
+
+    def estimate(one: FloatArray, other: FloatArray, sign: float) -> Estimate:
+        powers = (one * other, 0.5 * (one**2 + other**2), 0.5 * (one + other), np.ones(len(one)))
+        sums = np.array([np.bincount(replicates, power, REPLICATES) for power in powers])
+
+        def index(sums: FloatArray) -> float:
+            product, square, mean = sums[:3] / sums[3]
+            variance = square - mean**2
+            same = (product - mean**2) / variance if variance > 0.0 else 1.0
+            return float(same if sign > 0.0 else 1.0 - same)
+
+        total = sums.sum(axis=1)
+        return _jackknife(index(total), [index(total - one) for one in sums.T], int(total[3]))
+
+    return {
+        name: Indices(estimate(second, other, 1.0), estimate(first, other, -1.0))
+        for name, other in zip((NOISE, *names), others, strict=True)
+    }
+
+
+def _jackknife(value: float, without: Sequence[float], samples: int) -> Estimate:
+    """Return a value with the interval of its values without each replicate."""
+    count = len(without)
+    error = sqrt((count - 1) / count * float(np.sum((np.array(without) - np.mean(without)) ** 2)))
+    half = float(stdtrit(count - 1, 1.0 - _TAIL)) * error
+    return Estimate(value, max(0.0, value - half), min(1.0, value + half), samples)
+
+
+def _sorted(values: FloatArray, by: FloatArray, parts: IntArray) -> Estimate:
+    """Estimate a first-order index from the means over ranges of a variable."""
     finite = np.isfinite(values)
-    y = values[finite][np.argsort(by[finite], kind='stable')]
-    if len(y) < _FEWEST:
-        return float('nan')
-    if np.ptp(y) == 0.0 or np.ptp(by[finite]) == 0.0:
-        return 0.0
-    means = [(len(one), one.mean()) for one in np.array_split(y, _GROUPS)]
-    between = sum(n * (mean - y.mean()) ** 2 for n, mean in means) / (len(y) * y.var())
-    by_chance = (_GROUPS - 1) / (len(y) - 1)
-    return float(max(0.0, (between - by_chance) / (1.0 - by_chance)))
+    y, by, parts = values[finite], by[finite], parts[finite]
+    if np.ptp(y) == 0.0 or np.ptp(by) == 0.0:
+        return Estimate(0.0, 0.0, 0.0, len(y))
+
+    def index(kept: BoolArray) -> float:
+        y_, by_ = y[kept], by[kept]
+        means = [
+            (len(one), one.mean())
+            for one in np.array_split(y_[np.argsort(by_, kind='stable')], _GROUPS)
+        ]
+        between = sum(n * (mean - y_.mean()) ** 2 for n, mean in means) / (len(y_) * y_.var())
+        by_chance = (_GROUPS - 1) / (len(y_) - 1)
+        return float(max(0.0, (between - by_chance) / (1.0 - by_chance)))
+
+    without = [index(parts != part) for part in range(REPLICATES)]
+    return _jackknife(index(np.ones(len(y), dtype=np.bool_)), without, len(y))
 
 
 def worst(parts: Iterable[FloatArray], number: int) -> list[int]:

@@ -57,7 +57,8 @@ steered.plot()
 
 def report(name, table):
     """Print the probability of a hit, and the median miss."""
-    hit, miss = probability([table.values['hit']]), quantile(table.values['miss'], 0.5)
+    values, design = table.values, table.study.design
+    hit, miss = probability([values['hit']], design), quantile(values['miss'], 0.5, design)
     print(
         f'{name}: hit {100 * hit.value:.0f} % ({100 * hit.low:.0f} to {100 * hit.high:.0f}), '
         f'median miss {1e3 * miss.value:.2f} mm ({1e3 * miss.low:.2f} to {1e3 * miss.high:.2f})'

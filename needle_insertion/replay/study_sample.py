@@ -26,7 +26,7 @@ def replay_sample(results: Results, number: int, bag: Path) -> bool:
     drawn = {name: float(row[name][0]) for name in study.population}
     templates: dict[str, Template] = {}
     with BagWriter(bag) as writer:
-        for message in study.scenario.replay(drawn, study.rng(number, 1)):
+        for message in study.scenario.replay(drawn, study.design.noise(number)):
             name = f'/{message.topic.name}'
             if name not in templates:
                 templates[name] = message.topic.template()

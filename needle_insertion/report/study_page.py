@@ -17,10 +17,12 @@ from needle_study.summary import (
     batches,
     column,
     Estimate,
+    Indices,
+    indices,
+    NOISE,
     picked,
     probability,
     quantile,
-    share,
     worst,
 )
 import numpy as np
@@ -54,27 +56,32 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     probabilities, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
     for name, one in metrics.items():
         if not one.unit:
-            probabilities[name] = probability(batches(table, name))
+            probabilities[name] = probability(batches(table, name), study.design)
             continue
         found = values if name == main else column(table, name, _MOST)
-        parts = [quantile(found, part) for part in _PARTS]
+        parts = [quantile(found, part, study.design) for part in _PARTS]
         if known := parts[0].samples:
             words = (f'{value} ({ends})' for value, ends in (_rounded(p, one.unit) for p in parts))
             quantiles.append((_head(name, one.unit), *words, str(known), one.meaning))
-    shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
-    order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
+    columns = {name: column(table, name, _MOST) for name in drawn}
+    shares = indices(values, columns, study)
+    order = sorted(shares or drawn, key=lambda name: -_part(shares.get(name)))
+    named = [name for name in order if name in columns]
+    meanings = {name: study.scenario.variables[name].meaning for name in drawn}
+    meanings[NOISE] = 'noise of path, sensors and losses'
+    meanings = {name: meanings.get(name, 'row of this table') for name in order}
     # The two most influential variables are drawn.
-    most = {name: column(table, name, _MOST) for name in order[:2]}
-    bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
+    most = {name: columns[name] for name in named[:2]}
+    bad, listed = worst(batches(table, main), _WORST), [main, *named[:4]]
     of_bad = {name: picked(table, name, bad) for name in listed}
     units = {name: study.scenario.variables[name].unit for name in drawn}
     units[main] = metrics[main].unit
     hit = probabilities.get('hit')
-    cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
+    cards = [('Samples', f'{study.samples}', f'seed {study.design.seed}, {study.design.name}')]
     if hit is not None:
         value, ends = _rounded(hit, '%')
         cards.append(('Hit', value, f'95 %: {ends}'))
-    value, ends = _rounded(quantile(values, 0.5), units[main])
+    value, ends = _rounded(quantile(values, 0.5, study.design), units[main])
     unit, _ = _shown(units[main])
     cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
     pictures = [_distribution(main, metrics[main], values)]
@@ -94,9 +101,8 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
         ],
         quantile_heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
         quantiles=quantiles,
-        shares=[
-            (name, _share(shares[name]), study.scenario.variables[name].meaning) for name in order
-        ],
+        totals=NOISE in shares,
+        shares=[(name, *_shares(shares[name]), meanings[name]) for name in order if shares],
         worst_heads=('sample', *(_head(name, units[name]) for name in listed)),
         worst=[
             (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
@@ -132,8 +138,15 @@ def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
     return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else 'too few samples'
 
 
-def _share(part: float) -> str:
-    return f'{part:.1%}' if isfinite(part) else 'too few samples'
+def _part(one: Indices | None) -> float:
+    """Return the part of the variance that varies with a variable, in any way."""
+    return 0.0 if one is None else (one.total or one.first).value
+
+
+def _shares(one: Indices) -> list[str]:
+    """Format the indices of a variable with their intervals."""
+    both = [_rounded(found, '%') for found in (one.first, one.total) if found is not None]
+    return [f'{value} ({ends})' for value, ends in both]
 
 
 def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:

@@ -206,10 +206,10 @@ def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, 
     study = build_study({**SMALL, 'settings': settings, 'population': {}})
     drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
     rows = {name: np.array([value]) for name, value in drawn.items()}
-    found = study.scenario.run(rows, [study.rng(0, 1)])
+    found = study.scenario.run(rows, [study.design.noise(0)])
     guard = Guard(SafetyLimits(**limits), (PHANTOM.minimum_depth, PHANTOM.length))
     said: list[bool] = []
-    for topic, _, values in study.scenario.replay(drawn, study.rng(0, 1)):
+    for topic, _, values in study.scenario.replay(drawn, study.design.noise(0)):
         if topic.name == 'joint_states':
             measured = Measurement(time=0.0, depth=values[0], velocity=values[2])
             beyond = [guard.encoders(measured)]
