@@ -14,12 +14,14 @@ from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE, PRESETS
 from needle_dynamics.steering.parameters import STEEL, SteeringParameters, tissue_of
 from needle_ros.documents import read_document
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import quantity
 from needle_ros.settings import from_values, unknown_name
 
 #: Needle of new commands, studies and environments, and of the node `steering`.
 DEFAULT_NEEDLE: Final = 'bending_35mm'
 
 FILES: Final = ('.yaml', '.yml')  #: Ends of the names of files of needles.
+_DIAMETERS: Final = ('outer_diameter', 'inner_diameter')  #: of a tube, in place of its area
 _PREFIXES: Final = ('model.', 'steering.')  #: Prefixes of the constants in a ROS parameter file.
 
 
@@ -36,11 +38,16 @@ class NeedlePreset(NamedTuple):
         return self.steering != SteeringParameters()
 
     def changed(self, values: Mapping[str, Any]) -> NeedlePreset:
-        """Return these constants with other values by name; one number may replace a tuple."""
+        """
+        Return these constants with other values by name; one number may replace a tuple.
+
+        ``outer_diameter`` and ``inner_diameter`` [m] of a tube stand for area and area moment.
+        """
+        values = _of_tube(values)
         known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
         for name in values:
             if name not in known:
-                raise ParameterError(unknown_name(name, known))
+                raise ParameterError(unknown_name(name, [*known, *_DIAMETERS]))
 
         def replaced(part: Any) -> Any:
             own = {item.name: values[item.name] for item in fields(part) if item.name in values}
@@ -49,15 +56,42 @@ class NeedlePreset(NamedTuple):
         return NeedlePreset(replaced(self.needle), replaced(self.steering), self.source)
 
 
+def tube(outer: float, inner: float = 0.0) -> tuple[float, float]:
+    """Return area [m^2] and area moment [m^4] of a tube with these diameters [m]."""
+    return pi / 4.0 * (outer**2 - inner**2), pi / 64.0 * (outer**4 - inner**4)
+
+
+def _of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace the diameters of a tube by its area and area moment."""
+    others = {name: value for name, value in values.items() if name not in _DIAMETERS}
+    if len(others) == len(values):
+        return others
+    outer, inner = (
+        quantity(value, 'm') if isinstance(value := values.get(name, 0.0), str) else value
+        for name in _DIAMETERS
+    )
+    numbers = isinstance(outer, (int, float)) and isinstance(inner, (int, float))
+    if not (numbers and 0.0 <= inner < outer):
+        raise ParameterError(
+            'outer_diameter and inner_diameter must be 0 <= inner < outer [m], got '
+            f'{outer!r} and {inner!r}'
+        )
+    if clash := [name for name in ('area', 'area_moment') if name in others]:
+        raise ParameterError(f'{clash[0]} is given by the diameters, too: omit one of them')
+    area, moment = tube(outer, inner)
+    return {**others, 'area': area, 'area_moment': moment}
+
+
 def _literature(
     outer: float, inner: float, modulus: float, tissue: float, source: str
 ) -> NeedlePreset:
     """Return a round needle with outer and inner diameter [m]; other constants are the paper's."""
+    area, moment = tube(outer, inner)
     needle = replace(
         PRESETS['phantom'],
         youngs_modulus=modulus,
-        area=pi / 4.0 * (outer**2 - inner**2),
-        area_moment=pi / 64.0 * (outer**4 - inner**4),
+        area=area,
+        area_moment=moment,
         tissue_stiffness=tissue,
     )
     twist = needle.bending_stiffness / STEEL

@@ -23,6 +23,7 @@ import zlib
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
+from needle_identification.bags.files import form_of, METADATA
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps
@@ -111,6 +112,14 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
 
 def is_table(path: Path | str) -> bool:
     return Path(path).suffix.lower() in TABLES
+
+
+def recordings_in(path: Path) -> list[Path]:
+    """Return the tables and bags in a folder that is no bag itself, in any other case the path."""
+    inside = sorted(path.iterdir()) if path.is_dir() else []
+    if any(form_of(one) and one.is_file() for one in inside):
+        return [path]
+    return [one for one in inside if is_table(one) or (one / METADATA).is_file()] or [path]
 
 
 def read_table(path: Path) -> Table:

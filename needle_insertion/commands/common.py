@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared parts of the commands: options, model constants from words, results and their folders."""
 
-from argparse import ArgumentParser, ArgumentTypeError
+from argparse import Action, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Iterable, Sequence
 import json
 import os
@@ -24,6 +24,30 @@ def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '')
         help=f'needle and tissue: {NEEDLE_HELP} (default {default or otherwise})',
     )
     added.completer = lambda **_: [*NEEDLES, *map(str, Path().glob('*.yaml'))]
+
+
+class _Recordings(Action):
+    """Store the recordings in each folder that is no bag itself."""
+
+    def __call__(
+        self, _parser: ArgumentParser, options: Namespace, values: Any, _option: str | None = None
+    ) -> None:
+        from needle_identification.recordings.tables import recordings_in
+
+        setattr(options, self.dest, [one for path in values for one in recordings_in(path)])
+
+
+def add_recordings(parser: ArgumentParser, otherwise: str = '') -> None:
+    """Add the argument of recordings; ``otherwise`` ends its help."""
+    parser.add_argument(
+        'recordings',
+        type=Path,
+        nargs='+',
+        action=_Recordings,
+        metavar='RECORDING',
+        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, table (.csv, .tsv, .mat), or a '
+        f'folder of these{otherwise}',
+    )
 
 
 def with_unit(

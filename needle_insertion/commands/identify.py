@@ -26,7 +26,7 @@ from needle_identification import (
     TERMS,
     write_result,
 )
-from needle_identification.recordings.tables import column_roles, ROLES
+from needle_identification.recordings.tables import column_roles, recordings_in, ROLES
 from needle_identification.steering.columns import STEERING_ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
@@ -34,6 +34,7 @@ from needle_insertion.commands.identify_steering import (
     add_output,
     add_steering,
     add_time,
+    SKIPPED,
     words_of,
 )
 from needle_insertion.progress import ProgressLine
@@ -127,14 +128,7 @@ def _add_common(
     parser: argparse.ArgumentParser, defaults: FrictionSettings | StiffnessSettings
 ) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
     """Add the options of all kinds; return the option groups of reading and of fitting."""
-    parser.add_argument(
-        'bags',
-        type=Path,
-        nargs='+',
-        metavar='BAG',
-        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); an '
-        'unusable recording is reported and skipped, and the exit status is 2',
-    )
+    common.add_recordings(parser, SKIPPED)
     writing = parser.add_argument_group('output')
     add_output(writing)
     writing.add_argument(
@@ -205,7 +199,7 @@ def _run_friction(options: argparse.Namespace) -> int:
         settings,
         axes,
         read_friction_recording,
-        lambda recording: identify_friction(recording, settings, len(options.bags)),
+        lambda recording: identify_friction(recording, settings, len(options.recordings)),
         summarize,
         write_result,
         ('stiffness', lambda bag: identify_stiffness(read_indentation_recording(bag))),
@@ -246,7 +240,7 @@ def _identify(
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(
-        options.bags,
+        options.recordings,
         lambda bag: read(bag, **reading),
         identify,
         Origin(settings=settings, reading=reading, result=options.output),
@@ -294,10 +288,10 @@ def completed(words: Sequence[str]) -> list[str]:
     #: Columns of the user, in place of those that are found.
     own = [word for word in words if word.startswith('--columns')]
     reasons = []
-    for name in given:
+    for path in [one for name in given for one in recordings_in(Path(name))]:
         try:
-            with ProgressLine(f'reading {name}', brief=True):
-                found = inspect_recording(name)
+            with ProgressLine(f'reading {path}', brief=True):
+                found = inspect_recording(path)
         except (NeedleError, OSError) as error:
             reasons.append(str(error))
             continue

@@ -18,7 +18,13 @@ from needle_identification.steering.estimate import HeldOut, SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_insertion.commands.common import check_file, print_each, print_result, with_unit
+from needle_insertion.commands.common import (
+    add_recordings,
+    check_file,
+    print_each,
+    print_result,
+    with_unit,
+)
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import interval_of, plain, title_of
 from needle_insertion.report.text import table
@@ -26,6 +32,9 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
 
 _ONE = 'all'  #: name of a medium without a name
+
+#: End of the help on recordings.
+SKIPPED = '; an unusable recording is reported and skipped, and the exit status is 2'
 
 #: Columns of the table of media.
 _FITS = (
@@ -44,14 +53,7 @@ def add_steering(what: Any) -> None:
         "'depth=-robot[m],guide_x=base.x[mm]@1,guide_z=base.z[mm]@1,tip_x=tip.x[mm],"
         "tip_z=tip.z[mm]'",
     )
-    parser.add_argument(
-        'recordings',
-        type=Path,
-        nargs='+',
-        metavar='BAG',
-        help='insertions as bags, or as tables (.csv, .tsv, .mat); an unusable recording is '
-        'reported and skipped, and the exit status is 2',
-    )
+    add_recordings(parser, SKIPPED)
     add_output(parser, ', for a steered plant; for a single medium only')
     reading = parser.add_argument_group('input')
     reading.add_argument(

@@ -3,10 +3,9 @@
 
 import argparse
 from math import isfinite
-from pathlib import Path
 
 from needle_identification import inspect_recording, Inspection
-from needle_insertion.commands.common import print_each, print_result
+from needle_insertion.commands.common import add_recordings, print_each, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
@@ -14,13 +13,7 @@ from needle_ros.errors import NeedleError, shown
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        'recordings',
-        type=Path,
-        nargs='+',
-        metavar='RECORDING',
-        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat)',
-    )
+    add_recordings(parser)
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 

@@ -47,7 +47,7 @@ ANSWERS = {
     'analyze --depth -10mm': 'outside [0.001, 0.2] m',
     'analyze --needle fantom': 'did you mean phantom?',
     'identify frction BAG': 'did you mean friction?',
-    'identify friction': 'required: BAG; --help lists all arguments',
+    'identify friction': 'required: RECORDING; --help lists all arguments',
     'identify friction nowhere': 'nowhere does not exist; valid: a rosbag2 folder',
     'identify friction folder': 'folder holds no recording; valid: a rosbag2 folder',
     'identify friction empty.csv': 'empty.csv is empty; valid: a table with named columns',

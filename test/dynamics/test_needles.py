@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from pathlib import Path
 
 from needle_dynamics import (
@@ -41,6 +42,17 @@ def test_file_changes_constants_of_a_needle(tmp_path: Path) -> None:
     assert NeedleParameters.preset(str(file)) == found.needle
 
 
+def test_diameters_stand_for_area_and_area_moment(tmp_path: Path) -> None:
+    """The literature prints 22 gauge as 0.7 mm outside and 0.48 mm inside."""
+    file = tmp_path / 'mine.yaml'
+    file.write_text('needle: misra_2010\nouter_diameter: 0.7mm\ninner_diameter: 0.48e-3\n')
+    found, known = find_needle(str(file)).needle, NEEDLES['hollow_0.70mm'].needle
+    assert (found.area, found.area_moment) == pytest.approx((known.area, known.area_moment))
+    solid = NEEDLES['phantom'].changed({'outer_diameter': 1e-3}).needle
+    assert solid.area == pytest.approx(0.25 * pi * 1e-6)
+    assert solid.area_moment == pytest.approx(solid.area**2 / (4.0 * pi))
+
+
 def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
     """Parameters of the nodes that are no constants of the needle are left out."""
     file = tmp_path / 'identified.yaml'
@@ -68,6 +80,14 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ('lenght: 1\n', "mine.yaml: unknown parameter 'lenght'; did you mean 'length'"),
         ('length: long\n', "with a unit of m, cm, mm, um, got 'long'"),
         ('length: 3N\n', 'mine.yaml: length must be a number, or text with a unit of m'),
+        (
+            'outer_diameter: 1mm\ninner_diameter: 2mm\n',
+            'must be 0 <= inner < outer [m], got 0.001',
+        ),
+        ('outer_diameter: 3N\n', "mine.yaml: '3N' is not a length"),
+        ('inner_diameter: 1mm\n', 'must be 0 <= inner < outer [m], got 0.0 and'),
+        ('outer_diameter: 1mm\narea: 1mm^2\n', 'area is given by the diameters, too'),
+        ('outer_diamter: 1mm\n', "did you mean 'outer_diameter'"),
         ('a: [', 'mine.yaml cannot be read: is not YAML'),
     ],
 )
