@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated robot in each repeat of an experiment."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from needle_dynamics.needles import find_needle
+from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.force_sensor import HIGHEST_RATE
 from needle_insertion.report.paper_tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_ros.errors import ParameterError
@@ -26,8 +28,13 @@ class Campaign:
     rate: float = 250.0  #: Sample rate [Hz].
     #: Use the means of the paper's tables in each run instead of sampled values.
     fixed: bool = False
+    needle: str | None = None  #: Needle whose friction all runs have; None: of the paper's table.
 
     def __post_init__(self) -> None:
+        if self.needle is not None:
+            find_needle(self.needle)
+            if self.fixed or self.protocol.name != 'friction':
+                raise ParameterError('--needle is for friction, and replaces --fixed')
         if not 1 <= self.repeats <= _MOST_REPEATS:
             raise ParameterError(f'--repeats must be in [1, {_MOST_REPEATS}], got {self.repeats}')
         if self.seed < 0:
@@ -53,6 +60,16 @@ class Campaign:
         }
 
     def _drawn(self) -> list[dict[str, Any]]:
+        if self.needle is not None:
+            own = asdict(find_needle(self.needle).needle)
+            base = asdict(find_needle(PAPER_NEEDLE).needle)
+            changed = {name: value for name, value in own.items() if value != base[name]}
+            return [
+                {
+                    f'model.{name}': list(value) if isinstance(value, tuple) else value
+                    for name, value in changed.items()
+                }
+            ] * self.repeats
         if self.protocol.name == 'friction':
             friction = draw_friction(self.repeats, self.seed)
             if self.fixed:

@@ -4,7 +4,7 @@
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import check_folder
+from needle_insertion.commands.common import add_needle, check_folder
 from needle_ros.errors import ParameterError
 from reproduction.protocol import FASTEST, PROTOCOLS, SPEED
 
@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=unit,
             help=f'{words} (default {default:g})',
         )
+    add_needle(parser, None, "friction drawn around the paper's Table 1")
     parser.add_argument(
         '--fixed',
         action='store_true',
@@ -50,6 +51,7 @@ def run(options: argparse.Namespace) -> int:
         seed=options.seed,
         rate=options.rate,
         fixed=options.fixed,
+        needle=options.needle,
     )
     if not 0.0 < options.speed <= FASTEST:
         raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')

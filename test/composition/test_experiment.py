@@ -111,6 +111,9 @@ def test_campaign_samples_around_the_tables_or_uses_their_means() -> None:
     ]
     (fixed,) = Campaign(protocol=FRICTION, repeats=1, fixed=True).runs.values()
     assert fixed['model.viscous_friction'] == TABLE_1['viscous_friction'][0]
+    (own,) = Campaign(protocol=FRICTION, repeats=1, needle='misra_2010').runs.values()
+    assert own['model.youngs_modulus'] == 50e9
+    assert 'model.coulomb_friction' not in own
     (fixed,) = Campaign(protocol=STIFFNESS, repeats=1, fixed=True).runs.values()
     assert fixed['indenter.stiffness_xz'] == list(TABLE_2['k_xz'][0])
 

@@ -77,6 +77,8 @@ ANSWERS = {
     'verify nowhere': 'nowhere does not exist; valid: a rosbag2 folder',
     'verify BAG --steps': 'unrecognized arguments: --steps; --help lists all arguments',
     'experiment friction --rate -5 out': '--rate must be in [40, 5000] Hz',
+    'experiment stiffness --needle phantom out': '--needle is for friction',
+    'experiment friction --needle fantom out': 'did you mean phantom?',
     'experiment friktion out': 'did you mean friction?',
     'reproduce figure-9': 'did you mean figure-8?',
     'run --needle bending_35mmm': 'did you mean bending_35mm?',
