@@ -24,7 +24,7 @@ check: $(VENV)/.dev
 
 # Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs compiled
-	$(BIN)/python -m sphinx -q -W -E --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -W -E --keep-going -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
 
 format: $(VENV)/.dev

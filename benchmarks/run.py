@@ -14,8 +14,8 @@ from typing import TypeAlias
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, conclusion, header, Tick
+from needle_insertion.progress import ProgressLine
 from needle_ros.errors import ParameterError
-from tqdm import tqdm
 
 #: A measurement.
 Question: TypeAlias = Callable[[Tick], Answer]
@@ -130,25 +130,19 @@ def ask(name: str, command: str, questions: Sequence[Question]) -> tuple[str, bo
     begin = time.perf_counter()
     page = ''
     bars: list[Bar] = []
-    # Progress is printed to a terminal only.
-    with tqdm(disable=None, leave=False, unit=' stages') as progress:
 
-        def tell(text: object) -> None:
-            nonlocal page
-            page += f'{text}\n'
-            progress.clear()
-            sys.stdout.write(f'{text}\n')
-            sys.stdout.flush()
+    def tell(text: object) -> None:
+        nonlocal page
+        page += f'{text}\n'
+        sys.stdout.write(f'{text}\n')
+        sys.stdout.flush()
 
-        def tick(stage: str) -> None:
-            progress.set_description(stage, refresh=False)
-            progress.update()
-
-        tell(header(name, command))
-        for question in questions:
-            sections, found = question(tick)
-            bars += found
-            for section in sections:
-                tell(f'\n{section}')
-        tell(f'\n{conclusion(bars, time.perf_counter() - begin)}')
+    tell(header(name, command))
+    for question in questions:
+        with ProgressLine(name, brief=True) as show:
+            sections, found = question(show)
+        bars += found
+        for section in sections:
+            tell(f'\n{section}')
+    tell(f'\n{conclusion(bars, time.perf_counter() - begin)}')
     return page, any(bar.missed for bar in bars)

@@ -62,6 +62,12 @@ class ProgressLine:
         if self._kind != before and not self._terminal:
             self._write()
 
+    def note(self, text: str) -> None:
+        """Write a line of its own."""
+        clear = _CLEAR if self._terminal else ''
+        self._stream.write(f'{clear}{text}\n')
+        self._stream.flush()
+
     def _update(self) -> None:
         while not self._end.wait(_UPDATE):
             if self._terminal or monotonic() - self._written >= _LINE:

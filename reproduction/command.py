@@ -8,6 +8,7 @@ import sys
 from typing import Any, Final
 
 from needle_insertion.commands.common import check_folder, make_folder
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.text import table
 
 #: Results to choose from.
@@ -40,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     # Takes two seconds to import; invalid options are reported without it.
-    from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
+    with ProgressLine('reproduce', brief=True):
+        from reproduction.results import campaigns, results, VERDICT_HEADS, write_results
 
     folder = options.output or (_OUTPUT if options.what == 'all' else None)
     check_folder(folder)
@@ -72,7 +74,8 @@ def run(options: argparse.Namespace) -> int:
     else:
         sys.stdout.write(f'{found[options.what].text}\n')
     if folder is not None:
-        page = write_results(folder, found)
+        with ProgressLine('page', brief=True):
+            page = write_results(folder, found)
         if not options.json:
             sys.stdout.write(f'\nwrote {page}\n')
     return 0 if passed else 1

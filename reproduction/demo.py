@@ -72,7 +72,8 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
             insertion.record_insertion(
                 law, output / law, output / 'logs' / law, show, lockstep=lockstep
             )
-        insertions.append(insertion.read_insertion(law, output / law))
+            show('reading')
+            insertions.append(insertion.read_insertion(law, output / law))
     aimed, alone = output / 'steered', output / 'guide_at_rest'
     for folder, steered in ((alone, False), (aimed, True)):
         with ProgressLine(f'insertion, {folder.name.replace("_", " ")}') as show:
@@ -82,7 +83,10 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
         # The noise is the same in each demo, and so is the verdict.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
         (parameters,) = campaign.runs.values()
-        with ProgressLine(f'{name} experiment') as show, rig(output, protocol) as running:
+        with (
+            ProgressLine(f'{name} experiment') as show,
+            rig(output, protocol, show.note) as running,
+        ):
             running.record(output / name, parameters, EXPERIMENT_SPEED, partial(show, 'recording'))
 
     friction: list[FrictionEstimate] = []

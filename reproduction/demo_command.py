@@ -5,6 +5,7 @@ import argparse
 from pathlib import Path
 
 from needle_insertion.commands.common import check_folder
+from needle_insertion.progress import ProgressLine
 from reproduction.protocol import SHIPPED_BAGS
 
 
@@ -26,8 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     check_folder(options.output)
-    from needle_insertion.compilation import compile_nodes
-    from reproduction import demo
+    with ProgressLine('demo', brief=True):
+        from needle_insertion.compilation import compile_nodes
+        from reproduction import demo
 
     compile_nodes()
     return demo.run(options.output, options.bags, lockstep=not options.realtime)

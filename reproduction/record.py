@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 import shutil
-import sys
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
@@ -15,6 +15,7 @@ from needle_dynamics import ParameterError
 from needle_identification import RecordingError
 from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
+from needle_insertion.progress import ProgressLine
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import JobError
@@ -25,7 +26,6 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from reproduction.campaign import Campaign
 from reproduction.protocol import ExperimentProtocol, SPEED
-from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Timeout of a sample on a busy machine, and period of the checks for the end [s].
@@ -51,17 +51,19 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
         if not _is_finished(folder / name, protocol, parameters)
     ]
     done, words = len(runs) - len(missing), f'{protocol.name} runs'
-    bar = tqdm(total=len(runs), initial=done, desc=words, disable=None)
     if missing:
-        with bar, rig(folder, protocol) as stand:
-            for name in missing:
-                stand.record(folder / name, runs[name], speed)
-                bar.update()
+        with ProgressLine(words, brief=True) as show, rig(folder, protocol, show.note) as stand:
+            for number, name in enumerate(missing, done + 1):
+                stand.record(
+                    folder / name, runs[name], speed, partial(show, f'{number} of {len(runs)}')
+                )
     return [folder / name for name in runs]
 
 
 @contextmanager
-def rig(folder: Path, protocol: ExperimentProtocol) -> Iterator[Rig]:
+def rig(
+    folder: Path, protocol: ExperimentProtocol, note: Callable[[str], object]
+) -> Iterator[Rig]:
     """Start a plant and a recorder for runs of a protocol; drafts are in a hidden folder."""
     drafts = folder / f'.{protocol.name}.unfinished'
     # Left by an earlier call that was killed.
@@ -69,7 +71,7 @@ def rig(folder: Path, protocol: ExperimentProtocol) -> Iterator[Rig]:
     drafts.mkdir(parents=True)
     try:
         with Graph(drafts / 'logs') as graph:
-            yield Rig(graph, drafts / 'run', protocol)
+            yield Rig(graph, drafts / 'run', protocol, note)
     finally:
         shutil.rmtree(drafts, ignore_errors=True)
 
@@ -81,8 +83,14 @@ class Rig:
     `draft` is the folder of the first bag during recording; the name of bag k ends in ``_k``.
     """
 
-    def __init__(self, graph: Graph, draft: Path, protocol: ExperimentProtocol) -> None:
-        self._graph, self._draft, self._protocol = graph, draft, protocol
+    def __init__(
+        self,
+        graph: Graph,
+        draft: Path,
+        protocol: ExperimentProtocol,
+        note: Callable[[str], object],
+    ) -> None:
+        self._graph, self._draft, self._protocol, self._note = graph, draft, protocol, note
         self._recordings = 0
         topics = list(protocol.topics)
         graph.start('recorder', {'autostart': False, 'path': str(draft), 'topics': topics})
@@ -119,7 +127,7 @@ class Rig:
             said = f'{bag}: {lost} at {factor:g} times real time'
             if factor <= 1.0:
                 raise ExperimentError(f'{said}; choose a lower --rate')
-            tqdm.write(said, file=sys.stderr)
+            self._note(said)
             factor = max(1.0, factor / 2.0)
 
     def _run(self, parameters: Mapping[str, Any], progress: Callable[[float], None]) -> Path:

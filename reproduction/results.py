@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reproduce the results of the paper as text, as JSON, and as a page."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from functools import cache, partial
+from itertools import count
 from math import nan
 from pathlib import Path
 from typing import Any, Final
 
+from needle_insertion.progress import ProgressLine
 from needle_insertion.report.page import write_page
 from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
 from needle_insertion.report.text import filled, table
@@ -22,7 +25,6 @@ from reproduction.identified import (
     VERDICTS,
 )
 from reproduction.protocol import PROTOCOLS
-from tqdm import tqdm
 
 #: Tables that decide about a result.
 _JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
@@ -64,7 +66,13 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
     source = f'the {"shipped" if recorded is None else "new"} simulated recordings'
     jobs = _jobs(tables, source)
     chosen = [name for name in jobs if name not in figures.FIGURES] if what == 'all' else [what]
-    return {name: jobs[name]() for name in tqdm(chosen, **_bar('results'))}
+    found = {}
+    for name in chosen:
+        # These show how far they are.
+        own = name in ('claims', 'mismatch')
+        with nullcontext() if own else ProgressLine(name, brief=True):
+            found[name] = jobs[name]()
+    return found
 
 
 def _jobs(tables: Mapping[str, IdentifiedTable], source: str) -> dict[str, Callable[[], Result]]:
@@ -133,14 +141,27 @@ def _of_figure(name: str) -> Result:
 
 @cache
 def _study() -> mismatch.Mismatch:
-    with tqdm(total=1001 * len(mismatch.CASES), unit=' insertions', **_bar('mismatch')) as bar:
-        return mismatch.study(progress=bar.update)
+    with _counted('mismatch', 1001 * len(mismatch.CASES)) as step:
+        return mismatch.study(progress=step)
 
 
 def _judged(tables: Mapping[str, IdentifiedTable], source: str) -> list[claims.Claim]:
     study = _study()
-    with tqdm(unit=' claims', **_bar('claims')) as bar:
-        return claims.judge_claims(_statistics(tables, source), study, bar.update)
+    with _counted('claims') as step:
+        return claims.judge_claims(_statistics(tables, source), study, step)
+
+
+@contextmanager
+def _counted(what: str, total: int | None = None) -> Iterator[Callable[[], None]]:
+    """Show the number of calls of the result."""
+    numbers = count(1)
+    with ProgressLine(what, brief=True) as show:
+
+        def step() -> None:
+            number = next(numbers)
+            show(f'{number}' if total is None else f'{number} of {total}')
+
+        yield step
 
 
 def _statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
@@ -157,10 +178,6 @@ def _statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Ta
         stiffness={entry: (means, scatter) for entry, (means, scatter) in by_level.items()},
         experiments=min(len(one.bags) for one in tables.values()),
     )
-
-
-def _bar(what: str) -> dict[str, Any]:
-    return {'desc': what, 'disable': None, 'leave': False}
 
 
 def write_results(folder: Path, found: Mapping[str, Result]) -> Path:

@@ -42,13 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     try:
-        from needle_insertion.replay.study_sample import replay_sample
-        from needle_insertion.report.study_page import write_study
-        from needle_study import engine
+        with ProgressLine('study', brief=True):
+            from needle_insertion.replay.study_sample import replay_sample
+            from needle_insertion.report.study_page import write_study
+            from needle_study import engine
+            from needle_study.study import read_study
     except ModuleNotFoundError as error:
         raise missing_extra(error, 'needle study', 'study') from error
-    from needle_study.study import read_study
-
     study = read_study(options.study)
     folder = options.output or Path(f'{options.study.stem}_study')
     check_folder(folder)

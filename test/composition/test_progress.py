@@ -74,3 +74,13 @@ def test_brief_line_is_removed_from_a_terminal_and_absent_elsewhere() -> None:
     # Carriage return and clearing of the line.
     assert stream.getvalue().endswith('\r\033[K')
     assert '\n' not in stream.getvalue()
+
+
+@pytest.mark.parametrize('stream', [io.StringIO, Terminal])
+def test_a_note_is_a_line_of_its_own(stream: type[io.StringIO]) -> None:
+    written = stream()
+    with ProgressLine('recording', written, brief=True) as show:
+        show('1 of 2')
+        show.note('samples are lost')
+    assert 'samples are lost\n' in written.getvalue()
+    assert '1 of 2samples' not in written.getvalue()
