@@ -15,8 +15,9 @@ terms:
 
 Each recording has its own slope and path noise (`needle_identification.steering.mixed`), so that
 the readings of a recording are not independent. The search for the lengths starts from a grid
-(variable projection [Golub2003]_). Their intervals are profile likelihood intervals, and contain
-all optima that fit alike.
+(variable projection [Golub2003]_). Their intervals are profile likelihood intervals, in which the
+cause of drift and the order of motion are unknown as well: they contain all optima, causes and
+orders that fit alike.
 
 References
 ----------
@@ -43,7 +44,6 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import stdtrit
 
-_AS_GOOD: Final = 0.02  # relative difference of residuals below which fits are equivalent
 _WORSE: Final = 1.5  # smallest ratio of held-out errors and residuals that is reported
 _LENGTHS: Final = 2  # number of nonlinear constants of a medium
 _LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and predictions
@@ -120,18 +120,15 @@ def identify_steering(
                 optima = search.optima([one.x for one in optima])
                 fits.append(_Fit(search, optima))
                 advance()
-    best = min(fits, key=lambda fit: fit.selection)
-    alternatives = {
-        fit.search.terms: rms_of(fit.search.residuals(fit.optima[0].x))
-        for fit in fits
-        if fit.search.tips.order == best.search.tips.order
-    }
-    return _estimate(_refined(best), alternatives)
+    best = min(fit.selection for fit in fits)
+    ranked = [fit._replace(gap=fit.selection - best) for fit in fits]
+    return _estimate(sorted(ranked, key=lambda fit: fit.gap))
 
 
 class _Fit(NamedTuple):
     search: Search
     optima: list[Optimum]
+    gap: float = 0.0  # selection minus that of the best fit
 
     @property
     def selection(self) -> float:
@@ -160,11 +157,18 @@ def _refined(fit: _Fit) -> _Fit:
         for model, one in zip(search.models, search.fits(fit.optima[0].x), strict=True)
     ]
     faster = Search(search.tips, search.terms, search.known, models)
-    return _Fit(faster, faster.optima([one.x for one in fit.optima]))
+    return fit._replace(search=faster, optima=faster.optima([one.x for one in fit.optima]))
 
 
-def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> SteeringEstimate:
-    search, best = fit.search, fit.optima[0]
+def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
+    """Return the constants of the first fit, with the intervals of all that fit alike."""
+    order = ranked[0].search.tips.order
+    alternatives = {
+        fit.search.terms: rms_of(fit.search.residuals(fit.optima[0].x))
+        for fit in ranked
+        if fit.search.tips.order == order
+    }
+    search, best = (first := _refined(ranked[0])).search, first.optima[0]
     fits, residuals = search.fits(best.x), search.residuals(best.x)
     information = search.information(best.x)
     freedom = [
@@ -172,13 +176,17 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
         for model, one in zip(search.models, fits, strict=True)
     ]
     rises = [log1p(stdtrit(free, 0.975) ** 2 / free) * (free + 1.0) for free in freedom]
+    alike = [first, *(_refined(fit) for fit in ranked[1:] if fit.gap < max(rises))]
 
     def length(name: str, at: int, rise: float) -> ParameterEstimate:
         """Return a length with its profile interval, if guide or roll alone determine it."""
         x, step = float(best.x[at]), 1e-6
         if np.ptp(search.bounds[:, at]) ** 2 * information[at] <= 4.0 * rise:
             return _constant(name, shown(name, x))
-        low, high = interval(search, fit.optima, at, rise)
+        ends = [
+            interval(fit.search, fit.optima, at, rise - fit.gap) for fit in alike if fit.gap < rise
+        ]
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
         if name == 'skin':
             # The lower bound of the skin is zero.
             low = max(low, 0.0)
@@ -214,7 +222,6 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
                 recordings=len(members),
             )
         )
-    alike = [one for one in fit.optima if one.deviance - best.deviance <= max(rises)]
     return SteeringEstimate(
         free_length=free,
         media=tuple(media),
@@ -222,8 +229,8 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
         order=search.tips.order,
         alternatives=alternatives,
         residuals=tuple(residuals),
-        optima=len(fit.optima),
-        warnings=tuple(_warnings(search, alike, alternatives, media)),
+        optima=len(first.optima),
+        warnings=tuple(_warnings(alike, max(rises), alternatives, media)),
     )
 
 
@@ -259,28 +266,36 @@ def _constant(
 
 
 def _warnings(
-    search: Search,
-    alike: Sequence[Optimum],
+    alike: Sequence[_Fit],
+    rise: float,
     alternatives: Mapping[tuple[str, ...], float],
     media: Sequence[MediumEstimate],
 ) -> Iterator[str]:
     """Warn of fits that the recordings cannot distinguish, and of poor predictions."""
-    best = min(alternatives.values())
-    equal = [terms for terms, rms in alternatives.items() if rms <= (1.0 + _AS_GOOD) * best]
+    search, optima = alike[0].search, alike[0].optima
+    equal = [fit.search.terms for fit in alike if fit.search.tips.order == search.tips.order]
     if len(equal) > 1:
-        each = ', '.join(f'{terms[0]} {1e3 * alternatives[terms]:.3f} mm' for terms in equal)
+        each = ', '.join(
+            f'{"+".join(terms)} {1e3 * alternatives[terms]:.3f} mm' for terms in equal
+        )
         yield (
             f'these explain the drift equally well (rms: {each}); all of it is attributed to '
-            f'{search.terms[0]}. A motion of the guide in air identifies the frame, a rotation of '
-            'the needle at half the depth identifies the bevel'
+            f'{"+".join(search.terms)}. A motion of the guide in air identifies the frame, a '
+            'rotation of the needle at half the depth identifies the bevel'
         )
-    if len(alike) > 1:
+    if any(fit.search.tips.order != search.tips.order for fit in alike):
+        yield (
+            'guide and needle may move together or one after the other: both fit alike, and the '
+            'intervals contain both'
+        )
+    near = [one for one in optima if one.deviance - optima[0].deviance <= rise]
+    if len(near) > 1:
         each = ' or '.join(
             f'{1e3 * length:.1f} mm with skin {1e3 * skin:.1f} mm'
-            for one in alike
+            for one in near
             for _, length, skin in search.lengths(one.x)
         )
-        yield f'{len(alike)} sets of lengths fit alike, the intervals contain all: lambda {each}'
+        yield f'{len(near)} sets of lengths fit alike, the intervals contain all: lambda {each}'
     for one in media:
         name = one.medium or 'these recordings'
         if one.held_out is not None and one.held_out.rms > _WORSE * one.rms:
@@ -296,7 +311,10 @@ def _warnings(
             )
         for constant in one.parameters:
             if constant.name.startswith('frame') and abs(constant.value) > _ROTATED:
+                low, high = constant.interval
+                may = 'may differ' if low <= 0.0 <= high else 'differ'
                 yield (
-                    f'{name}: the frames of guide and tip differ by {constant.symbol} = '
-                    f'{constant.value:.2f} rad: check the registration of the sensor'
+                    f'{name}: the frames of guide and tip {may} by {constant.symbol} = '
+                    f'{constant.value:.2f} rad ({low:.2f} to {high:.2f}): check the registration '
+                    'of the sensor'
                 )

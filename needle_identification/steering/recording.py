@@ -68,19 +68,28 @@ class SteeringRecording(Displayed):
 
 
 def readings(recording: SteeringRecording) -> SteeringRecording:
-    """Average successive rows at rest, and as many other rows as needed for at most 100."""
+    """
+    Average successive rows at rest, and as many other rows as needed for at most 100.
+
+    Of a rest, the second half counts for the tip: tissue and filters settle.
+    """
     moved = np.column_stack([recording.depth, recording.guide, _LEVER * recording.roll])
     starts = [0]
     for k, row in enumerate(moved):
         if np.abs(row - moved[starts[-1]]).max() > _REST:
             starts.append(k)
+    rests = np.diff([*starts, len(moved)])
+    place = np.arange(len(moved)) - np.repeat(starts, rests)
+    late = recording.known & (place >= np.repeat(rests // 2, rests))
     starts = starts[:: ceil(len(starts) / _MOST)]
-    known = recording.known[:, np.newaxis]
-    count = np.add.reduceat(known.astype(np.float64), starts)
-    sums = np.add.reduceat(np.where(known, recording.tip, 0.0), starts)
+    rows = np.diff([*starts, len(moved)])
+    group = np.repeat(np.arange(len(starts)), rows)
+    # Without a late reading, all readings of the rest.
+    used = late | (recording.known & ~np.isin(group, group[late]))
+    count = np.bincount(group[used], minlength=len(starts))[:, np.newaxis]
+    sums = np.add.reduceat(np.where(used[:, np.newaxis], recording.tip, 0.0), starts)
     tip = np.divide(sums, count, out=np.full_like(sums, np.nan), where=count > 0)
-    rows = np.diff([*starts, len(moved)])[:, np.newaxis]
-    means = np.add.reduceat(moved, starts) / rows
+    means = np.add.reduceat(moved, starts) / rows[:, np.newaxis]
     return replace(
         recording, depth=means[:, 0], guide=means[:, 1:3], roll=means[:, 3] / _LEVER, tip=tip
     )

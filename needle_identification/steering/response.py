@@ -47,7 +47,8 @@ class SimulatedCauses:
         poses[2, :, 5] = recording.roll
         if order == 'guide first':
             # The guide moves to its next position before the needle, except at the last depth.
-            poses = np.repeat(poses, 2, axis=1)[:, 1:]
+            # Contiguous, as compiled.
+            poses = np.repeat(poses, 2, axis=1)[:, 1:].copy()
             poses[:, 1::2, 0] = depth[:-1]
         self._poses, self._deepest = poses, float(depth.max())
         self._every = 2 if order == 'guide first' else 1

@@ -169,19 +169,20 @@ def test_a_simulated_needle_with_a_guide_at_rest_is_not_identified(
 
 
 def test_rows_at_rest_are_one_reading() -> None:
-    """Ten readings at each depth with their own noise: as one reading with their mean."""
+    """Ten readings at each depth, where the tip settles: as one reading, the mean of the last."""
     one = insertion(1)
     rng = np.random.default_rng(1)
     noise = 1e-4 * rng.standard_normal((10 * len(one.depth), 2))
+    unsettled = 3e-3 * np.tile(np.arange(10) < 5, len(one.depth))[:, np.newaxis]
     rows = np.repeat(np.arange(len(one.depth)), 10)
     often = replace(
         one,
         depth=one.depth[rows],
         guide=one.guide[rows],
         roll=one.roll[rows],
-        tip=one.tip[rows] + noise,
+        tip=one.tip[rows] + noise + unsettled,
     )
-    mean = replace(one, tip=one.tip + noise.reshape(-1, 10, 2).mean(axis=1))
+    mean = replace(one, tip=one.tip + noise.reshape(-1, 10, 2)[:, 5:].mean(axis=1))
     [found], [wanted] = (identify_steering([r], TILTED).media for r in (often, mean))
     assert found.samples == wanted.samples == len(one.depth)
     # Rounding of the means, and the end of the search.
@@ -256,7 +257,7 @@ def test_a_table_of_another_laboratory_is_read_with_options(
     low, high = medium['parameters']['bending_length']['interval']
     assert low < PLAIN.length < high
     assert medium['rms'] == pytest.approx(NOISE, rel=0.15)
-    assert main(['identify', 'steering', *paths, *options]) == 0
+    assert main(['identify', 'steering', str(tmp_path), *options]) == 0
     text = capsys.readouterr().out
     assert 'Bending length lambda [m]' in text
     assert tmp_path.name in text
