@@ -22,7 +22,7 @@ def main() -> None:
     # keep=False keeps the end of each run only.
     batch = simulate_batch(needles, start, 3.0, duration=1.0, interval=1e-2, keep=False)
 
-    depth = 1e3 * (needles[0].length - batch.states[:, -1, 0])
+    depth = 1e3 * batch.depth[:, -1]
     low, middle, high = np.percentile(depth, (2.5, 50.0, 97.5))
     print(f'{len(needles)} needles, depth after {batch.time[-1]:g} s:')
     print(f'median {middle:.1f} mm, 95 % of them between {low:.1f} and {high:.1f} mm')

@@ -6,12 +6,14 @@ The first driver accepts efforts, like a forward controller of ros2_control; the
 positions. Run a driver, and the controller with the parameters in docs/howto/own-robot.md.
 """
 
+from contextlib import suppress
 from math import copysign, exp
 import sys
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -88,4 +90,5 @@ class PositionRobot(Node):
 
 if __name__ == '__main__':
     rclpy.init()
-    rclpy.spin(PositionRobot() if 'position' in sys.argv else ForceRobot())
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(PositionRobot() if 'position' in sys.argv else ForceRobot())

@@ -21,7 +21,7 @@ from needle_ros.settings import from_values, unknown_name
 DEFAULT_NEEDLE: Final = 'bending_35mm'
 
 FILES: Final = ('.yaml', '.yml')  #: Ends of the names of files of needles.
-_DIAMETERS: Final = ('outer_diameter', 'inner_diameter')  #: of a tube, in place of its area
+DIAMETERS: Final = ('outer_diameter', 'inner_diameter')  #: of a tube, in place of its area
 _PREFIXES: Final = ('model.', 'steering.')  #: Prefixes of the constants in a ROS parameter file.
 
 
@@ -43,11 +43,11 @@ class NeedlePreset(NamedTuple):
 
         ``outer_diameter`` and ``inner_diameter`` [m] of a tube stand for area and area moment.
         """
-        values = _of_tube(values)
+        values = of_tube(values)
         known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
         for name in values:
             if name not in known:
-                raise ParameterError(unknown_name(name, [*known, *_DIAMETERS]))
+                raise ParameterError(unknown_name(name, [*known, *DIAMETERS]))
 
         def replaced(part: Any) -> Any:
             own = {item.name: values[item.name] for item in fields(part) if item.name in values}
@@ -61,14 +61,14 @@ def tube(outer: float, inner: float = 0.0) -> tuple[float, float]:
     return pi / 4.0 * (outer**2 - inner**2), pi / 64.0 * (outer**4 - inner**4)
 
 
-def _of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
+def of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
     """Replace the diameters of a tube by its area and area moment."""
-    others = {name: value for name, value in values.items() if name not in _DIAMETERS}
+    others = {name: value for name, value in values.items() if name not in DIAMETERS}
     if len(others) == len(values):
         return others
     outer, inner = (
         quantity(value, 'm') if isinstance(value := values.get(name, 0.0), str) else value
-        for name in _DIAMETERS
+        for name in DIAMETERS
     )
     numbers = isinstance(outer, (int, float)) and isinstance(inner, (int, float))
     if not (numbers and 0.0 <= inner < outer):

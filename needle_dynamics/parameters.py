@@ -201,9 +201,9 @@ class NeedleParameters:
     def preset(cls, name: str, **changes: Any) -> NeedleParameters:
         """Return the constants of a needle of `find_needle` by name, with changed fields."""
         # Imported here: the needles that bend are above this module.
-        from needle_dynamics.needles import find_needle
+        from needle_dynamics.needles import find_needle, of_tube
 
-        return from_values(cls, {**asdict(find_needle(name).needle), **changes})
+        return from_values(cls, {**asdict(find_needle(name).needle), **of_tube(changes)})
 
 
 _PAPER_SI = NeedleParameters()

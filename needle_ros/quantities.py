@@ -12,6 +12,7 @@ _LENGTHS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6}
 
 #: Name and example of a quantity, and its accepted units with their factors, by SI unit.
 _KINDS: Final[Mapping[str, tuple[str, str, Mapping[str, float]]]] = {
+    '1': ('number', '0.001', {'1': 1.0}),
     'm': ('length', '0.05 or 50mm', _LENGTHS),
     's': ('time', '20 or 20s', {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'min': 60.0}),
     'N': ('force', '3 or 3N', {'N': 1.0, 'mN': 1e-3}),
@@ -47,7 +48,8 @@ def quantity(text: str, unit: str) -> float:
             return float(found[1]) * known[found[2] or unit]
     except ValueError:
         pass
-    raise ParameterError(f'{text.strip()!r} is not a {kind}, such as {example}')
+    article = 'an' if kind[0] in 'aeiou' else 'a'
+    raise ParameterError(f'{text.strip()!r} is not {article} {kind}, such as {example}')
 
 
 def quantities(text: str, unit: str) -> list[float]:

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import quantity
 from needle_ros.settings import find_class
 import numpy as np
 from scipy import stats
@@ -117,17 +118,21 @@ def _frozen(kind: str, numbers: tuple[float, ...]) -> Any:
     return found
 
 
-def distribution(name: str, given: Any) -> Distribution:
-    """Parse a distribution: a number, or a mapping as ``{normal: [0, 0.02], within: [0, 1]}``."""
-    if is_number(given):
-        return Distribution(_CHOICE, (float(given),))
+def distribution(name: str, given: Any, unit: str = '1') -> Distribution:
+    """
+    Parse a distribution: a number, or a mapping as ``{normal: [0, 0.02], within: [0, 1]}``.
+
+    Numbers are in the SI unit, or text with another unit of its kind, such as ``4mm``.
+    """
+    if is_number(given) or isinstance(given, str):
+        return Distribution(_CHOICE, _numbers(name, [given], unit))
     if not isinstance(given, Mapping):
         raise ParameterError(f'{name} must be a number or one of {_kinds()}, got {given!r}')
     kinds = [str(kind) for kind in given if kind not in (_WITHIN, _WEIGHTS, _OF)]
     if len(kinds) != 1 or not (kinds[0] in (*KINDS, _CHOICE, _ROWS) or ':' in kinds[0]):
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
-    numbers = _numbers(f'{name}: {kind}', given[kind])
+    numbers = _numbers(f'{name}: {kind}', given[kind], unit)
     if kind in (_CHOICE, _ROWS):
         return _choice(name, kind, numbers, given)
     if _WEIGHTS in given or _OF in given:
@@ -140,7 +145,7 @@ def distribution(name: str, given: Any) -> Distribution:
             raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
     if _WITHIN not in given:
         return Distribution(kind, numbers)
-    ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN])
+    ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN], unit)
     # The probabilities differ if a value is between the ends.
     if len(ends) != 2 or not np.diff(_frozen(kind, numbers).cdf(ends)) > 0.0:
         raise ParameterError(
@@ -198,11 +203,15 @@ def is_number(value: Any) -> bool:
     return number and abs(value) <= _LARGEST
 
 
-def _numbers(name: str, given: Any) -> tuple[float, ...]:
+def _numbers(name: str, given: Any, unit: str = '1') -> tuple[float, ...]:
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{name} takes a list of numbers, got {given!r}')
-    if not all(map(is_number, given)):
+    try:
+        numbers = [quantity(one, unit) if isinstance(one, str) else one for one in given]
+    except ParameterError as error:
+        raise ParameterError(f'{name}: {error}') from error
+    if not all(map(is_number, numbers)):
         raise ParameterError(
             f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
         )
-    return tuple(map(float, given))
+    return tuple(map(float, numbers))

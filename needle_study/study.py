@@ -148,7 +148,10 @@ def build_study(document: Any) -> Study:
     known = scenario.variables
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.
-    population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
+    population = {
+        name: distribution(f'population: {name}', given[name], known[name].unit)
+        for name in sorted(given)
+    }
     lengths = {(one.rows, len(one.numbers)) for one in population.values() if one.rows}
     if len({rows for rows, _ in lengths}) < len(lengths):
         raise ParameterError('population: variables of the same table must have as many rows')

@@ -199,7 +199,9 @@ def _jackknife(value: float, without: Sequence[float], samples: int) -> Estimate
     count = len(without)
     error = sqrt((count - 1) / count * float(np.sum((np.array(without) - np.mean(without)) ** 2)))
     half = float(stdtrit(count - 1, 1.0 - _TAIL)) * error
-    return Estimate(value, max(0.0, value - half), min(1.0, value + half), samples)
+    # A fraction: also of an estimate with an error.
+    value, low, high = (min(max(0.0, one), 1.0) for one in (value, value - half, value + half))
+    return Estimate(value, low, high, samples)
 
 
 def _sorted(values: FloatArray, by: FloatArray, parts: IntArray) -> Estimate:

@@ -146,7 +146,8 @@ def simulate_batch(
     step = checked_step(step)
     _check(each, starts)
     inputs = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
-    ends = np.array(np.broadcast_to(starts, (runs, starts.shape[1])))
+    # In C order, as compiled.
+    ends = np.broadcast_to(starts, (runs, starts.shape[1])).copy()
     workers = thread_count(workers, runs)
     with progress_of(progress, runs, 'runs') as advance:
         kept, completed = _take(each, ends, inputs, keep=keep, workers=workers, progress=advance)

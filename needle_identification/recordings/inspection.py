@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inspect a recording: list its content, find force and motion, suggest a command."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -20,7 +20,14 @@ from needle_identification.recordings.reading import (
     read_indentation_recording,
 )
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
-from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES, with_unit
+from needle_identification.recordings.tables import (
+    guessed,
+    is_table,
+    read_friction_table,
+    read_table,
+    ROLES,
+    with_unit,
+)
 from needle_identification.steering.columns import (
     check_depth,
     is_inverted,
@@ -129,6 +136,12 @@ def _table(path: Path) -> Inspection:
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
         columns_of = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
+    elif _is_reversed(path, roles):
+        columns_of = {
+            role: f'-{spec}' if role in ('depth', 'speed') else spec
+            for role, spec in roles.items()
+        }
+        words.append('motion reversed: the force of friction has the sign of the velocity')
     words += [unknown] * bool(unknown)
     named = ','.join(f'{role}={spec}' for role, spec in columns_of.items())
     return Inspection(
@@ -136,6 +149,16 @@ def _table(path: Path) -> Inspection:
         command=shlex.join(['needle', 'identify', kind, str(path), '--columns', named]),
         lacking=unknown,
     )  # fmt: skip
+
+
+def _is_reversed(path: Path, roles: Mapping[str, str]) -> bool:
+    """Return whether the force opposes the motion of the base."""
+    try:
+        read = read_friction_table(path, roles)
+    except RecordingError:
+        return False
+    velocity = np.gradient(read.depth, read.time) if read.velocity is None else read.velocity
+    return bool(np.cov(np.sign(velocity), read.force)[0, 1] < 0.0)
 
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:

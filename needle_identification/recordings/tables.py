@@ -170,7 +170,11 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
 def guessed(
     names: Iterable[str], usual_names: Mapping[str, Sequence[str]] = _USUAL
 ) -> dict[str, str]:
-    """Find names by role from usual names, in order of preference, lower case without signs."""
+    """
+    Find names by role from usual names, in order of preference, lower case without signs.
+
+    Roles of friction are also found by unit: the only column in N is the force.
+    """
     plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
@@ -180,9 +184,10 @@ def guessed(
             if alike:
                 found[role] = alike[0]
                 break
-    by_unit = [name for name in plain if unit_of(name, 'force')]
-    if 'force' in usual_names and len(by_unit) == 1:
-        found.setdefault('force', by_unit[0])
+    for role in ROLES if usual_names is _USUAL else ():
+        by_unit = [name for name in plain if unit_of(name, role)]
+        if len(by_unit) == 1 and by_unit[0] not in found.values():
+            found.setdefault(role, by_unit[0])
     pairs = [
         (sec, nanosec)
         for sec in plain

@@ -28,12 +28,17 @@ def run(options: argparse.Namespace) -> int:
             print_each('error', [error])
             bad += 1
     if found or options.json:
-        text = '\n\n'.join(map(_text, found))
+        # One command is for all recordings of a kind.
+        kinds = {one.command.split()[2] for one in found if one.command}
+        several = len(found) > 1 and len(kinds) == 1
+        text = '\n\n'.join(_text(one, several=several) for one in found)
+        if several:
+            text += '\n\ntry, for all of them: needle identify RECORDINGS'
         print_result([plain(one) for one in found], text, as_json=options.json)
     return 2 if bad else 0
 
 
-def _text(found: Inspection) -> str:
+def _text(found: Inspection, *, several: bool) -> str:
     rows = []
     for content in found.contents:
         first = (
@@ -52,6 +57,6 @@ def _text(found: Inspection) -> str:
     lines = [found.path, table([tuple(map(shown, row)) for row in rows], heads)]
     lines += [f'warning: {shown(words)}' for words in found.losses]
     lines += [shown(words) for words in found.words]
-    if found.command:
+    if found.command and not several:
         lines += [f'try: {shown(found.command)}']
     return '\n'.join(lines)

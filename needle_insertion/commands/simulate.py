@@ -21,6 +21,7 @@ from needle_dynamics import (
     simulate,
     SteeringParameters,
 )
+from needle_dynamics.needles import DIAMETERS
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
 from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
@@ -139,8 +140,7 @@ def run(options: argparse.Namespace) -> int:
         if given and model != chosen:
             raise ParameterError(
                 f'--{given[0].replace("_", "-")} is an option of --model {model}, not of '
-                f'{chosen}, the model of {needle}; try --needle '
-                f'{PAPER_NEEDLE if model == _MODES else DEFAULT_NEEDLE}'
+                f'{chosen}, the model of {needle}; try --model {model}'
             )
     return _run_modes(needle, options) if chosen == _MODES else _run_steering(needle, options)
 
@@ -185,7 +185,7 @@ def _pace(ratio: float) -> str:
 
 def _changed(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
     given = common.constants(words)
-    valid = [*NEEDLE_CONSTANTS, *(item.name for item in fields(SteeringParameters))]
+    valid = [*NEEDLE_CONSTANTS, *DIAMETERS, *(item.name for item in fields(SteeringParameters))]
     for key in given:
         if key not in valid:
             raise ParameterError(unknown_name(key, valid))

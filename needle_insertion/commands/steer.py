@@ -27,6 +27,7 @@ from needle_dynamics import (
     NeedleParameters,
     SteeringParameters,
 )
+from needle_dynamics.needles import DIAMETERS
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
@@ -135,8 +136,8 @@ def _task(
             f'{options.step!r} m'
         )
     for name in common.constants(options.set):
-        if name not in CONSTANTS:
-            raise ParameterError(unknown_name(name, CONSTANTS))
+        if name not in (*CONSTANTS, *DIAMETERS):
+            raise ParameterError(unknown_name(name, [*CONSTANTS, *DIAMETERS]))
     given = {**asdict(SteeringPrior()), **common.constants(options.prior)}
     needle, steering, _ = found.changed(common.constants(options.set))
     prior = from_values(SteeringPrior, given)

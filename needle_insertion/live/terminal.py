@@ -208,7 +208,8 @@ class Terminal(Cmd):
             if isinstance(status, ControllerStatus) and status.commissioning is not self._checked:
                 self._checked = status.commissioning
                 phase = self._checked.value if self._checked else ''
-                self._say(f'{name}: first motion {phase} {status.commissioning_result}'.rstrip())
+                result = status.commissioning_result and f': {status.commissioning_result}'
+                self._say(f'{name}: first motion {phase}{result}')
 
     def do_target(self, words: list[str]) -> None:
         aims = self._operator.aims

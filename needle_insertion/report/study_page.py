@@ -48,7 +48,11 @@ _WORST: Final = 10  #: number of worst samples in the list
 
 
 def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
-    """Write the page of a study whose table is complete; return its main results as rows."""
+    """
+    Write the page of a study whose table is complete; return its main results as rows.
+
+    These are the cards of the page, and the largest Sobol index of each variable.
+    """
     study, table = results.study, results.table
     metrics, drawn = study.scenario.metrics, list(study.population)
     main = next(iter(metrics))
@@ -108,8 +112,15 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
             (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
             for place, number in enumerate(bad)
         ],
+        variables=[
+            (name, f'{one.default:g}', one.unit, one.meaning)
+            for name, one in study.scenario.variables.items()
+        ],
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
+    for name in order if shares else ():
+        value, ends = _rounded(shares[name].total or shares[name].first, '%')
+        cards.append((f'Variance by {name}', value, f'95 %: {ends}'))
     return cards
 
 

@@ -70,8 +70,8 @@ def test_membranes_start_depth_and_seed_take_effect(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--force', '3N'], 'the model of bending_35mm; try --needle phantom'),
-        (['--needle', 'phantom', '--to', '9cm'], 'of phantom; try --needle bending_35mm'),
+        (['--force', '3N'], 'the model of bending_35mm; try --model modes'),
+        (['--needle', 'phantom', '--to', '9cm'], 'of phantom; try --model steering'),
         (
             ['--model', 'steering', '--force', '3'],
             '--force is an option of --model modes, not of steering',

@@ -40,7 +40,7 @@ ANSWERS = {
     'steer -o nowhere/picture.png': 'its folder does not exist',
     'simulate --depth 5': '--depth must be <= length = 0.2 m, got 5 m: lengths without a unit',
     'simulate --force 3kg': 'is not a force, such as 3 or 3N',
-    'simulate --duration 1s': 'try --needle phantom',
+    'simulate --duration 1s': 'try --model modes',
     'simulate --needle phantom --set length=150N': "with a unit of m, cm, mm, um, got '150N'",
     'simulate --needle phantom --depth 500mm': 'outside [0.001, 0.2] m',
     'simulate --frce 3N': 'did you mean --force?',

@@ -287,3 +287,40 @@ def test_an_annotation_without_a_type_is_rejected() -> None:
 
     with pytest.raises(TypeError, match='is not a number, an array with dimensions'):
         numba_type(FloatArray)
+
+
+def test_functions_are_called_with_the_types_that_are_compiled() -> None:
+    """Nothing is compiled after `needle compile`: identification, both kinds of batches."""
+    code = """
+from importlib import import_module
+
+import numpy as np
+from needle_dynamics import NEEDLES, NeedleModel, NeedleParameters, insert_batch, simulate_batch
+from needle_dynamics.compiled.cache import kernels
+from needle_dynamics.compiled.signatures import argument_types
+from needle_identification.steering.response import ORDERS, SimulatedCauses
+from needle_identification import SteeringRecording
+
+zero = np.zeros((5, 2))
+depth = np.linspace(0.0, 0.1, 5)
+one = SteeringRecording(depth=depth, guide=zero, roll=zero[:, 0], tip=zero)
+for order in ORDERS:
+    SimulatedCauses(one, order).responses(0.04, 0.035, 0.0)
+for needle, steering, _ in NEEDLES.values():
+    insert_batch(needle, steering, depth[np.newaxis])
+phantom = NeedleParameters.preset('phantom')
+start = NeedleModel(phantom).state_at(0.05)
+for states in (start, [start, start]):
+    simulate_batch([phantom, phantom], states, 3.0, duration=0.1, interval=0.05)
+for name in kernels(['needle_dynamics.compiled.cut', 'needle_dynamics.compiled.lanes']):
+    module, _, own = name.partition(':')
+    found = getattr(import_module(module), own)
+    assert {*found.dispatcher.signatures} <= {argument_types(found.py_func)}, name
+    print(name, len(found.dispatcher.signatures))
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'needle_dynamics.compiled.lanes:run 1' in done.stdout
+    assert 'needle_dynamics.compiled.cut:insert 1' in done.stdout

@@ -14,7 +14,8 @@ from typing import Any
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from needle_dynamics import FloatArray
-from needle_identification import BagWriter
+from needle_identification import BagWriter, RecordingError
+from needle_identification.bags.bag import Bag
 from needle_insertion.cli import main
 import numpy as np
 from numpy.typing import NDArray
@@ -452,7 +453,8 @@ def test_the_error_for_other_files_gives_instructions(
     assert 'old.bag is damaged' in refused(old)
     folder = tmp_path / 'runs'
     file = write_folder(folder / 'one', recorded()[:10])
-    assert f'name those inside, such as {folder / "one"}' in refused(folder)
+    with pytest.raises(RecordingError, match=f'name those inside, such as {folder / "one"}'):
+        Bag(folder)
     for name in ('monday.mcap', 'tuesday.mcap'):
         shutil.copy(file, folder / name)
     assert f'several recordings; name them, such as {folder / "monday.mcap"}' in refused(folder)

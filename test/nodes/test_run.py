@@ -216,7 +216,9 @@ def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path
 
     status, said, complained = answered(tmp_path / 'run')
     assert (status, complained) == (0, ''), said
-    assert re.search(r'^controller: first motion passed moved -0\.\d+ mm, \d+ ms late', said, re.M)
+    assert re.search(
+        r'^controller: first motion passed: moved -0\.\d+ mm, \d+ ms late', said, re.M
+    )
     # The needle is no longer where it was measured.
     status, said, complained = answered(tmp_path / 'again')
     assert status == 1

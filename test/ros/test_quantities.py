@@ -35,6 +35,7 @@ def test_quantity_is_read_with_or_without_unit(text: str, unit: str, value: floa
 def test_examples_are_quantities() -> None:
     # 5 degrees: up to the rounding of the factor.
     assert {unit: quantity(text, unit) for unit, text in EXAMPLES.items()} == {
+        '1': 0.001,
         'm': 0.05,
         's': 20.0,
         'N': 3.0,

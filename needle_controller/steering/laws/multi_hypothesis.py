@@ -151,7 +151,7 @@ class MultiHypothesisLaw(SteeringLaw):
         before, self._now.target[:] = self.target, checked_target(target)
         self._hit_probability = None
         if self.hit_probability < _REFUSED:
-            error = OutOfReachError(self._unreachable(), self.reach)
+            error = OutOfReachError(self._reachable('out of reach'), self.reach)
             self._now.target[:], self._hit_probability = before, None
             raise error
 
@@ -208,14 +208,15 @@ class MultiHypothesisLaw(SteeringLaw):
     @property
     def warning(self) -> str:
         """Warning if the target is probably out of reach, '' otherwise."""
-        return '' if self.hit_probability >= _WARNED else self._unreachable()
+        within = f'within reach with a probability of {self.hit_probability:.0%} only'
+        return '' if self.hit_probability >= _WARNED else self._reachable(within)
 
-    def _unreachable(self) -> str:
+    def _reachable(self, target: str) -> str:
         middles, sizes, w = self.reach
         middle, size = 1e3 * complex(w @ middles), 1e3 * complex(w @ sizes)
         x, z = 1e3 * self.target
         return (
-            f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: reachable are '
+            f'the target x = {x:.2f} mm, z = {z:.2f} mm is {target}: reachable are '
             f'x = {middle.real:.2f} ± {size.real:.2f} mm, z = {middle.imag:.2f} ± '
             f'{size.imag:.2f} mm'
         )
