@@ -45,8 +45,9 @@ wheel: setup
 # The marker is written last: an interrupted setup restarts. Older versions of pip install without a word.
 $(VENV)/.complete: requirements.lock setup.py package.xml
 	@echo 'installing 750 MB into $(VENV), a minute or two'
-	$(PYTHON) -m venv --clear $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=25.1'
+	$(PYTHON) -m venv --clear --without-pip $(VENV)
+	$(BIN)/python -m ensurepip --default-pip
+	$(BIN)/python -m pip install --disable-pip-version-check 'pip>=25.1'
 	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
