@@ -116,10 +116,20 @@ def is_table(path: Path | str) -> bool:
 
 def recordings_in(path: Path) -> list[Path]:
     """Return the tables and bags in a folder that is no bag itself, in any other case the path."""
-    inside = sorted(path.iterdir()) if path.is_dir() else []
-    if any(form_of(one) and one.is_file() for one in inside):
-        return [path]
-    return [one for one in inside if is_table(one) or (one / METADATA).is_file()] or [path]
+    inside = [] if _has_bag(path) else _inside(path)
+    return [one for one in inside if is_table(one) or _has_bag(one)] or [path]
+
+
+def _has_bag(folder: Path) -> bool:
+    """Whether a folder has files of a bag, also of one that was not closed."""
+    return any(form_of(one) or one.name == METADATA for one in _inside(folder) if one.is_file())
+
+
+def _inside(folder: Path) -> list[Path]:
+    # A folder that cannot be read is reported when it is read as a recording.
+    with suppress(OSError):
+        return sorted(folder.iterdir()) if folder.is_dir() else []
+    return []
 
 
 def read_table(path: Path) -> Table:
