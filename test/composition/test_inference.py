@@ -57,7 +57,8 @@ def test_path_noise_increases_the_summary_of_curvature() -> None:
         for noise in (1e-5, 1e-2)
     ]
     assert summaries[0].shape == (50, 24)
-    assert (summaries[1][:, -2:].mean(axis=0) > summaries[0][:, -2:].mean(axis=0) + 0.2).all()
+    # By 0.2, with a standard error of 0.03 for fifty needles.
+    assert (summaries[1][:, -2:].mean(axis=0) > summaries[0][:, -2:].mean(axis=0) + 0.1).all()
 
 
 def test_inferred_parameters() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 import ctypes
 import os
 from pathlib import Path
@@ -42,7 +43,12 @@ def _is_permitted() -> bool:
 def _policies(process: int) -> set[tuple[int, int]]:
     """Return policy and priority of all threads of a process."""
     threads = [int(one.name) for one in Path(f'/proc/{process}/task').iterdir()]
-    return {(os.sched_getscheduler(one), os.sched_getparam(one).sched_priority) for one in threads}
+    found = set()
+    for one in threads:
+        # A thread may end after the listing.
+        with suppress(ProcessLookupError):
+            found.add((os.sched_getscheduler(one), os.sched_getparam(one).sched_priority))
+    return found
 
 
 @pytest.mark.skipif(not _is_permitted(), reason='no right to use real-time scheduling')
