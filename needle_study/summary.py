@@ -219,7 +219,7 @@ def _sorted(values: FloatArray, by: FloatArray, parts: IntArray) -> Estimate:
         ]
         between = sum(n * (mean - y_.mean()) ** 2 for n, mean in means) / (len(y_) * y_.var())
         by_chance = (_GROUPS - 1) / (len(y_) - 1)
-        return float(max(0.0, (between - by_chance) / (1.0 - by_chance)))
+        return float((between - by_chance) / (1.0 - by_chance))
 
     without = [index(parts != part) for part in range(REPLICATES)]
     return _jackknife(index(np.ones(len(y), dtype=np.bool_)), without, len(y))

@@ -132,7 +132,7 @@ def _table(path: Path) -> Inspection:
         try:
             check_depth(table, steered['depth'])
         except RecordingError as error:
-            unknown = str(error)
+            unknown = str(error).removeprefix(f'{path}: ')
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
         columns_of = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
