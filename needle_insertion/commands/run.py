@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_insertion.commands.common import add_needle, check_folder
+from needle_insertion.progress import ProgressLine
 from needle_ros.errors import ParameterError
 
 
@@ -47,10 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     # Imported here: rclpy takes a second.
-    from needle_dynamics import find_needle
-    from needle_insertion.compilation import compile_nodes
-    from needle_insertion.live.session import config_file, Session
-    from needle_insertion.live.session import run as run_session
+    with ProgressLine('needle run', brief=True):
+        from needle_dynamics import find_needle
+        from needle_insertion.compilation import compile_nodes
+        from needle_insertion.live.session import config_file, Session
+        from needle_insertion.live.session import run as run_session
 
     if options.output is None:
         options.output = Path('needle_runs') / f'{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}'

@@ -18,6 +18,7 @@ from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
 from needle_insertion.live.terminal import Terminal, Warnings
+from needle_insertion.progress import ProgressLine
 from needle_ros import contract
 from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
@@ -99,8 +100,9 @@ def run(session: Session) -> int:
                 if not rests:
                     terminal.stop()
         # Nodes that move the needle end first, the recorder last: the bag is complete.
-        for process in sorted(processes, key=lambda one: _ENDING.index(one.name)):
-            process.interrupt()
+        with ProgressLine('ending the nodes', brief=True):
+            for process in sorted(processes, key=lambda one: _ENDING.index(one.name)):
+                process.interrupt()
     if 'recorder' in session.nodes:
         screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
     return 0
