@@ -2,6 +2,9 @@
 """
 Sampling designs: uniform numbers, noise and replicate of each sample of a study.
 
+The replicates of a Sobol sequence are scrambled independently [Owen1998]_. Sobol' indices are
+computed from groups of samples [Saltelli2010]_.
+
 References
 ----------
 .. [Owen1998] A. B. Owen, "Scrambling Sobol' and Niederreiter-Xing points", Journal of Complexity
@@ -110,7 +113,7 @@ class LatinDesign(RandomDesign):
 
 
 class SobolDesign(RandomDesign):
-    """Independently scrambled Sobol sequences, which take turns [Owen1998]_."""
+    """Independently scrambled Sobol sequences, which take turns."""
 
     name = 'sobol'
     replicates = REPLICATES
@@ -137,7 +140,7 @@ class SobolDesign(RandomDesign):
 
 class SaltelliDesign(SobolDesign):
     """
-    Groups of samples for Sobol' indices [Saltelli2010]_, where the noise is one more variable.
+    Groups of samples for Sobol' indices, where the noise is one more variable.
 
     A group has a sample A, a sample B, A with the noise of B, and for each variable A with the
     value of this variable in B.

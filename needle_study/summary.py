@@ -2,6 +2,10 @@
 """
 Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable.
 
+The interval of a probability is that of Wilson, for the number of independent samples with the
+variance between the replicates of the design [Korn1998]_. Sobol' indices are correlations of
+samples that have variables in common [Janon2014]_.
+
 References
 ----------
 .. [Janon2014] A. Janon et al., "Asymptotic normality and efficiency of two Sobol index
@@ -85,8 +89,7 @@ def probability(parts: Iterable[FloatArray], design: RandomDesign | None = None)
     """
     Estimate the fraction of ones among 1 and 0, with the interval of Wilson; NaN is ignored.
 
-    The replicates of a design give the number of independent samples that have the same variance
-    [Korn1998]_.
+    The replicates of a design give the number of independent samples that have the same variance.
     """
     sums = np.zeros((2, max(1, design.replicates if design else 0)))
     first = 0
@@ -152,9 +155,9 @@ def indices(
     """
     Estimate the Sobol' indices of each variable, by variable; empty for fewer than 200 samples.
 
-    The groups of a design `saltelli` also have the index of the noise, total indices
-    [Janon2014]_, and for all variables of a table one index, by its name. For other designs the
-    samples are grouped by each variable. The intervals are of the jackknife over the replicates of
+    The groups of a design `saltelli` also have the index of the noise, total indices, and for all
+    variables of a table one index, by its name. For other designs the samples are grouped by each
+    variable. The intervals are of the jackknife over the replicates of
     the design, or over as many parts.
     """
     if np.count_nonzero(np.isfinite(values)) < _FEWEST:
