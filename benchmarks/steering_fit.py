@@ -120,13 +120,6 @@ def insertion(
     )
 
 
-_COUNTS: Final = {
-    'one insertion': 1,
-    'two insertions': 2,
-    'four insertions': 4,
-    'ten insertions': 10,
-}
-
 #: Paths that wander, in frames that differ between insertions.
 _REAL: Final = FitTruth(path_noise=1e-3, slope=0.02)
 
@@ -158,7 +151,10 @@ _CASES: Final = (
     ('four insertions, path and frame vary', _REAL, 4),
     ('ten insertions', FitTruth(), 10),
     ('ten insertions, path and frame vary', _REAL, 10),
-    *((f'{words} of a population', None, count) for words, count in _COUNTS.items()),
+    ('one insertion of a population', None, 1),
+    ('two insertions of a population', None, 2),
+    ('four insertions of a population', None, 4),
+    ('ten insertions of a population', None, 10),
 )
 
 #: Constants, and their symbols.

@@ -38,7 +38,7 @@ class SpringNode(Node):
 
 
 def test_the_spring_reaches_its_depth(tmp_path: Path) -> None:
-    """The needle comes to rest where the spring is weaker than the static friction."""
+    """To a millimeter: friction holds the needle where the spring pushes with less than 0.56 N."""
     with Graph(tmp_path) as graph:
         graph.start('plant', {'needle': 'phantom', 'depth': 0.04})
         user = graph.node('user')

@@ -140,7 +140,7 @@ class SobolDesign(RandomDesign):
 
 class SaltelliDesign(SobolDesign):
     """
-    Groups of samples for Sobol' indices, where the noise is one more variable.
+    Groups of samples for Sobol' indices, where the noise is a variable, too.
 
     A group has a sample A, a sample B, A with the noise of B, and for each variable A with the
     value of this variable in B.

@@ -2,9 +2,9 @@
 """
 Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable.
 
-The interval of a probability is that of Wilson, for the number of independent samples with the
-variance between the replicates of the design [Korn1998]_. Sobol' indices are correlations of
-samples that have variables in common [Janon2014]_.
+The interval of a probability is by the method of Wilson, with the number of independent samples
+that has the variance between the replicates of the design [Korn1998]_. Sobol' indices are
+correlations of samples that have variables in common [Janon2014]_.
 
 References
 ----------
@@ -32,7 +32,6 @@ _TAIL: Final = 0.025  #: probability of an interval above the true value, and be
 
 #: Groups of samples in the estimate of a variance fraction, and the least number of samples.
 _GROUPS, _FEWEST = 32, 200
-
 
 #: Name of the noise among the variables.
 NOISE: Final = 'noise'
@@ -100,7 +99,7 @@ def probability(parts: Iterable[FloatArray], design: RandomDesign | None = None)
     n, yes = sums.sum(axis=1).tolist()
     if n == 0:
         return Estimate(np.nan, 0.0, 1.0, 0)
-    p, (size, z) = yes / n, _size(sums)
+    p, size, z = yes / n, _size(sums), _NORMAL
     middle = (p + z * z / (2 * size)) / (1.0 + z * z / size)
     half = z / (1.0 + z * z / size) * sqrt(p * (1.0 - p) / size + z * z / (4 * size * size))
     return Estimate(p, max(0.0, middle - half), min(1.0, middle + half), int(n))
@@ -114,15 +113,17 @@ def _sums(
     return np.array([np.bincount(at, one, replicates) for one in (np.ones(len(values)), values)])
 
 
-def _size(sums: FloatArray) -> tuple[float, float]:
-    """Return the equivalent number of independent samples, and the half-width of an interval."""
+def _size(sums: FloatArray) -> float:
+    """Return the number of independent samples with the same interval, by number and sum."""
     n, yes = sums
     count, p = len(n), float(yes.sum() / n.sum())
     apart = yes - p * n
-    variance = count / max(1, count - 1) * float(apart @ apart) / n.sum() ** 2
+    variance = count / max(1, count - 1) * float(apart @ apart) / float(n.sum()) ** 2
     if variance == 0.0 or not n.all():
-        return float(n.sum()), _NORMAL
-    return p * (1.0 - p) / variance, float(stdtrit(count - 1, 1.0 - _TAIL))
+        return float(n.sum())
+    # The variance has an error: Student's distribution.
+    wider = float(stdtrit(count - 1, 1.0 - _TAIL)) / _NORMAL
+    return p * (1.0 - p) / (variance * wider**2)
 
 
 def quantile(values: FloatArray, part: float, design: RandomDesign | None = None) -> Estimate:
@@ -136,7 +137,7 @@ def quantile(values: FloatArray, part: float, design: RandomDesign | None = None
     size = n
     if design and design.replicates:
         below = (values[known] <= value).astype(np.float64)
-        size = max(1, round(_size(_sums(below, known, design, design.replicates))[0]))
+        size = max(1, round(_size(_sums(below, known, design, design.replicates))))
     # Ranks, from 1: the true value is below the first, and above the second, in one of 40 studies
     # each.
     tails = (_TAIL, 1.0 - _TAIL)
@@ -157,8 +158,7 @@ def indices(
 
     The groups of a design `saltelli` also have the index of the noise, total indices, and for all
     variables of a table one index, by its name. For other designs the samples are grouped by each
-    variable. The intervals are of the jackknife over the replicates of
-    the design, or over as many parts.
+    variable. The intervals are of the jackknife over the replicates, or over as many parts.
     """
     if np.count_nonzero(np.isfinite(values)) < _FEWEST:
         return {}
@@ -171,7 +171,7 @@ def indices(
 def _grouped(
     values: FloatArray, names: Sequence[str], design: SaltelliDesign
 ) -> dict[str, Indices]:
-    """Correlate the samples of the groups that have one variable, or all but one, in common."""
+    """Correlate the samples of the groups that share a variable, or all other variables."""
     count = len(values) // design.group
     groups = values[: count * design.group].reshape(count, design.group).T
     kept = np.isfinite(groups).all(axis=0)

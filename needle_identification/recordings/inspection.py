@@ -21,11 +21,12 @@ from needle_identification.recordings.reading import (
 )
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.recordings.tables import (
+    friction_recording,
     guessed,
     is_table,
-    read_friction_table,
     read_table,
     ROLES,
+    Table,
     with_unit,
 )
 from needle_identification.steering.columns import (
@@ -119,7 +120,7 @@ def _table(path: Path) -> Inspection:
     columns = tuple(_column(name, values) for name, values in table.columns.items())
     count = len(next(iter(table.columns.values())))
     content = Content(name=path.name, type_name='table', count=count, columns=columns)
-    words = [f'{role} by its name: {spec}' for role, spec in roles.items()]
+    words = [f'{role} by name or unit: {spec}' for role, spec in roles.items()]
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
     lacking = [role for role in ('time', 'force') if role not in roles]
     if not {'depth', 'speed'} & set(roles):
@@ -136,7 +137,7 @@ def _table(path: Path) -> Inspection:
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
         columns_of = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
-    elif _is_reversed(path, roles):
+    elif _is_reversed(table, roles):
         columns_of = {
             role: f'-{spec}' if role in ('depth', 'speed') else spec
             for role, spec in roles.items()
@@ -151,14 +152,14 @@ def _table(path: Path) -> Inspection:
     )  # fmt: skip
 
 
-def _is_reversed(path: Path, roles: Mapping[str, str]) -> bool:
+def _is_reversed(table: Table, roles: Mapping[str, str]) -> bool:
     """Return whether the force opposes the motion of the base."""
     try:
-        read = read_friction_table(path, roles)
+        read = friction_recording(table, roles)
     except RecordingError:
         return False
-    velocity = np.gradient(read.depth, read.time) if read.velocity is None else read.velocity
-    return bool(np.cov(np.sign(velocity), read.force)[0, 1] < 0.0)
+    # Without its mean, which is the zero of the sensor.
+    return bool(np.sign(np.diff(read.depth)) @ (read.force - read.force.mean())[1:] < 0.0)
 
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:

@@ -144,8 +144,13 @@ def read_table(path: Path) -> Table:
 
 
 def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
-    """Read force and motion from a table; roles missing in `columns` are found by usual names."""
-    table = read_table(path)
+    """Read force and motion from a file; roles missing in `columns` are found by usual names."""
+    return friction_recording(read_table(path), columns)
+
+
+def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
+    """Return force and motion of a table, as `read_friction_table`."""
+    path = table.path
     specs = {**guessed(table.columns), **columns}
     missing = [role for role in ('time', 'force') if role not in specs]
     if not {'depth', 'speed'} & set(specs):
@@ -183,7 +188,7 @@ def guessed(
     """
     Find names by role from usual names, in order of preference, lower case without signs.
 
-    Roles of friction are also found by unit: the only column in N is the force.
+    Roles of friction are also found by unit: the only column with a unit of force is the force.
     """
     plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}

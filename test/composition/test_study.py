@@ -36,6 +36,7 @@ from needle_study.study import build_study, read_study, Study
 from needle_study.summary import column, indices, probability, quantile, worst
 import numpy as np
 import pytest
+from scipy import stats
 from support.installed import ROOT
 from support.pages import look_at
 from support.studies import check_refused
@@ -215,6 +216,11 @@ def test_variables_of_a_table_have_values_of_the_same_row(tmp_path: Path) -> Non
     assert rows.tolist() == [[0.8, 1.5], [1.0, 1.0], [1.2, 0.5]]
     # Of each of the 16 sequences 30 points: a third, plus or minus one.
     assert np.abs(counts - 160).max() <= 16
+    # Exact at the probabilities of the design, in the order of names: the table, then the tilt.
+    chances = study.design.parts(0, 480)[:, 1]
+    np.testing.assert_allclose(
+        stats.laplace(0.01, 0.001).cdf(drawn['tilt_x']), chances, atol=1e-12
+    )
     # Mean deviation of a Laplace distribution; four standard errors of independent samples.
     assert np.abs(drawn['tilt_x'] - 0.01).mean() == pytest.approx(1e-3, rel=4.0 / sqrt(480.0))
     file.write_text(file.read_text().replace(', s]', ', t]').replace('- s\n', '- t\n'))
@@ -277,6 +283,17 @@ _OWN = '\n'.join(
         flags=re.DOTALL | re.MULTILINE,
     )
 )
+
+
+def test_page_lists_the_variables_of_the_scenario() -> None:
+    page = (ROOT / 'docs/howto/study.md').read_text('utf-8')
+    listed = dict[str, tuple[str, ...]]()
+    for row in re.findall(r'^\| (`[^|]*) \| (\S+) \| (\S+) \| (.*) \|$', page, re.MULTILINE):
+        listed |= dict.fromkeys(re.findall(r'`(\w+)`', row[0]), row[1:])
+    variables = SteeringScenario({}).variables
+    assert {name: listed[name] for name in variables} == {
+        name: (f'{one.default:g}', one.unit, one.meaning) for name, one in variables.items()
+    }
 
 
 def test_own_scenario_of_a_file_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
