@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from csv import DictReader
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -59,6 +60,9 @@ KINDS: Final = {
         lambda a, b, low, high: stats.beta(a, b, low, high - low),
     ),
 }  # fmt: skip
+
+#: Parameters without the unit of the variable.
+_UNITLESS: Final = ('standard deviation of the logarithm', 'a', 'b')
 
 _LARGEST: Final = 1e100  #: largest valid magnitude of a parameter
 _WITHIN: Final = 'within'
@@ -132,12 +136,17 @@ def distribution(name: str, given: Any, unit: str = '1') -> Distribution:
     if len(kinds) != 1 or not (kinds[0] in (*KINDS, _CHOICE, _ROWS) or ':' in kinds[0]):
         raise ParameterError(f'{name} must be one of {_kinds()}, got {dict(given)!r}')
     (kind,) = kinds
-    numbers = _numbers(f'{name}: {kind}', given[kind], unit)
+    row = KINDS.get(kind)
+    # Parameters of a class have no known units.
+    units = ['1' if ':' in kind else unit]
+    if row is not None:
+        units = ['1' if one in _UNITLESS else unit for one in row.parameters]
+    numbers = _numbers(f'{name}: {kind}', given[kind], *units)
     if kind in (_CHOICE, _ROWS):
         return _choice(name, kind, numbers, given)
     if _WEIGHTS in given or _OF in given:
         raise ParameterError(f'{name}: only a {_CHOICE} has {_WEIGHTS}, and only {_ROWS} {_OF}')
-    if (row := KINDS.get(kind)) is not None:
+    if row is not None:
         if len(numbers) != len(row.parameters):
             takes = ', '.join(row.parameters)
             raise ParameterError(f'{name}: {kind} takes [{takes}], got {list(numbers)}')
@@ -203,11 +212,13 @@ def is_number(value: Any) -> bool:
     return number and abs(value) <= _LARGEST
 
 
-def _numbers(name: str, given: Any, unit: str = '1') -> tuple[float, ...]:
+def _numbers(name: str, given: Any, *units: str) -> tuple[float, ...]:
+    """Return numbers in SI units, by default without a unit; the last unit is for all others."""
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{name} takes a list of numbers, got {given!r}')
+    each = zip(given, chain(units, repeat((units or ('1',))[-1])), strict=False)
     try:
-        numbers = [quantity(one, unit) if isinstance(one, str) else one for one in given]
+        numbers = [quantity(one, unit) if isinstance(one, str) else one for one, unit in each]
     except ParameterError as error:
         raise ParameterError(f'{name}: {error}') from error
     if not all(map(is_number, numbers)):

@@ -271,6 +271,8 @@ def test_weights_are_relative_probabilities() -> None:
     values, counts = np.unique(weighted.quantiles(parts), return_counts=True)
     assert values.tolist() == [1.0, 2.0, 3.0]
     assert counts.tolist() == [700, 200, 100]
+    assert distribution('x', {'normal': ['1mm', '2mm']}, 'm').numbers == (1e-3, 2e-3)
+    assert distribution('x', {'lognormal': ['1mm', 0.2]}, 'm').numbers == (1e-3, 0.2)
     one, other = (distribution('x', {'choice': [3, 1], **w}) for w in ({}, {'weights': [2, 2]}))
     assert np.array_equal(one.quantiles(parts), other.quantiles(parts))
 
@@ -729,6 +731,8 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'design': 'grid'}, 'design must be one of sobol, random, latin, saltelli, got'),
         ({'population': {'tilt': 1}}, "population: unknown parameter 'tilt'; "),
         ({'population': {'tilt_x': 'big'}}, "population: tilt_x: 'big' is not an angle"),
+        ({'population': {'tip_noise': {'lognormal': ['1um', '1um']}}}, "'1um' is not a number"),
+        ({'population': {'tip_noise': {'uniform': ['1um', '1N']}}}, "'1N' is not a length"),
         ({'population': {'tilt_x': [1]}}, 'population: tilt_x must be a number or one of'),
         ({'population': {'skin': {'uniform': ['1mm', 2]}}}, "'1mm' is not a number"),
         ({'population': {'tilt_x': {'cauchy': [0, 1]}}}, 'tilt_x must be one of {uniform:'),
