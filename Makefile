@@ -16,15 +16,15 @@ test: $(VENV)/.dev compiled
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
-	$(BIN)/mypy
-	$(BIN)/python -m tools.language
+	$(BIN)/python -m tools.quiet_command $(BIN)/mypy
+	$(BIN)/python -m tools.quiet_command $(BIN)/python -m tools.language
 	$(BIN)/python -m tools.safety_file
 	$(BIN)/python -m tools.changelog --check
 	$(BIN)/python -m tools.license
 
 # Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs compiled
-	$(BIN)/python -m sphinx -W -E --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m sphinx -q -W -E --keep-going -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
 
 format: $(VENV)/.dev

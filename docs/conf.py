@@ -18,6 +18,7 @@ extensions = [
     'sphinx.ext.viewcode',
     'numpydoc',
     'myst_parser',
+    'progress',
     'api',
     'repository_pages',
     'safety_file',

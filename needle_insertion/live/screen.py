@@ -19,10 +19,11 @@ _CLEAR: Final = '\r\033[K'  #: Moves to the start of a line and clears it.
 
 
 class Screen:
-    """The terminal, or a script on the standard input; `typed` is True for a terminal."""
+    """The terminal, or a script on the standard input; `typed` is True if a person types."""
 
     def __init__(self) -> None:
-        self.typed = bool(sys.stdin and sys.stdin.isatty() and sys.stdout.isatty())
+        self._terminal = bool(sys.stdout and sys.stdout.isatty())
+        self.typed = self._terminal and bool(sys.stdin and sys.stdin.isatty())
         self._lines: SimpleQueue[str | Exception | None] = SimpleQueue()
         self._wanted = Semaphore(0)
         self._asked = self._shown = False
@@ -99,13 +100,13 @@ class Screen:
         sys.stdout.flush()
 
     def show(self, line: str) -> None:
-        """Show a line that the next line replaces; no effect in a script."""
-        if self.typed:
+        """Show a line that the next line replaces; no effect in a file or pipe."""
+        if self._terminal:
             sys.stdout.write(f'{_CLEAR}{line}')
             sys.stdout.flush()
             self._shown = True
 
     def _clear(self) -> None:
-        if self.typed and (self._shown or self._asked):
+        if self._shown or (self._asked and self.typed):
             sys.stdout.write(_CLEAR)
         self._shown = False

@@ -5,6 +5,7 @@ import io
 from threading import Event
 
 from needle_insertion import progress
+from needle_insertion.live.screen import Screen
 from needle_insertion.progress import ProgressLine
 import pytest
 
@@ -84,3 +85,19 @@ def test_a_note_is_a_line_of_its_own(stream: type[io.StringIO]) -> None:
         show.note('samples are lost')
     assert 'samples are lost\n' in written.getvalue()
     assert '1 of 2samples' not in written.getvalue()
+
+
+@pytest.mark.parametrize(('output', 'shown'), [(Terminal, True), (io.StringIO, False)])
+def test_position_is_shown_while_a_script_waits(
+    monkeypatch: pytest.MonkeyPatch, output: type[io.StringIO], shown: bool
+) -> None:
+    """A person who watches a script sees the motion; a file holds the answers only."""
+    stream = output()
+    monkeypatch.setattr('sys.stdin', io.StringIO('wait\n'))
+    monkeypatch.setattr('sys.stdout', stream)
+    screen = Screen()
+    screen.show('insertion 12 mm')
+    screen.say('arrived')
+    assert not screen.typed
+    assert ('insertion 12 mm' in stream.getvalue()) == shown
+    assert stream.getvalue().endswith('arrived\n')
