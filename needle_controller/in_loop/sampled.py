@@ -76,6 +76,8 @@ def run_controller(
     ------
     InsertionDepthError
         If the needle leaves its range.
+    ParameterError
+        If ``command`` returns something else than a `ControllerOutput`.
 
     Examples
     --------
@@ -107,6 +109,11 @@ def run_controller(
         )
         load = -float(model.bias_forces(x, measured.time)[0]) if ground_truth else 0.0
         command = controller.command(measured, load)
+        if not isinstance(command, ControllerOutput):
+            raise ParameterError(
+                f'{type(controller).__name__}.command must return a ControllerOutput, got '
+                f'{command!r}'
+            )
         pending.append((float(command.force), float(command.torque)))
         applied = pending.popleft()
         forces[k, :2] = applied

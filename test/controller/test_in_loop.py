@@ -297,6 +297,18 @@ class Blurred:
         )
 
 
+def test_law_that_returns_a_number_is_rejected() -> None:
+
+    class Number:
+        period, delay = PERIOD, 1
+
+        def command(self, _measured: Measurement, _load: float = 0.0) -> float:
+            return 0.5
+
+    with pytest.raises(ParameterError, match=r'Number.command must return a ControllerOutput'):
+        run_controller(Number(), MODEL.parameters, STRAIGHT, duration=0.01)  # type: ignore[arg-type]
+
+
 def test_batch_noise_is_encoder_noise() -> None:
     """Noise is added to the measurements, not to the needle; the additional force moves it."""
     law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
