@@ -162,13 +162,19 @@ class _Parser(argparse.ArgumentParser):
             near = get_close_matches(wrong[1], known, 1)
         else:
             _, _, words = message.partition('unrecognized arguments: ')
+            given = [word.partition('=')[0] for word in words.split() if word.startswith('-')]
+            options = dict(self._options())
+            others = [
+                f'{word} is an option of {options[word]}' for word in given if word in options
+            ]
+            if others:
+                self.exit(2, f'{self.prog}: error: {message}; {", ".join(others)}\n')
             # Without the dashes, which all options have in common.
-            options = {name.lstrip('-'): name for name in self._options()}
+            names = {name.lstrip('-'): name for name in options}
             near = [
-                options[name]
-                for word in words.split()
-                if word.startswith('-')
-                for name in get_close_matches(word.partition('=')[0].lstrip('-'), options, 1)
+                names[name]
+                for word in given
+                for name in get_close_matches(word.lstrip('-'), names, 1)
             ]
         if near:
             message += f'; did you mean {", ".join(near)}?'
@@ -176,8 +182,9 @@ class _Parser(argparse.ArgumentParser):
             message += '; --help lists all arguments'
         self.exit(2, f'{self.prog}: error: {message}\n')
 
-    def _options(self) -> Iterator[str]:
-        yield from self._option_string_actions
+    def _options(self) -> Iterator[tuple[str, str]]:
+        """Yield each option of this command and of its subcommands with the command."""
+        yield from ((name, self.prog) for name in self._option_string_actions)
         for action in self._actions:
             for parser in action.choices or ():
                 if isinstance(action.choices, Mapping):

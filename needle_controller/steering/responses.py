@@ -119,6 +119,10 @@ class SteeringModel:
                 f'depths must be in [0, {reach:g}] m, the length of the needle without its free '
                 f'length, got {at[0]:g} to {at[-1]:g} m'
             )
+        if not needle.tissue_stiffness > 0.0:
+            raise ParameterError(
+                'steering needs tissue that bends the needle: tissue_stiffness must be > 0 N/m^2'
+            )
         self.needle, self.steering = needle, steering
         self.depths, self.prior = at, prior or SteeringPrior()
         #: Nominal load of the bevel, along z at zero roll [N].

@@ -29,6 +29,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.needles import DIAMETERS
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
+from needle_dynamics.steering.parameters import bending_length
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png
@@ -199,6 +200,10 @@ def run(options: argparse.Namespace) -> int:
         ),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
+        'bending length [m]': bending_length(needle.bending_stiffness, needle.tissue_stiffness),
+        'free length [m]': steering.free_length,
+        'skin stiffness [N/m]': steering.skin_stiffness,
+        'bevel load [N]': max(steering.bevel_load),
         'guide travel [m]': done.travel,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
@@ -217,7 +222,10 @@ def run(options: argparse.Namespace) -> int:
     text = (
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
         f'{1e3 * target[1]:g} mm, guide travel {1e3 * done.travel:.1f} mm, load on the guide up '
-        f'to {done.load:.1f} N, {done.turns} turns of the needle\n\n'
+        f'to {done.load:.1f} N, {done.turns} turns of the needle\n'
+        f'nominal: lambda {1e3 * found["bending length [m]"]:.1f} mm, free length '
+        f'{1e3 * steering.free_length:g} mm, skin {steering.skin_stiffness:g} N/m, bevel load '
+        f'{found["bevel load [N]"]:g} N\n\n'
         f'{_text(found)}'
     )
     common.print_result(found, text, filter(None, [options.output]), as_json=options.json)

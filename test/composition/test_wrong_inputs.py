@@ -35,6 +35,8 @@ ANSWERS = {
     'steer --seed one': "argument --seed: must be a whole number, got 'one'",
     'steer --set lenght=1m': "did you mean 'length'?",
     'steer --set length': '--set takes NAME=VALUE',
+    'steer --set tissue_stiffness=0': 'tissue_stiffness must be > 0 N/m^2',
+    'identify steering table.csv --report page': '--report is an option of needle identify',
     'steer --prior noise=-1': 'noise must be finite, > 0 m',
     'steer -o picture.pdf': 'the picture must be .png',
     'steer -o nowhere/picture.png': 'its folder does not exist',

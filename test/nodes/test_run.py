@@ -186,25 +186,13 @@ def test_robot_replaces_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
 
 
 def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Its result is printed, and a refusal ends a script."""
+    """With the file of the page its result is printed, and a refusal ends a script."""
     drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
     ros_graph.add(drivers['PositionRobot'])
-    words = [
-        f'-pcontroller.{name}={value}'
-        for name, value in {
-            'deflection_feedback': 'none',
-            'hardware.joint': 'stage',
-            'hardware.scale': 0.001,
-            'hardware.zero': 100.0,
-            'hardware.command': 'position',
-            'hardware.command_topic': 'stage/joint_trajectory',
-            'hardware.command_type': 'joint_trajectory',
-            'hardware.commissioning.positions': [100.0, 250.0],
-            'hardware.commissioning.depths': [0.0, 0.15],
-            'hardware.commissioning.start_depth': 0.02,
-        }.items()
-    ]
-    words += ['--hardware', '--no-recording']
+    page = (ROOT / 'docs/howto/own-robot.md').read_text(encoding='utf-8')
+    file = tmp_path / 'robot.yaml'
+    file.write_text(page.split('```yaml\n')[1].split('```')[0], encoding='utf-8')
+    words = ['--params-file', str(file), '--hardware', '--no-recording']
 
     def answered(folder: Path) -> tuple[int, str, str]:
         """Repeat a session in which a busy machine has delayed the measurements."""
