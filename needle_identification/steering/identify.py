@@ -17,12 +17,15 @@ Each recording has its own slope and path noise (`needle_identification.steering
 the readings of a recording are not independent. The search for the lengths starts from a grid
 (variable projection [Golub2003]_). Their intervals are profile likelihood intervals, in which the
 cause of drift and the order of motion are unknown as well: they contain all optima, causes and
-orders that fit alike.
+orders that fit alike. Their level is that of Student's t, with degrees of freedom from the
+scatter of the variances that the ratios give [Satterthwaite1946]_.
 
 References
 ----------
 .. [Golub2003] G. H. Golub, V. Pereyra, "Separable nonlinear least squares: the variable projection
    method and its applications", Inverse Problems 19, 2003.
+.. [Satterthwaite1946] F. E. Satterthwaite, "An approximate distribution of estimates of variance
+   components", Biometrics Bulletin 2(6), 1946.
 
 """
 
@@ -31,6 +34,7 @@ from dataclasses import dataclass, replace
 from math import inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.progress import Progress, progress_of
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
@@ -150,14 +154,31 @@ def _check(recordings: Sequence[SteeringRecording], terms: tuple[str, ...]) -> N
 
 
 def _refined(fit: _Fit) -> _Fit:
-    """Return the fit with the probable ratios of variances alone, which is faster."""
-    search = fit.search
-    models = [
-        MixedModel(model.depths, model.ratios[one.weights > _LEAST])
-        for model, one in zip(search.models, search.fits(fit.optima[0].x), strict=True)
-    ]
-    faster = Search(search.tips, search.terms, search.known, models)
-    return fit._replace(search=faster, optima=faster.optima([one.x for one in fit.optima]))
+    """Return the fit with the lengths integrated out, for the probable ratios of variances."""
+    search, x = fit.search, fit.optima[0].x
+    models = []
+    for model, one, spread in zip(search.models, search.fits(x), search.spreads(x), strict=True):
+        penalties = -np.linalg.slogdet(spread)[1]
+        weights = one.weights * np.exp(-0.5 * (penalties - penalties.min()))
+        kept = weights > _LEAST * weights.sum()
+        models.append(MixedModel(model.depths, model.ratios[kept], penalties[kept]))
+    refined = Search(search.tips, search.terms, search.known, models)
+    return fit._replace(search=refined, optima=refined.optima([one.x for one in fit.optima]))
+
+
+def _freedom(search: Search, x: FloatArray) -> FloatArray:
+    """Return the degrees of freedom (k,) of the variance of each variable [Satterthwaite1946]_."""
+    found = np.full(len(x), inf)
+    parts = zip(search.models, search.fits(x), search.spreads(x), strict=True)
+    for medium, (model, one, spread) in enumerate(parts):
+        known = model.freedom - len(one.drift) - _LENGTHS - 1
+        each = np.diagonal(spread, axis1=1, axis2=2)
+        mean = one.weights @ each
+        # The ratios of the deviations are uncertain, too.
+        scatter = one.weights @ (each / mean - 1.0) ** 2
+        own = search.own(medium)
+        found[own] = np.minimum(found[own], 1.0 / (1.0 / known + 0.5 * scatter))
+    return np.asarray(np.maximum(found, 1.0))
 
 
 def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
@@ -175,7 +196,10 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         model.freedom - len(one.drift) - _LENGTHS - 1
         for model, one in zip(search.models, fits, strict=True)
     ]
-    rises = [log1p(stdtrit(free, 0.975) ** 2 / free) * (free + 1.0) for free in freedom]
+    rises = [
+        log1p(stdtrit(free, 0.975) ** 2 / free) * (free + 1.0)
+        for free in _freedom(search, best.x).tolist()
+    ]
     alike = [first, *(_refined(fit) for fit in ranked[1:] if fit.gap < max(rises))]
 
     def length(name: str, at: int, rise: float) -> ParameterEstimate:
@@ -196,7 +220,7 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         return _constant(name, shown(name, x), error, shown(name, low), shown(name, high))
 
     if search.known is None:
-        free = length('free_length', 0, min(rises))
+        free = length('free_length', 0, rises[0])
     else:
         free = _constant('free_length', search.known, 0.0, search.known, search.known)
     media = []
@@ -209,8 +233,8 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
             MediumEstimate(
                 medium=medium,
                 parameters=(
-                    length('bending_length', at, rises[k]),
-                    length('skin', at + 1, rises[k]),
+                    length('bending_length', at, rises[at]),
+                    length('skin', at + 1, rises[at + 1]),
                     *_drift(search, best, k, float(stdtrit(freedom[k], 0.975))),
                 ),
                 rms=rms_of(left),

@@ -10,10 +10,14 @@ with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the dept
 noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
 whose variance grows with its travel, and white noise e of deviation sigma. The likelihood is
 restricted [Harville1974]_: o, beta and sigma are integrated out. The ratios of the other
-deviations to sigma are summed over a grid: a few recordings hardly determine them.
+deviations to sigma are summed over a grid: a few recordings hardly determine them. The lengths in
+the response are integrated out by a penalty for each ratio, in the approximation of [Cox1987]_:
+otherwise the lengths of a few recordings are those with the least difference between recordings.
 
 References
 ----------
+.. [Cox1987] D. R. Cox, N. Reid, "Parameter orthogonality and approximate conditional inference",
+   Journal of the Royal Statistical Society B 49(1), 1987.
 .. [Harville1974] D. A. Harville, "Bayesian inference for variance components using only error
    contrasts", Biometrika 61, 1974.
 
@@ -57,14 +61,23 @@ class Likelihood(NamedTuple):
 
 
 class MixedModel:
-    """Covariances of the recordings of a medium, by depth and guide (n, 3) of their readings."""
+    """
+    Covariances of the recordings of a medium, by depth and guide (n, 3) of their readings.
 
-    def __init__(self, depths: Sequence[FloatArray], ratios: FloatArray | None = None) -> None:
+    Twice the log likelihood of each ratio is less by its penalty.
+    """
+
+    def __init__(
+        self,
+        depths: Sequence[FloatArray],
+        ratios: FloatArray | None = None,
+        penalties: FloatArray | float = 0.0,
+    ) -> None:
         if ratios is None:
             # The drift of a single recording contains its slope.
             slopes = _SLOPES if len(depths) > 1 else (0.0,)
             ratios = np.array(list(product(_WANDERS, slopes, _RESPONSES)))
-        self.ratios, self.depths = ratios, depths
+        self.ratios, self.depths, self.penalties = ratios, depths, penalties
         self.samples = 2 * sum(map(len, depths))
         self.freedom = self.samples - 2 * len(depths)  #: samples minus offsets
         # The contrasts are normalized by white noise, the last ratios.
@@ -79,6 +92,7 @@ class MixedModel:
                 half, log = known[depth.tobytes()]
                 self._half[k, i, : len(half), : len(half)] = half
                 self._logs[k] += 2.0 * log
+        self._logs[:-1] += penalties
 
     def likelihood(
         self, columns: Sequence[FloatArray], wanted: Sequence[FloatArray]

@@ -34,7 +34,8 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
         others = [search.tips.recordings[own] for own in rest]
         models = list(search.models)
         depths = [*models[medium].depths[:k], *models[medium].depths[k + 1 :]]
-        models[medium] = MixedModel(depths, models[medium].ratios)
+        whole = models[medium]
+        models[medium] = MixedModel(depths, whole.ratios, whole.penalties)
         fitted = Search(Tips(others, search.tips.order), search.terms, search.known, models)
         found.append(predict(search, fitted, fitted.descend(best.x), medium, at))
     rms, freedom = rms_of([one.errors for one in found]), 2 * len(found)

@@ -177,6 +177,25 @@ class Search:
                 found[k] += one.weights @ ((left**2).sum(axis=1) / one.variances)
         return found
 
+    def own(self, medium: int) -> list[int]:
+        """Return the indices of the variables on which a medium depends."""
+        first = int(self.known is None)
+        return [*range(first), *range(first + 2 * medium, first + 2 * medium + 2)]
+
+    def spreads(self, x: FloatArray) -> list[FloatArray]:
+        """Return the covariances (K, k, k) of the variables of each medium, by ratio."""
+        changed = [(step, self.fits(there)) for step, there in self.steps(x)]
+        found: list[FloatArray] = []
+        for medium, one in enumerate(self.fits(x)):
+            scale = np.sqrt(one.variances)[:, np.newaxis]
+            steps = [(changed[k][1][medium], changed[k][0]) for k in self.own(medium)]
+            each = [(there.residuals - one.residuals) / (step * scale) for there, step in steps]
+            jacobian = np.stack(each, axis=-1)
+            normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+            # A deviation of 1 if they are not determined.
+            found.append(np.asarray(np.linalg.inv(normal + np.eye(len(steps)))))
+        return found
+
     def residuals(self, x: FloatArray) -> list[FloatArray]:
         """Return measured minus fitted tips of each recording (n, 2) [m]."""
         found = {}

@@ -8,7 +8,7 @@ import json
 from math import pi, sqrt
 from pathlib import Path
 
-from benchmarks.steering_fit import FitTruth, insertion, NOISE
+from benchmarks.steering_fit import drawn, FitTruth, insertion, NOISE
 from needle_dynamics import bending_length
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_identification import (
@@ -222,6 +222,16 @@ def test_intervals_contain_the_differences_between_insertions() -> None:
     assert gel.held_out is not None
     # Predicted tips of twelve paths, whose errors are correlated within a path.
     assert 0.8 <= gel.held_out.coverage <= 1.0
+
+
+@pytest.mark.parametrize('seed', [22, 49])
+def test_lengths_are_uncertain_with_the_difference_of_two_insertions(seed: int) -> None:
+    """At wrong lengths, two insertions in different frames are alike."""
+    truth = drawn(seed)
+    assert truth.slope > 0.0
+    found = identify_steering([insertion(1000 * seed + k, truth) for k in range(2)], TILTED)
+    low, high = found['gel']['bending_length'].interval
+    assert low < truth.length < high
 
 
 def test_poor_prediction_of_another_recording_is_reported() -> None:
