@@ -36,6 +36,8 @@ class Screen:
         try:
             yield
         finally:
+            if self._shown:
+                self._clear()
             if before is not None:
                 # The thread may still wait for a line. A closed terminal is an error.
                 with suppress(termios.error, OSError):
