@@ -2,7 +2,6 @@
 """Preparation of a node in a thread before `configure`."""
 
 from collections.abc import Callable, Iterable, Iterator
-import gc
 from importlib import import_module
 from threading import Thread
 from typing import NamedTuple
@@ -25,8 +24,6 @@ def imports(modules: Iterable[str]) -> Iterator[PreparationProgress]:
     for done, name in enumerate(names):
         yield PreparationProgress(done, len(names), name)
         import_module(name)
-        # A full collection stops all threads for 0.2 s: imported objects are excluded.
-        gc.freeze()
     yield PreparationProgress(len(names), len(names), '')
 
 
