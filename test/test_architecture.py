@@ -43,7 +43,7 @@ MAY_IMPORT = {
         'needle_study',
         'reproduction',
     },
-    'tools': set(),
+    'tools': {'needle_insertion'},
 }
 #: Largest number of lines of a file.
 MOST_LINES = 500

@@ -158,7 +158,8 @@ def _refined(fit: _Fit) -> _Fit:
     search, x = fit.search, fit.optima[0].x
     models = []
     for model, one, spread in zip(search.models, search.fits(x), search.spreads(x), strict=True):
-        penalties = -np.linalg.slogdet(spread)[1]
+        # The drift of a single recording contains its slope: nothing can be hidden.
+        penalties = -np.linalg.slogdet(spread)[1] * (len(model.depths) > 1)
         weights = one.weights * np.exp(-0.5 * (penalties - penalties.min()))
         kept = weights > _LEAST * weights.sum()
         models.append(MixedModel(model.depths, model.ratios[kept], penalties[kept]))
@@ -167,7 +168,7 @@ def _refined(fit: _Fit) -> _Fit:
 
 
 def _freedom(search: Search, x: FloatArray) -> FloatArray:
-    """Return the degrees of freedom (k,) of the variance of each variable [Satterthwaite1946]_."""
+    """Return the degrees of freedom (k,) of the variance of each variable (Satterthwaite)."""
     found = np.full(len(x), inf)
     parts = zip(search.models, search.fits(x), search.spreads(x), strict=True)
     for medium, (model, one, spread) in enumerate(parts):
