@@ -17,8 +17,8 @@ Each recording has its own slope and path noise (`needle_identification.steering
 the readings of a recording are not independent. The search for the lengths starts from a grid
 (variable projection [Golub2003]_). Their intervals are profile likelihood intervals, in which the
 cause of drift and the order of motion are unknown as well: they contain all optima, causes and
-orders that fit alike. Their level is that of Student's t, with degrees of freedom from the
-scatter of the variances that the ratios give [Satterthwaite1946]_.
+orders that fit alike. Their level is the one of Student's t; its degrees of freedom are
+from the scatter of the variances over the ratios [Satterthwaite1946]_.
 
 References
 ----------
@@ -255,7 +255,7 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         alternatives=alternatives,
         residuals=tuple(residuals),
         optima=len(first.optima),
-        warnings=tuple(_warnings(alike, max(rises), alternatives, media)),
+        warnings=tuple(_warnings(alike, min(rises), alternatives, media)),
     )
 
 
@@ -298,6 +298,8 @@ def _warnings(
 ) -> Iterator[str]:
     """Warn of fits that the recordings cannot distinguish, and of poor predictions."""
     search, optima = alike[0].search, alike[0].optima
+    # The interval of a constant that is hardly determined contains more fits.
+    alike = [fit for fit in alike if fit.gap < rise]
     equal = [fit.search.terms for fit in alike if fit.search.tips.order == search.tips.order]
     if len(equal) > 1:
         each = ', '.join(

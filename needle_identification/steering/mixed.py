@@ -10,8 +10,8 @@ with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the dept
 noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
 whose variance grows with its travel, and white noise e of deviation sigma. The likelihood is
 restricted [Harville1974]_: o, beta and sigma are integrated out. The ratios of the other
-deviations to sigma are summed over a grid: a few recordings hardly determine them. The lengths in
-the response are integrated out by a penalty for each ratio, in the approximation of [Cox1987]_:
+deviations to sigma are summed over a grid: a few recordings hardly determine them. A penalty for
+each ratio integrates the lengths in the response out, in the approximation of [Cox1987]_:
 otherwise the lengths of a few recordings are those with the least difference between recordings.
 
 References
