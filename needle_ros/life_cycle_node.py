@@ -2,7 +2,6 @@
 """Lifecycle service: reject invalid transitions, and defer `configure` until preparation ends."""
 
 from collections.abc import Callable
-import gc
 from typing import Any, Final
 
 from lifecycle_msgs.msg import Transition
@@ -57,8 +56,6 @@ class LifeCycle:
 
     def _resume(self) -> None:
         act, self._waiting = self._waiting, None
-        # A full collection takes 0.2 s: imported objects are excluded from it.
-        gc.freeze()
         if act is not None:
             act()
 
