@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from typing import Final
 
 from needle_controller.controller import Measurement
-from needle_controller.observer.observer import Observer
+from needle_controller.observer.observer import NEAREST, Observer
 from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.status import ObserverStatus
+from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 _CHECK_INTERVAL: Final = 25  #: Samples between two consistency checks of the observer.
@@ -44,6 +45,7 @@ class LoadEstimator:
         self.load = 0.0
         self.warning: str | None = None  #: Why the observer is inconsistent.
         self._updates = 0
+        self._updated = -1  #: Stamp of the last encoder sample of an update [ns].
         #: Stamp, lateral force and moment of the last wrench that waits for the encoders, and
         #: encoders and tip that wait for the update, with their stamps [ns].
         self._waiting: tuple[int, float, float] | None = None
@@ -58,16 +60,15 @@ class LoadEstimator:
             self.observer.add_tip(*self._tip)
         self._tip = stamp, deflection
 
-    def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
+    def take_wrench(self, stamp: int, lateral: float, moment: float) -> None:
         """
         Add lateral force along z [N] and moment about x at the base without the torque [N m].
 
-        A wrench newer than the latest encoder sample, at ``measured`` [ns], waits for the
-        encoders.
+        It belongs to the encoder sample that is nearest in time, and waits for its update.
         """
         if self.observer is None:
             return
-        if stamp > measured:
+        if self.waits or stamp > self._updated:
             self._waiting = stamp, lateral, moment
         else:
             self.observer.add_wrench(stamp, lateral, moment)
@@ -99,10 +100,16 @@ class LoadEstimator:
             return
         if tip is not None:
             observer.add_tip(*tip)
-        (stamp, measured), wrench = encoders, self._waiting
-        own = wrench[1:] if wrench is not None and wrench[0] == stamp else None
-        if wrench is not None and wrench[0] <= stamp:
-            self._waiting = None
+        stamp, measured = encoders
+        own, self._updated = None, stamp
+        if (wrench := self._waiting) is not None:
+            later = (wrench[0] - stamp) / NANOSECONDS / observer.period
+            if later <= NEAREST:
+                self._waiting = None
+            if abs(later) <= NEAREST:
+                own = wrench[1:]
+            elif later < 0.0:
+                observer.add_wrench(*wrench)
         self.load = 0.0
         observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1

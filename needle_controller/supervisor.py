@@ -302,10 +302,9 @@ class Supervisor(StateMachine[ForceCommand]):
             answer = self._stop_for(guard.wrench(values[:3], values[3:]), now) or answer
             # The sensor also measures the commanded torque of the base.
             moment -= self._last.torque
-            newest = self.safety.streams['joint_states'].last
             if not guard.is_beyond('base_wrench'):
                 self.estimate()
-                self.bending.take_wrench(reading.stamp, lateral, moment, newest)
+                self.bending.take_wrench(reading.stamp, lateral, moment)
         return answer
 
     def truth(self, reading: Reading, now: int) -> ForceCommand | None:

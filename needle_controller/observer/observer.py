@@ -41,7 +41,7 @@ from numpy.typing import ArrayLike
 
 _EVEN: Final = 0.01  #: Relative deviation of encoder stamps from the period that is ignored.
 _NEAR: Final = 0.1  #: Relative tolerance of the filter rate as a multiple of the sample rate.
-_SAME: Final = 0.1  #: Largest stamp difference of a wrench and its encoder sample, in periods.
+NEAREST: Final = 0.5  #: Largest stamp difference of a wrench and its encoder sample, in periods.
 _WAITING: Final = 16  #: Largest number of wrenches that wait for their encoder sample.
 _OVERLAP: Final = 0.1  #: Relative overlap of exposures above which a tip sample is a duplicate.
 _LARGEST: Final = 1e6  #: Largest plausible measurement; squares of larger ones overflow [SI].
@@ -138,8 +138,7 @@ class Observer:
     def reset(self) -> None:
         """Discard all measurements; the next encoder sample restarts the observer."""
         #: Number of rejected samples: late or repeated encoder samples; tip samples and wrenches
-        #: that are not finite, repeated, older than the history, far ahead of the encoders, or (a
-        #: wrench) between encoder samples.
+        #: that are not finite, repeated, older than the history, or far ahead of the encoders.
         self.refused = 0
         self.restarts = 0  #: Number of automatic restarts.
         self.warning: str | None = None  #: Reason of the last restart.
@@ -205,12 +204,12 @@ class Observer:
         return (_checked(stamp) - (self._origin or 0)) / NANOSECONDS
 
     def add_wrench(self, stamp: int, lateral: float, moment: float) -> None:
-        """Process a base wrench that arrives apart from the encoder sample of its stamp [ns]."""
+        """Process a base wrench at a stamp [ns], with the nearest encoder sample."""
         time, lateral, moment = self._seconds(stamp), _finite(lateral), _finite(moment)
         if self._last is None or not (isfinite(lateral) or isfinite(moment)):
             self.refused += 1
             return
-        slack = _SAME * self.period
+        slack = NEAREST * self.period
         if time > self._last.time + slack and len(self._waiting) < _WAITING:
             self._waiting.append((stamp, lateral, moment))
             return

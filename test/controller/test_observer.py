@@ -1161,6 +1161,38 @@ def test_tips_before_the_encoders_are_not_lost() -> None:
     assert found[0] == found[1]
 
 
+@settings(deadline=None, max_examples=15)
+@given(st.floats(-0.49, 0.49), st.integers(1, 4))
+def test_force_sensor_with_its_own_clock_is_used(apart: float, readings: int) -> None:
+    """Readings between the encoder samples count for the nearest sample, one for each."""
+    estimators = [
+        LoadEstimator(phantom(), Observer(phantom(), ObserverSettings(), PERIOD)) for _ in range(2)
+    ]
+    # The last encoder sample has no reading of its own.
+    events: list[tuple[float, int, int]] = [(float(k), 1, k) for k in range(1, 41)]
+    # Several readings within less than half a period end at the given distance from a sample.
+    spread = 0.5 + min(apart, 0.0)
+    for k in range(1, 40):
+        events += [(k + apart - spread * j / readings, 0, k) for j in range(readings)]
+    for time, kind, k in sorted(events):
+        moment = 0.01 * float(np.cos(k))
+        same, own = estimators
+        if kind == 0:
+            own.take_wrench(ns(time * PERIOD), 0.1, moment)
+            continue
+        if k < 40:
+            same.take_wrench(ns(k * PERIOD), 0.1, moment)
+        for one in estimators:
+            one.take_encoders(
+                ns(k * PERIOD), Measurement(time=k * PERIOD, depth=0.1, velocity=0.0)
+            )
+            one.update()
+    found = [one.observer.modal for one in estimators if one.observer is not None]
+    # Rounding: after a late reading the steps are computed again from the sample before.
+    for one, other in zip(*found, strict=True):
+        assert_allclose(one, other, rtol=0, atol=1e-9 * abs(one).max())
+
+
 def test_inconsistent_observer_is_not_used() -> None:
     """An alternating moment gives a warning and zero load; both end with the moment."""
     bending = LoadEstimator(phantom(), Observer(phantom(), ObserverSettings(), PERIOD))
@@ -1169,7 +1201,7 @@ def test_inconsistent_observer_is_not_used() -> None:
     def watch(count: int, size: float) -> None:
         for stamp in islice(stamps, count):
             moment = size * float(rng.choice([-1.0, 1.0]))
-            bending.take_wrench(stamp, 0.5, 0.1 + moment, stamp - 1)
+            bending.take_wrench(stamp, 0.5, 0.1 + moment)
             bending.take_encoders(stamp, Measurement(time=1e-9 * stamp, depth=0.1, velocity=0.0))
             bending.update()
 
