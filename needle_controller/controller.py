@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from typing import Final, NamedTuple, TypeAlias
 
 from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
@@ -387,7 +387,11 @@ class Controller:
         loop, depth, velocity = self._insertion, measured.depth, measured.velocity
         sample = measured.time, velocity, measured.force
         if self._hold.measure(sample, age, loop.law.axis.coulomb):
-            (loop.unwind if self._hold.missing else loop.stop)()
+            if self._hold.missing:
+                loop.unwind()
+            else:
+                # The robot holds the last force.
+                loop.stop(loop.last if isnan(measured.force) else measured.force)
         now = self.guide.at(measured.time, depth, velocity)
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
         torque = 0.0

@@ -139,10 +139,10 @@ class SampledLoop:
         self._acts = 0.0  #: Force of the period that starts now [N].
         self._take_over = False
 
-    def stop(self) -> None:
-        """Discard the pending commands and the modeled motion; the rest of the memory stays."""
+    def stop(self, acts: float = 0.0) -> None:
+        """Discard pending commands for a force that acts [N], and the modeled motion only."""
         for i in range(len(self.pending)):
-            self.pending[i] = 0.0
+            self.pending[i] = acts
         self.memory[FOLLOWS] = self.memory[MEASURED] = 0.0
         self.last = 0.0
         self._take_over = False

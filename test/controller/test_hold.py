@@ -19,9 +19,9 @@ RATE = 200.0
 PERIOD = 1e-3
 PHANTOM = NeedleParameters.preset('phantom')
 
-#: Overshoot of the velocity of the needle after stalls, relative to the limit of the reference:
-#: the law corrects distances of up to 0.1 mm, and the plant holds a force for up to 0.1 s.
-OVERSHOOT = 0.6
+#: Overshoot of the velocity of the needle, relative to the limit of the reference. That of PID
+#: without stalls is 0.15, that of the other laws 0; after stalls they correct some 10 um.
+OVERSHOOT = {'adaptive': 0.1, 'inverse_dynamics': 0.1, 'pid': 0.2}
 
 #: Largest distance from the target at rest [m]: dry friction, 0.56 N, over the stiffness of PID.
 AT_REST = 1e-4
@@ -44,13 +44,15 @@ stalls = st.lists(
 @settings(max_examples=5)
 @given(stalls)
 @example([Stall('plant', 0.3, 0.09), Stall('commands', 0.3, 0.6), Stall('controller', 0.3, 0.12)])
+# During the acceleration.
+@example([Stall('plant', 0.0625, 0.0625)])
 def test_velocities_after_stalls_are_within_limits(
     law: str, kind: str, happens: Sequence[Stall]
 ) -> None:
     """Of the reference by its limit, of the needle with an overshoot; the target is reached."""
     found = insert(law, kind, happens, rate=RATE)
     assert found.reference <= LIMIT * (1.0 + 1e-9)
-    assert max(found.inward, found.outward) <= LIMIT * (1.0 + OVERSHOOT)
+    assert max(found.inward, found.outward) <= LIMIT * (1.0 + OVERSHOOT[law])
     assert found.stop == ''
     assert abs(found.depth - TARGET) < AT_REST
 
@@ -124,6 +126,61 @@ def test_reference_waits_for_a_reported_force(law: str, force: float) -> None:
         assert moved == 0.0
     else:
         assert moved == pytest.approx(50.0 * LIMIT * PERIOD, rel=0.05)
+
+
+@pytest.mark.requirement('S-282', 'S-284')
+@pytest.mark.parametrize('law', LAWS)
+def test_lost_commands_do_not_make_the_needle_faster(law: str) -> None:
+    """The plant holds a force that it reports, and is commanded another one."""
+    # During the acceleration, when the force changes most.
+    lost = [Stall('commands', 0.06, 0.03), Stall('commands', 0.3, 0.09)]
+    found = insert(law, 'target', lost)
+    assert found.inward <= LIMIT * (1.0 + OVERSHOOT[law])
+    assert abs(found.depth - TARGET) < AT_REST
+
+
+@pytest.mark.requirement('S-284')
+@given(st.floats(-2.0, 2.0), st.floats(0.5, 2.0), st.floats(0.0, 1.0))
+@example(0.0, 1.0, 0.0)
+@settings(max_examples=20, deadline=None)
+def test_other_reported_forces_do_not_delay_the_reference(
+    offset: float, factor: float, noise: float
+) -> None:
+    """Of a sensor with an offset, another scale, or noise."""
+    controller = Controller(PHANTOM)
+    controller.set_target(TARGET)
+    rng, aims = np.random.default_rng(1), list[Setpoint]()
+    depth, last = 0.02, 0.0
+    for k in range(1000):
+        force = factor * last + offset + noise * float(rng.standard_normal())
+        measured = Measurement(
+            time=k * PERIOD, depth=depth, velocity=command_velocity(aims), force=force
+        )
+        command = controller.command(measured)
+        aims.append(command.setpoint)
+        depth, last = command.setpoint.position, command.force
+    # One second at the limit, less the acceleration.
+    assert aims[-1].position - 0.02 == pytest.approx(LIMIT * 0.95, rel=0.06)
+
+
+@pytest.mark.requirement('S-283')
+@pytest.mark.parametrize('law', LAWS)
+def test_needle_continues_at_its_velocity_after_a_gap(law: str) -> None:
+    """The plant holds the last force: the law does not assume a needle without force."""
+    loop = StalledLoop(law)
+    for _ in range(20):
+        loop.step()
+    loop.target(TARGET)
+    # Without a stall the integral of PID also changes the velocity.
+    for _ in range(1500):
+        loop.step()
+    loop.stall('controller', 0.03)
+    for _ in range(100):
+        loop.step()
+    depths = np.array([depth for _, depth in loop.track[-100:]])
+    steps = np.diff(depths) / PERIOD
+    assert steps.min() > 0.9 * LIMIT
+    assert steps.max() < 1.1 * LIMIT
 
 
 def command_velocity(follows: Sequence[tuple[float, ...]]) -> float:
