@@ -5,12 +5,12 @@ from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import ceil, log2, nan
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final
 
-from needle_dynamics import FloatArray
 from needle_identification import Bag, RecordingError
 from needle_identification.bags.bag import Recorded
 from needle_identification.bags.messages import deserialize
@@ -23,7 +23,7 @@ from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import node_of
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import MessageReader, read_line, read_string, Reading
+from needle_ros.wire import MessageReader, read_line, read_string
 import numpy as np
 
 #: Topics shown on the page; each also in a namespace.
@@ -45,32 +45,30 @@ _SLACK: Final = 10.0  #: Difference of the durations by stamps and by arrival th
 
 SLOWEST, FASTEST = 0.02, 50.0  #: Range of the playback speed, relative to real time.
 
-_Item = TypeVar('_Item')
 
-
-class _Kept(Generic[_Item]):
-    """Messages of a topic by time, decimated to an interval [s] and to `_MOST` messages."""
+class _Kept:
+    """Messages by time, decimated to an interval [s] and to `_MOST`, each as its effect."""
 
     def __init__(self, interval: float = 0.0) -> None:
         self.interval = interval
         self._times: list[float] = []
-        self._items: list[_Item] = []
+        self._effects: list[Callable[[View], object]] = []
 
-    def add(self, time: float, make: Callable[[], _Item]) -> None:
-        """Store the result of ``make`` unless it is too soon after the previous message."""
+    def add(self, time: float, effect: Callable[[View], object]) -> None:
+        """Store the effect of a message on a view, unless it is too soon after the previous."""
         if self._times and time < self._times[-1] + self.interval:
             return
-        self._items.append(make())
+        self._effects.append(effect)
         self._times.append(time)
         if len(self._times) > _MOST:
             span = self._times[-1] - self._times[0]
             self.interval = max(2.0 * self.interval, 2.0 * span / _MOST)
-            del self._times[1::2], self._items[1::2]
+            del self._times[1::2], self._effects[1::2]
 
-    def at(self, time: float) -> tuple[float, _Item] | None:
-        """Return time and content of the newest message at a time."""
-        k = bisect_right(self._times, time) - 1
-        return (self._times[k], self._items[k]) if k >= 0 else None
+    def show(self, view: View, time: float) -> None:
+        """Put the newest message at a time into a view."""
+        if k := bisect_right(self._times, time):
+            self._effects[k - 1](view)
 
 
 class _Curve:
@@ -138,15 +136,10 @@ class ShownRecording:
 
     def __init__(self, path: Path, time: str = TIMES[0]) -> None:
         self.name = path.name or str(path)
-        period = 0.75 / RATE
         self._header = time == TIMES[0]
-        self._readings: dict[str, _Kept[Reading]] = {}
+        #: Messages by topic, and by line or node.
+        self._kept: dict[tuple[str, str], _Kept] = {}
         self._curves = defaultdict[Signal, _Curve](_Curve)
-        self._lines = {name: _Kept[FloatArray](period) for name in ('needle', 'path')}
-        self._expected = _Kept[Any]()
-        self._configurations = {name: _Kept[dict[str, Any]]() for name in CONFIGURED}
-        self._nodes: dict[str, _Kept[Any]] = {}
-        self._period = period
         self._invalid = 0
         self._readers = {topic.name: MessageReader(topic.type_name) for topic in STREAMS}
 
@@ -179,12 +172,11 @@ class ShownRecording:
                 f'within {elapsed:.4g} s: use --time receive if clocks differed'
             )
             self.losses += (contradiction,)
-        shown: list[_Kept[Any]] = [*self._readings.values(), *self._lines.values()]
-        if not any(kept.at(self.duration) for kept in shown):
-            reasons = '; '.join((f'{path} has no readings to show', *self.losses))
-            raise RecordingError(reasons)
-        longest = max(kept.interval for kept in shown)
-        self._silent = max(1.0, 3.0 * longest)
+        timed = (*self._readers, contract.NEEDLE_SHAPE.name)
+        intervals = [kept.interval for (name, _), kept in self._kept.items() if name in timed]
+        if not intervals:
+            raise RecordingError('; '.join((f'{path} has no readings to show', *self.losses)))
+        self._silent = max(1.0, 3.0 * max(intervals))
 
     def _time(self, stamp: int) -> float:
         """Return the time of a stamp [ns] from the start [s], and store it if it is the newest."""
@@ -201,46 +193,46 @@ class ShownRecording:
             reading = self._readers[name].read(data)
             if self._header and reading.stamp:
                 time = self._time(reading.stamp)
-            self._readings.setdefault(name, _Kept()).add(time, lambda: reading)
+            self._keep((name, ''), time, lambda view: view.reading(name, reading, time))
             for signal in _OF_TOPIC[name]:
                 self._curves[signal].add(time, signal.of(reading))
         elif name == contract.NEEDLE_SHAPE.name:
             which, points = read_line(data)
-            if which in self._lines:
-                self._lines[which].add(time, lambda: points)
+            if which in ('needle', 'path'):
+                line = partial(View.line, name=which, points=points, now=time)
+                self._keep((name, which), time, line, 0.75 / RATE)
         elif name == contract.TIP_EXPECTED.name:
-            self._expected.add(time, lambda: deserialize(message.topic, data))
+            expected = deserialize(message.topic, data)
+            self._keep((name, ''), time, lambda view: view.expected(expected))
         elif name == contract.DIAGNOSTICS.name:
             for status in deserialize(message.topic, data).status:
-                # Called at once.
-                self._nodes.setdefault(node_of(status.name), _Kept()).add(time, lambda: status)  # noqa: B023
+                effect = partial(View.status, status=status, now=time)
+                self._keep((name, node_of(status.name)), time, effect)
         else:
             parameters = parameters_of(read_string(data))
-            self._configurations[name].add(time, lambda: parameters)
+            self._keep((name, ''), time, lambda view: view.configuration(name, parameters))
+
+    def _keep(
+        self,
+        key: tuple[str, str],
+        time: float,
+        effect: Callable[[View], object],
+        interval: float = 0.0,
+    ) -> None:
+        self._kept.setdefault(key, _Kept(interval)).add(time, effect)
 
     def view(self, time: float) -> View:
         """Return the state of the page at a time from the start [s]."""
         view = View(self._silent)
         view.invalid = self._invalid
-        for topic, readings in self._readings.items():
-            if found := readings.at(time):
-                view.reading(topic, found[1], found[0])
-        for name, lines in self._lines.items():
-            if drawn := lines.at(time):
-                view.line(name, drawn[1], drawn[0])
-        if expected := self._expected.at(time):
-            view.expected(expected[1])
-        for node, configurations in self._configurations.items():
-            if parameters := configurations.at(time):
-                view.configuration(node, parameters[1])
-        for states in self._nodes.values():
-            if state := states.at(time):
-                view.status(state[1], state[0])
+        for kept in self._kept.values():
+            kept.show(view, time)
         return view
 
     def signals(self) -> dict[str, list[list[float | None]]]:
         """Return times [s] and values of each recorded signal; None between them is a gap."""
-        found = {name: self._curves[signal_of(name, self._readings)].points() for name in SIGNALS}
+        topics = {topic for topic, _ in self._kept}
+        found = {name: self._curves[signal_of(name, topics)].points() for name in SIGNALS}
         return {name: points for name, points in found.items() if points is not None}
 
     def start_of_motion(self) -> float | None:
@@ -343,15 +335,14 @@ class PagePlayback:
 
 def _chosen(topics: tuple[BagTopic, ...]) -> dict[BagTopic, str]:
     """Return the topics to read, by contract name or, for configurations, by node name."""
-    chosen: dict[BagTopic, str] = {}
+    chosen: dict[str, BagTopic] = {}
+    # The last topic of a name, which is the shortest, replaces the others.
     for topic in sorted(topics, key=lambda one: len(one.name), reverse=True):
         space, _, last = topic.name.rpartition('/')
         for known in (*STREAMS, *_OTHERS):
             if topic.type_name == known.type_name and last == known.name.rpartition('/')[2]:
-                chosen = {one: name for one, name in chosen.items() if name != known.name}
-                chosen[topic] = known.name
+                chosen[known.name] = topic
         node = space.rpartition('/')[2]
         if last == 'configuration' and node in CONFIGURED:
-            chosen = {one: name for one, name in chosen.items() if name != node}
-            chosen[topic] = node
-    return chosen
+            chosen[node] = topic
+    return {topic: name for name, topic in chosen.items()}

@@ -16,7 +16,6 @@ import numpy as np
 RATE: Final = 30.0  #: frames per second
 SPAN: Final = 20.0  #: duration of the history [s]
 _SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
-_NOTHING: Final = (None, None, None)  #: position, velocity and effort of a missing joint
 
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
@@ -67,6 +66,9 @@ SIGNALS: Final = {
     'guide_z': _joint(contract.JOINT_STATES, contract.GUIDE_Z),
     'roll': _joint(contract.JOINT_STATES, contract.ROLL),
 }
+
+#: Signals of a frame.
+_SHOWN: Final = ('depth', 'velocity', 'force', 'reference', 'error', 'roll')
 
 #: Force without a sensor: the effort that the robot reports.
 EFFORT: Final = _joint(contract.JOINT_STATES, contract.INSERTION, 2)
@@ -146,29 +148,19 @@ class View:
 
     def frame(self, now: float) -> dict[str, Any]:
         """Return the frame at a time [s] for JSON: lengths in m, forces in N; None if unknown."""
-        joints = self._joints(contract.JOINT_STATES.name)
-        depth, velocity, effort = joints.get(contract.INSERTION, _NOTHING)
-        aim = self._joints(contract.REFERENCE.name).get(contract.INSERTION, _NOTHING)
-        error = self._joints(contract.TRACKING_ERROR.name).get(contract.INSERTION, _NOTHING)
+        values = {name: self._value(name) for name in SIGNALS}
         tip = self._vector(contract.TIP_DEFLECTION.name)
-        force = self._vector(contract.BASE_WRENCH.name)
-        guide = [joints.get(name, _NOTHING)[0] for name in (contract.GUIDE_X, contract.GUIDE_Z)]
+        guide = [values['guide_x'], values['guide_z']]
         return {
             'time': round(now, 3),
-            'depth': depth,
-            'velocity': velocity,
-            # Without a sensor, the effort reported by the robot.
-            'force': effort if force is None else force[1],
-            'sensed': force is not None,
-            'reference': aim[0],
-            'error': error[0],
+            **{name: values[name] for name in _SHOWN},
+            'sensed': contract.BASE_WRENCH.name in self._readings,
             'tip': tip,
             'guide': guide,
-            'roll': joints.get(contract.ROLL, _NOTHING)[0],
             'target': self._target(),
             'expected': self._expected,
             'hit_probability': self._hit_probability(),
-            **self._shape(depth, tip, guide, now),
+            **self._shape(values['depth'], tip, guide, now),
             'silent': self._silent(now),
             'nodes': self._node_rows(now),
             'invalid': self.invalid,
@@ -176,21 +168,13 @@ class View:
 
     def row(self, now: float) -> list[float | None]:
         """Return a time [s] and the values of `SIGNALS`; None while a topic is silent."""
-        silent, values = self._silent(now), list[float | None]()
-        for name in SIGNALS:
-            signal = signal_of(name, self._readings)
-            known = signal.topic in self._readings and signal.topic not in silent
-            values.append(signal.of(self._readings[signal.topic][1]) if known else None)
-        return [round(now, 3), *values]
+        silent = self._silent(now)
+        return [round(now, 3), *(self._value(name, silent) for name in SIGNALS)]
 
-    def _joints(self, topic: str) -> dict[str, tuple[float | None, ...]]:
-        _, reading = self._readings.get(topic, (0.0, None))
-        if reading is None:
-            return {}
-        return {
-            name: tuple(number(part[k]) if k < len(part) else None for part in reading.values)
-            for k, name in enumerate(reading.names)
-        }
+    def _value(self, name: str, silent: Container[str] = ()) -> float | None:
+        signal = signal_of(name, self._readings)
+        known = signal.topic in self._readings and signal.topic not in silent
+        return signal.of(self._readings[signal.topic][1]) if known else None
 
     def _vector(self, topic: str) -> list[float | None] | None:
         """Return the first three numbers of a message."""

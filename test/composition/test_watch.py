@@ -359,19 +359,24 @@ def test_bag_of_robot_has_straight_shape(tmp_path: Path) -> None:
     assert seen['depth'] > 0.02
 
 
+def mark(view: View, number: int) -> None:
+    """Store a number in a view."""
+    view.invalid = number
+
+
 def test_long_recording_is_decimated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Messages above the limit are decimated by two, over the whole recording."""
     monkeypatch.setattr(recorded, '_MOST', 100)
-    kept = recorded._Kept[int](1.0 / 30.0)
+    kept = recorded._Kept(1.0 / 30.0)
     for k in range(100_000):
-        kept.add(k / 100.0, partial(int, k))
+        kept.add(k / 100.0, partial(mark, number=k))
     assert 40 < len(kept._times) <= 100
+    view = View()
     for time in (0.0, 1.0, 500.0, 999.0):
-        found = kept.at(time)
-        assert found is not None
-        assert found[1] == found[0] * 100.0
-        assert time - found[0] <= kept.interval + 0.02
-    assert kept.at(-1.0) is None
+        kept.show(view, time)
+        assert 0.0 <= time - view.invalid / 100.0 <= kept.interval + 0.02
+    kept.show(view, -1.0)
+    assert view.invalid > 0
 
 
 def file_of(bag: Path) -> Path:
