@@ -89,13 +89,13 @@ async def _recorded(options: argparse.Namespace) -> None:
 
 
 async def _live(options: argparse.Namespace) -> None:
-    from needle_insertion.watch.live import Live
+    from needle_insertion.watch.live import Live, LiveReader
     from needle_insertion.watch.server import Server
     from needle_insertion.watch.watch_node import watching
 
     with watching(control=options.control) as (view, poll, control):
         live = Live(view, poll, control=options.control)
-        server = Server(live.reader, options.host, options.port, control)
+        server = Server(lambda: LiveReader(live), options.host, options.port, control)
         making = asyncio.create_task(live.run())
         try:
             await _serve(server, making)

@@ -49,9 +49,6 @@ class Live:
             due = max(due + PERIOD, now)
             await asyncio.sleep(due - monotonic())
 
-    def reader(self) -> LiveReader:
-        return LiveReader(self)
-
     async def newer(self, number: int) -> None:
         async with self._changed:
             await self._changed.wait_for(lambda: self.number > number)

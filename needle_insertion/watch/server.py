@@ -152,8 +152,11 @@ class Server:
         except OSError as error:
             await self.end()
             other = self._port + 1 if self._port < 65535 else PORT
+            # Without additions of asyncio.
+            why = error.strerror or str(error)
+            why = 'the port is in use' if error.errno == errno.EADDRINUSE else why
             raise ParameterError(
-                f'cannot listen on {self._host}, port {self._port}: {_reason(error)}; '
+                f'cannot listen on {self._host}, port {self._port}: {why}; '
                 f'use another one, such as --port {other}, or --port 0 for a free one'
             ) from error
         self._port = self._runner.addresses[0][1]
@@ -341,10 +344,3 @@ def _real(value: object) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     # JSON integers can have any number of digits.
     return number and abs(value) < 1e9 and isfinite(value)  # type: ignore[arg-type]
-
-
-def _reason(error: OSError) -> str:
-    """Return the system's description of an error, without additions of asyncio."""
-    if error.errno == errno.EADDRINUSE:
-        return 'the port is in use'
-    return error.strerror or str(error)

@@ -24,6 +24,9 @@ _NODES: Final = 64
 _NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 
 
+_Place = Sequence[float | None]  #: Coordinates [m], None if unknown.
+
+
 def number(value: float | None) -> float | None:
     """Return a number rounded to 1e-7; None if missing or not finite."""
     return None if value is None or not isfinite(value) else round(float(value), 7)
@@ -160,7 +163,7 @@ class View:
             'target': self._target(),
             'expected': self._expected,
             'hit_probability': self._hit_probability(),
-            **self._shape(values['depth'], tip, guide, now),
+            **self._shape(values['depth'], guide, tip, now),
             'silent': self._silent(now),
             'nodes': self._node_rows(now),
             'invalid': self.invalid,
@@ -199,11 +202,7 @@ class View:
         return next((number(one) for one in found if one is not None), None)
 
     def _shape(
-        self,
-        depth: float | None,
-        tip: Sequence[float | None] | None,
-        guide: Sequence[float | None],
-        now: float,
+        self, depth: float | None, guide: _Place, tip: _Place | None, now: float
     ) -> dict[str, Any]:
         received, needle = self._lines.get('needle', (0.0, None))
         path = self._lines.get('path', (0.0, None))[1]
@@ -216,9 +215,8 @@ class View:
         x, z = (one or 0.0 for one in guide)
         ends = [(x, min(depth - length, -free), z), (x, -free, z)]
         if tip is not None and None not in (tip[0], tip[2]):
-            ends.append((tip[0], depth, tip[2]))  # type: ignore[arg-type]
-        else:
-            ends.append((x, depth, z))
+            x, _, z = tip  # type: ignore[assignment]
+        ends.append((x, depth, z))
         return {'needle': line(np.array(ends)), 'path': path, 'shape': 'straight'}
 
     def _silent(self, now: float) -> dict[str, float]:

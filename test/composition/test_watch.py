@@ -25,7 +25,7 @@ from needle_identification import BagWriter, RecordingError
 from needle_identification.bags.messages import encode
 from needle_insertion import cli
 from needle_insertion.watch import recorded
-from needle_insertion.watch.live import Live, RecordedReader
+from needle_insertion.watch.live import Live, LiveReader, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.scene import parameters_of, scene
 from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
@@ -750,7 +750,7 @@ async def test_live_reader_receives_newest_frame() -> None:
     live = Live(view, lambda _: None, control=False)
     running = asyncio.create_task(live.run())
     try:
-        reader = live.reader()
+        reader = LiveReader(live)
         first = json.loads(await reader.next())
         assert {'frame', 'scene', 'setting', 'history'} == set(first)
         while live.number < 10:
@@ -763,7 +763,7 @@ async def test_live_reader_receives_newest_frame() -> None:
         assert later['frame']['depth'] == 0.05
         assert later['scene']['limits']['force'] == 15.0
         assert set(json.loads(await reader.next())) == {'frame'}
-        assert len(json.loads(await live.reader().next())['history']) > 10
+        assert len(json.loads(await LiveReader(live).next())['history']) > 10
         with pytest.raises(ParameterError):
             reader.take({'at': 1.0})
     finally:
