@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> int:
     with ProgressLine('needle run', brief=True):
         from needle_dynamics import find_needle
         from needle_insertion.compilation import compile_nodes
+        from needle_insertion.graph.ros_graph import Graph
         from needle_insertion.live.session import config_file, Session
-        from needle_insertion.live.session import run as run_session
 
     if options.output is None:
         options.output = Path('needle_runs') / f'{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}'
@@ -68,7 +68,12 @@ def run(options: argparse.Namespace) -> int:
         nodes = {'recorder': {'path': str(options.output / 'bag')}, **nodes}
     compile_nodes()
     lockstep = not (options.hardware or options.realtime)
-    return run_session(Session(nodes, file, options.output / 'logs', lockstep=lockstep))
+    with Graph(options.output / 'logs', shared=True) as graph:
+        session = Session(graph, nodes, file, lockstep=lockstep)
+        session.run()
+    if not options.no_recording:
+        session.screen.say(f'recorded to {options.output / "bag"}')
+    return 0
 
 
 def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, Any]]:

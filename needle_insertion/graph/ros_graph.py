@@ -90,18 +90,15 @@ class Graph:
             try:
                 end(self.executor, self._nodes)
             finally:
-                self._free()
+                self.context.try_shutdown()
+                self._nodes.clear()
+                self._life_cycles.clear()
+                del self.executor
+                # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the
+                # nodes in the domain, where the next graph would discover them.
+                gc.collect()
         finally:
             self._end_processes()
-
-    def _free(self) -> None:
-        self.context.try_shutdown()
-        self._nodes.clear()
-        self._life_cycles.clear()
-        del self.executor
-        # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the nodes
-        # in the domain, where the next graph would discover them.
-        gc.collect()
 
     def _end_processes(self) -> None:
         try:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Send requests of a person to running nodes: target, pause, retraction, stop."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
@@ -96,58 +96,45 @@ class Operator:
         service, data = REQUESTS[word]
         clients = {f'{name}/{service}': self._clients[name, service] for name in NODES}
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
-        answers = {
-            name: self._calls.call(client, request)
-            for name, client in clients.items()
-            if client.service_is_ready()
-        }
-        if not answers:
-            return _done(RequestOutcome(False, f'no node offers {" or ".join(clients)}'))
-        return _gathered(
-            answers, lambda answer: RequestOutcome(answer.success, printable(answer.message))
-        )
+        return self._call(clients, request, f'no node offers {" or ".join(clients)}')
 
     def set(self, node: str, name: str, value: Any) -> Future:
         """Set a parameter of a node; the future has a `RequestOutcome`."""
         client = self._client(SetParameters, node, 'set_parameters')
         # A new client has not discovered the service yet.
-        if not client.wait_for_service(timeout_sec=_DISCOVERY):
-            return _done(RequestOutcome(False, f'no node {node}'))
+        client.wait_for_service(timeout_sec=_DISCOVERY)
         parameter = Parameter(name, value=value).to_parameter_msg()
-
-        def read(answer: SetParameters.Response) -> RequestOutcome:
-            (result,) = answer.results
-            return RequestOutcome(result.successful, printable(result.reason))
-
         request = SetParameters.Request(parameters=[parameter])
-        service = f'{node}/set_parameters'
-        return _gathered({service: self._calls.call(client, request)}, read)
+        return self._call({f'{node}/set_parameters': client}, request, f'no node {node}')
+
+    def _call(self, clients: Mapping[str, Client], request: Any, missing: str) -> Future:
+        """Return one outcome of all calls, when the last has an answer or has failed."""
+        gathered = Future()
+        answers = {
+            service: self._calls.call(client, request)
+            for service, client in clients.items()
+            if client.service_is_ready()
+        }
+
+        def on_answer(_: Future) -> None:
+            if not gathered.done() and all(answer.done() for answer in answers.values()):
+                found = [_outcome(name, answer.result()) for name, answer in answers.items()]
+                lines = '; '.join(one.message for one in found)
+                gathered.set_result(RequestOutcome(all(one.success for one in found), lines))
+
+        for answer in answers.values():
+            answer.add_done_callback(on_answer)
+        if not answers:
+            gathered.set_result(RequestOutcome(False, missing))
+        return gathered
 
 
-def _done(outcome: RequestOutcome) -> Future:
-    future = Future()
-    future.set_result(outcome)
-    return future
-
-
-def _gathered(answers: Mapping[str, Future], read: Callable[[Any], RequestOutcome]) -> Future:
-    """Return one outcome of all calls, when the last has an answer or has failed."""
-    gathered = Future()
-
-    def outcome(service: str) -> RequestOutcome:
-        response, node = answers[service].result(), service.partition('/')[0]
-        if response is None:
-            return RequestOutcome(False, no_answer(service))
-        found = read(response)
-        return RequestOutcome(found.success, f'{node}: {found.message or "done"}')
-
-    def on_answer(_: Future) -> None:
-        if gathered.done() or not all(answer.done() for answer in answers.values()):
-            return
-        outcomes = [outcome(service) for service in answers]
-        lines = '; '.join(one.message for one in outcomes)
-        gathered.set_result(RequestOutcome(all(one.success for one in outcomes), lines))
-
-    for answer in answers.values():
-        answer.add_done_callback(on_answer)
-    return gathered
+def _outcome(service: str, response: Any) -> RequestOutcome:
+    if response is None:
+        return RequestOutcome(False, no_answer(service))
+    if isinstance(response, SetParameters.Response):
+        (result,) = response.results
+        success, words = result.successful, result.reason
+    else:
+        success, words = response.success, response.message
+    return RequestOutcome(success, f'{service.partition("/")[0]}: {printable(words) or "done"}')

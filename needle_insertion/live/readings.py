@@ -5,6 +5,7 @@ from dataclasses import replace
 from time import time_ns
 from typing import Final
 
+from needle_controller.controller import Measurement
 from needle_controller.hardware import Robot, STAMPS
 from needle_insertion.graph.messages import waiting
 from needle_ros import contract
@@ -67,26 +68,18 @@ class Readings:
 
     def insertion(self, topic: Topic = contract.JOINT_STATES) -> tuple[float, float] | None:
         """Return insertion depth [m] and velocity [m/s] of a topic; None if unknown."""
-        reading = self.newest(topic)
-        if topic is contract.JOINT_STATES and self._robot is not None:
-            return self._measured(self._robot)
-        if reading is None or contract.INSERTION not in reading.names:
+        robot, reading = None, self.newest(topic)
+        if topic is contract.JOINT_STATES:
+            robot, reading = self._robot, self._state()
+        if reading is None:
             return None
-        at = reading.names.index(contract.INSERTION)
-        positions, velocities, *_ = reading.values
-        if len(positions) <= at or len(velocities) <= at:
-            return None
-        return positions[at], velocities[at]
-
-    def _measured(self, robot: Robot) -> tuple[float, float] | None:
-        """Return insertion depth [m] and velocity [m/s] of a robot; None if unknown."""
-        reading = self._state()
+        convert = Measurement.from_reading if robot is None else robot.measurement
         try:
-            measured = None if reading is None else robot.measurement(reading)
+            measured = convert(reading)
         except ParameterError:
             # The controller reports the missing joint.
             return None
-        return None if measured is None else (measured.depth, measured.velocity)
+        return measured.depth, measured.velocity
 
     def _state(self) -> Reading | None:
         """Return the newest joint states, with the time of arrival if they have no stamp."""

@@ -2,7 +2,7 @@
 """Start nodes for a person or a script, and end them with the session."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 import os
 from pathlib import Path
 import signal
@@ -56,39 +56,35 @@ def config_file(name: str) -> Path:
     )
 
 
-@dataclass(frozen=True)
 class Session:
-    """Nodes, parameters and folders of `needle run`."""
+    """
+    Nodes of `needle run`, with parameters that override a ROS parameter file.
 
-    #: Parameters by node, in the order of their start: `controller`, and optionally `recorder`,
-    #: `plant` and `steering`.
-    nodes: Mapping[str, Mapping[str, Any]]
-    file: Path  #: ROS parameter file of all nodes; `nodes` overrides it.
-    logs: Path  #: Folder of the node output.
-    lockstep: bool = False  #: Whether the plant runs in lock-step, and the nodes in its time.
+    The keys of `nodes` are, in the order of their start: optionally `recorder` and `plant`,
+    `controller`, and optionally `steering`. With `lockstep` the plant runs in lock-step, and the
+    nodes in its time.
+    """
 
+    def __init__(
+        self, graph: Graph, nodes: Mapping[str, Mapping[str, Any]], file: Path, *, lockstep: bool
+    ) -> None:
+        self._graph, self._nodes, self._file, self._lockstep = graph, nodes, file, lockstep
+        self._node, self.screen = graph.node('operator'), Screen()
+        self._check_alone(own=0, discovery=1.0)
+        self._operator, self._warnings = Operator(self._node), Warnings(self.screen.say)
 
-def run(session: Session) -> int:
-    """Start the nodes, execute the commands of a person or a script, and end the nodes."""
-    screen = Screen()
-    with Graph(session.logs, shared=True) as graph:
-        node = graph.node('operator')
-        _check_alone(session, graph, node, own=0, discovery=1.0)
-        operator = Operator(node)
-        screen.say(f'starting {", ".join(session.nodes)}')
-        # The first commands of a script are always executed at the same sample: time continues
-        # until all sensors have reported.
-        holds = session.lockstep and not screen.typed
-        witness = (
-            Witness(node, lambda sample: sample.time < WARM_UP, lockstep=True) if holds else None
-        )
-        warnings = Warnings(screen.say)
-        processes, readings = _bring_up(
-            session, graph, node, operator, screen, warnings, holds=holds
-        )
-        terminal = Terminal(graph, operator, readings, screen, warnings)
-        terminal.begin(session.nodes)
-        screen.say(f'on domain {graph.domain}; `help` lists the words')
+    def run(self) -> None:
+        """Start the nodes, execute the commands of a person or a script, and end the nodes."""
+        screen, witness = self.screen, None
+        screen.say(f'starting {", ".join(self._nodes)}')
+        if self._lockstep and not screen.typed:
+            # The first commands of a script are always executed at the same sample: time continues
+            # until all sensors have reported.
+            witness = Witness(self._node, lambda sample: sample.time < WARM_UP, lockstep=True)
+        processes, readings = self._bring_up(holds=witness is not None)
+        terminal = Terminal(self._graph, self._operator, readings, screen, self._warnings)
+        terminal.begin(self._nodes)
+        screen.say(f'on domain {self._graph.domain}; `help` lists the words')
         # Suspended, the session could not stop the needle.
         signal.signal(signal.SIGTSTP, signal.SIG_IGN)
         with screen.reading():
@@ -103,54 +99,63 @@ def run(session: Session) -> int:
         with ProgressLine('ending the nodes', brief=True):
             for process in sorted(processes, key=lambda one: _ENDING.index(one.name)):
                 process.interrupt()
-    if 'recorder' in session.nodes:
-        screen.say(f'recorded to {session.nodes["recorder"]["path"]}')
-    return 0
 
+    def _bring_up(self, *, holds: bool) -> tuple[list[NodeProcess], Readings]:
+        """Start the nodes; the plant starts after all others have subscribed."""
+        graph, node, nodes, states = self._graph, self._node, self._nodes, self._operator.states
+        begin = monotonic()
 
-def _bring_up(
-    session: Session,
-    graph: Graph,
-    node: Node,
-    operator: Operator,
-    screen: Screen,
-    warnings: Warnings,
-    *,
-    holds: bool,
-) -> tuple[list[NodeProcess], Readings]:
-    """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
-    begin = monotonic()
+        def show(name: str) -> None:
+            message = f': {states[name].message}' if name in states else ''
+            line = f'starting {name}, {monotonic() - begin:.0f} s{message}'
+            self.screen.show(line.removesuffix(': '))
 
-    def show(name: str) -> None:
-        message = operator.states[name].message if name in operator.states else ''
-        screen.show(f'starting {name}, {monotonic() - begin:.0f} s' + (message and f': {message}'))
+        processes = start_nodes(graph, node, nodes, show, self._file, lockstep=self._lockstep)
+        own = 'plant' in nodes
+        robot = None if own else _robot(graph, node)
+        readings = Readings(Node('readings', context=graph.context), robot)
+        state = (robot and robot.settings.state_topic) or contract.JOINT_STATES.name
+        # The node `steering` reads the topic of the contract.
+        others = own + ('steering' in nodes and state != contract.JOINT_STATES.name)
 
-    processes = start_nodes(
-        graph, node, session.nodes, show, session.file, lockstep=session.lockstep
-    )
-    own = 'plant' in session.nodes
-    robot = None if own else _robot(graph, node)
-    readings = Readings(Node('readings', context=graph.context), robot)
-    state = (robot and robot.settings.state_topic) or contract.JOINT_STATES.name
-    # The node `steering` reads the topic of the contract.
-    others = own + ('steering' in session.nodes and state != contract.JOINT_STATES.name)
+        def listen() -> bool:
+            self._warnings.show(states)
+            # This process subscribes, too.
+            subscribed = node.count_subscribers(state) >= len(processes) + 1 + holds - others
+            aimed = node.count_subscribers(contract.TARGET.name) >= len(processes) - own
+            return subscribed and aimed
 
-    def listen() -> bool:
-        warnings.show(operator.states)
-        # This process subscribes, too.
-        subscribed = node.count_subscribers(state) >= len(processes) + 1 + holds - others
-        aimed = node.count_subscribers(contract.TARGET.name) >= len(processes) - own
-        return subscribed and aimed
+        what = 'the nodes' if own else f'a robot that publishes {state}, and for the nodes'
+        graph.spin_until(listen, what, _START)
+        self._check_alone(own=1)
+        if own:
+            show('plant')
+            followers = [name for name in nodes if name in ('recorder', 'steering')]
+            activate_plant(graph, node, states, self._lockstep * (holds + len(followers)))
+        return processes, readings
 
-    what = 'the nodes' if own else f'a robot that publishes {state}, and for the nodes'
-    graph.spin_until(listen, what, _START)
-    _check_alone(session, graph, node, own=1)
-    if own:
-        show('plant')
-        followers = [name for name in session.nodes if name in ('recorder', 'steering')]
-        number = session.lockstep * (holds + len(followers))
-        activate_plant(graph, node, operator.states, number)
-    return processes, readings
+    def _check_alone(self, *, own: int, discovery: float = 0.0) -> None:
+        """Reject more than `own` nodes in a role, during a time for discovery [s]."""
+        end = monotonic() + discovery
+
+        def has_passed() -> bool:
+            for name, topic in (
+                ('plant', contract.JOINT_STATES),
+                ('controller', contract.WRENCH_COMMAND),
+                ('controller', contract.REFERENCE),
+                ('steering', contract.TIP_EXPECTED),
+                ('recorder', contract.RECORDED),
+            ):
+                # Without a plant of its own the session needs a robot.
+                most = own if name in self._nodes else 1
+                if self._node.count_publishers(topic.name) > most:
+                    raise GraphError(
+                        f'another {name} is running on domain {self._graph.domain}: end it, or '
+                        f'choose another {DOMAIN}'
+                    )
+            return monotonic() >= end
+
+        self._graph.spin_until(has_passed, 'discovery')
 
 
 def _robot(graph: Graph, node: Node) -> Robot | None:
@@ -168,31 +173,6 @@ def _robot(graph: Graph, node: Node) -> Robot | None:
             found = [topic for topic, types in read if name in types]
             own[field] = found[0] if len(found) == 1 else ''
     return Robot(from_values(HardwareSettings, own, prefix))
-
-
-def _check_alone(
-    session: Session, graph: Graph, node: Node, *, own: int, discovery: float = 0.0
-) -> None:
-    """Reject more than `own` nodes in a role of the session, during a time for discovery [s]."""
-    end = monotonic() + discovery
-
-    def has_passed() -> bool:
-        for name, topic in (
-            ('plant', contract.JOINT_STATES),
-            ('controller', contract.WRENCH_COMMAND),
-            ('controller', contract.REFERENCE),
-            ('steering', contract.TIP_EXPECTED),
-            ('recorder', contract.RECORDED),
-        ):
-            # Without a plant of its own the session needs a robot.
-            if node.count_publishers(topic.name) > (own if name in session.nodes else 1):
-                raise GraphError(
-                    f'another {name} is running on domain {graph.domain}: end it, or choose '
-                    f'another {DOMAIN}'
-                )
-        return monotonic() >= end
-
-    graph.spin_until(has_passed, 'discovery')
 
 
 def _converse(terminal: Terminal, screen: Screen, witness: Witness | None) -> None:

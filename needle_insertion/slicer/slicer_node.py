@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 import sys
-from time import monotonic
+from time import monotonic, monotonic_ns
 from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -249,13 +249,10 @@ class SlicerNode(BaseNode):
         points, header = interpreter.shape(shape, self._shapes)
         if link.send(points) and link.send(header):
             self._shapes += 1
-            self._rate.add(self._steady_ns())
+            self._rate.add(monotonic_ns())
         link.send(interpreter.tip(shape))
 
     # Status.
-
-    def _steady_ns(self) -> int:
-        return int(monotonic() * NANOSECONDS)
 
     def diagnose(self) -> Diagnosis[SlicerStatus]:
         """Report the connection, the transmitted shapes and the received targets."""
@@ -276,7 +273,7 @@ class SlicerNode(BaseNode):
             error=link.error,
             shape_source=source,
             shapes=self._shapes,
-            shape_rate=self._rate.rate(self._steady_ns()),
+            shape_rate=self._rate.rate(monotonic_ns()),
             left_out=link.left_out,
             targets=self._targets,
             rejected=self._events.rejected,
