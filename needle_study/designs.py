@@ -15,6 +15,7 @@ References
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -36,25 +37,17 @@ REPLICATES: Final = 16
 _MOST_LATIN: Final = 2**24
 
 
+@dataclass(frozen=True, eq=False)
 class RandomDesign:
-    """
-    Independent samples, and base of the other designs.
+    """Independent samples, and base of the other designs."""
 
-    Parameters
-    ----------
-    samples, seed : int
-        Number of samples, and seed of the study.
-    factor : (d, d) array
-        Cholesky factor of the correlations of the normal scores.
-
-    """
+    samples: int  #: number of samples
+    seed: int  #: of the study
+    factor: FloatArray  #: Cholesky factor of the correlations of the normal scores, shape (d, d)
 
     name = 'random'  #: of the study file
     replicates = 0  #: number of independent parts; 0 if all samples are independent
     mixes = True  #: whether correlations are applied to the uniform numbers
-
-    def __init__(self, samples: int, seed: int, factor: FloatArray) -> None:
-        self.samples, self.seed, self.factor = samples, seed, factor
 
     @property
     def dimensions(self) -> int:
@@ -92,17 +85,17 @@ class RandomDesign:
         return np.array(each).reshape(count, self.dimensions)
 
 
+@dataclass(frozen=True, eq=False)
 class LatinDesign(RandomDesign):
     """Latin hypercube: each of equal parts of every distribution has one sample."""
 
     name = 'latin'
     mixes = False  # its strata are correlated
 
-    def __init__(self, samples: int, seed: int, factor: FloatArray) -> None:
-        super().__init__(samples, seed, factor)
-        if samples > _MOST_LATIN:
+    def __post_init__(self) -> None:
+        if self.samples > _MOST_LATIN:
             raise ParameterError(
-                f'design latin takes at most {_MOST_LATIN} samples, got {samples}'
+                f'design latin takes at most {_MOST_LATIN} samples, got {self.samples}'
             )
 
     def uniform(self, first: int, count: int) -> FloatArray:
@@ -138,6 +131,7 @@ class SobolDesign(RandomDesign):
         return found
 
 
+@dataclass(frozen=True, eq=False)
 class SaltelliDesign(SobolDesign):
     """
     Groups of samples for Sobol' indices, where the noise is a variable, too.
@@ -148,8 +142,7 @@ class SaltelliDesign(SobolDesign):
 
     name = 'saltelli'
 
-    def __init__(self, samples: int, seed: int, factor: FloatArray) -> None:
-        super().__init__(samples, seed, factor)
+    def __post_init__(self) -> None:
         if self.is_correlated:
             raise ParameterError(
                 'design saltelli takes no correlations: Sobol indices are of independent variables'

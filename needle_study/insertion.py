@@ -6,20 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
-from needle_controller import (
-    Axis,
-    check_stability,
-    ControllerSettings,
-    DEFAULT_GAINS,
-    LAWS,
-    Measurement,
-    Reference,
-    ReferenceLimits,
-    REFERENCES,
-    run_batch,
-    SafetyLimits,
-    Setpoint,
-)
+import needle_controller as control
 from needle_controller.controller import LAW_OF
 from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
@@ -29,22 +16,14 @@ from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParamete
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import constant, from_values
+from needle_ros.settings import check_choice, constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.scenario import (
-    check_names,
-    mapping,
-    MeasuredRun,
-    Metric,
-    one_of,
-    Scenario,
-    Variable,
-)
+from needle_study.scenario import check_names, mapping, MeasuredRun, Metric, Scenario, Variable
 import numpy as np
 from scipy.optimize import brentq
 
 OPEN_LOOP: Final = 'open loop'
-CONTROLLERS: Final = (*LAWS, OPEN_LOOP)  #: control laws, and the open loop
+CONTROLLERS: Final = (*control.LAWS, OPEN_LOOP)  #: control laws, and the open loop
 _REST: Final = 1e-5  #: largest speed of a needle at rest [m/s]
 _MOST: Final = 1_000_000  #: most samples of an insertion
 _AT_ONCE: Final = 16  #: open-loop insertions per batch, whose samples are all in memory
@@ -73,15 +52,15 @@ def _same(settings: type, name: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InsertionStudy(ReferenceLimits):
+class InsertionStudy(control.ReferenceLimits):
     """Settings of the scenario that are the same for all samples."""
 
-    rate: float = _same(ControllerSettings, 'rate')
-    delay: float = _same(ControllerSettings, 'delay')
-    force_limit: float = _same(ControllerSettings, 'force_limit')
-    speed_limit: float = _same(SafetyLimits, 'speed')
-    error_limit: float = _same(SafetyLimits, 'tracking_error')
-    deflection_limit: float = _same(SafetyLimits, 'tip_deflection')
+    rate: float = _same(control.ControllerSettings, 'rate')
+    delay: float = _same(control.ControllerSettings, 'delay')
+    force_limit: float = _same(control.ControllerSettings, 'force_limit')
+    speed_limit: float = _same(control.SafetyLimits, 'speed')
+    error_limit: float = _same(control.SafetyLimits, 'tracking_error')
+    deflection_limit: float = _same(control.SafetyLimits, 'tip_deflection')
     wait: float = constant(1.0, 's', 'time after the end of the reference', open_low=True)
     push: float = constant(3.0, 'N', 'force of the open loop', open_low=True)
     tolerance: float = constant(1e-4, 'm', 'largest error of a hit', open_low=True)
@@ -120,13 +99,8 @@ class _Insertion(NamedTuple):
         return np.asarray(np.stack([self.depth, self.speed]) + noise.T)
 
     def until(self, end: int) -> '_Insertion':
-        return self._replace(
-            states=self.states[: end + 1],
-            commands=self.commands[:end],
-            forces=self.forces[:end],
-            noise=self.noise[: end + 1],
-            goal=self.goal[: end + 1],
-        )
+        cut = {name: getattr(self, name)[: end + 1] for name in ('states', 'noise', 'goal')}
+        return self._replace(commands=self.commands[:end], forces=self.forces[:end], **cut)
 
 
 class InsertionScenario(Scenario):
@@ -144,10 +118,10 @@ class InsertionScenario(Scenario):
         check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
         numbers = {name: value for name, value in settings.items() if name not in _PARTS}
         self._numbers = from_values(InsertionStudy, numbers, 'settings.')
-        controller, reference = (
-            one_of(f'settings: {name}', settings.get(name, next(iter(valid))), valid)
-            for name, valid in (('controller', CONTROLLERS), ('reference', REFERENCES))
-        )
+        words: dict[str, str] = {}
+        for name, valid in (('controller', CONTROLLERS), ('reference', tuple(control.REFERENCES))):
+            words[name] = settings.get(name, valid[0])
+            check_choice(f'settings: {name}', words[name], valid)
         constants, gains, uncertainty = (
             mapping(f'settings: {name}', settings.get(name))
             for name in ('constants', 'gains', 'uncertainty')
@@ -157,15 +131,15 @@ class InsertionScenario(Scenario):
             {**asdict(find_needle(settings.get('needle', PAPER_NEEDLE)).needle), **constants},
             'settings.constants.',
         )
-        self._kind = REFERENCES[reference]
+        self._kind = control.REFERENCES[words['reference']]
         self._period = 1.0 / self._numbers.rate
-        self._limits = SafetyLimits(
+        self._limits = control.SafetyLimits(
             speed=self._numbers.speed_limit,
             tracking_error=self._numbers.error_limit,
             tip_deflection=self._numbers.deflection_limit,
         )
         plants = from_values(Uncertainty, uncertainty, 'settings.uncertainty.')
-        self._law = self._made(controller, gains, plants)
+        self._law = self._made(words['controller'], gains, plants)
         p, samples = self._needle, self._longest * self._numbers.rate
         if samples > _MOST:
             raise ParameterError(
@@ -203,9 +177,11 @@ class InsertionScenario(Scenario):
         """Upper bound of the duration of an insertion [s]."""
         p, numbers = self._needle, self._numbers
         if self._law is None:
-            axis = Axis.insertion(p)
+            axis = control.Axis.insertion(p)
             return _time(axis, numbers.push, p.length - p.minimum_depth) + numbers.wait
-        reference: Reference = self._kind(Setpoint(p.minimum_depth), p.length, numbers)
+        reference: control.Reference = self._kind(
+            control.Setpoint(p.minimum_depth), p.length, numbers
+        )
         return reference.duration + numbers.wait
 
     def _made(
@@ -214,7 +190,7 @@ class InsertionScenario(Scenario):
         p = self._needle
         if controller == OPEN_LOOP:
             if gains:
-                raise ParameterError(f'settings: gains are for {", ".join(LAWS)}')
+                raise ParameterError(f'settings: gains are for {", ".join(control.LAWS)}')
             friction = p.coulomb_friction * max(1.0, p.withdrawal_friction)
             if not self._numbers.push > friction:
                 raise ParameterError(
@@ -223,12 +199,14 @@ class InsertionScenario(Scenario):
                 )
             return None
         require_complete(p)
-        usual = DEFAULT_GAINS[controller]['insertion']
+        usual = control.DEFAULT_GAINS[controller]['insertion']
         chosen = from_values(type(usual), {**asdict(usual), **gains}, 'settings.gains.')
-        axis = Axis.insertion(p)
+        axis = control.Axis.insertion(p)
         law = LAW_OF[type(usual)](axis=axis, gains=chosen, period=self._period)
         plants = uncertainty.axes(axis, carriage=True)
-        check_stability(law, int(self._numbers.delay), f'{controller} gains', plants=plants)
+        control.check_stability(
+            law, int(self._numbers.delay), f'{controller} gains', plants=plants
+        )
         return law
 
     def insert(
@@ -284,10 +262,10 @@ class InsertionScenario(Scenario):
         numbers, model = self._numbers, NeedleModel(self._truth(row))
         # The reference starts at the measured depth.
         begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
-        reference: Reference = self._kind(Setpoint(begin), row['target'], numbers)
+        reference: control.Reference = self._kind(control.Setpoint(begin), row['target'], numbers)
         count = max(1, round((reference.duration + numbers.wait) * numbers.rate))
         noise, late = self._noise(row, rng, count), round(row['late'])
-        batch = run_batch(
+        batch = control.run_batch(
             law,
             model.parameters,
             model.state_at(row['depth'], row['tip']),
@@ -324,7 +302,7 @@ class InsertionScenario(Scenario):
         """Return the first row of depth, velocity, error and deflection that the guard rejects."""
         guard = Guard(self._limits, (self._needle.minimum_depth, self._needle.length))
         for k, (depth, speed, error, tip) in enumerate(samples.tolist()):
-            encoders = guard.encoders(Measurement(time=0.0, depth=depth, velocity=speed))
+            encoders = guard.encoders(control.Measurement(time=0.0, depth=depth, velocity=speed))
             if encoders or guard.tracking(error) or guard.tip(tip):
                 return k
         return None
@@ -333,7 +311,7 @@ class InsertionScenario(Scenario):
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[_Insertion]:
         """Simulate insertions under a constant force, for the duration of the nominal needle."""
-        numbers, nominal = self._numbers, Axis.insertion(self._needle)
+        numbers, nominal = self._numbers, control.Axis.insertion(self._needle)
         models = [NeedleModel(self._truth(row)) for row in rows]
         commands, noise = [], []
         for row, rng in zip(rows, streams, strict=True):
@@ -389,7 +367,7 @@ class InsertionScenario(Scenario):
         }
 
 
-def _time(axis: Axis, force: float, distance: float) -> float:
+def _time(axis: control.Axis, force: float, distance: float) -> float:
     """Return the time in which a constant force moves an axis by a distance, from rest [s]."""
     if distance == 0.0:
         return 0.0

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics import FloatArray
 from needle_ros.contract import Topic
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice, unknown_name
+from needle_ros.settings import unknown_name
 import numpy as np
 
 
@@ -101,9 +101,3 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise ParameterError(f'{name} must be names with values, got {value!r}')
     return value
-
-
-def one_of(name: str, value: Any, valid: Iterable[str]) -> str:
-    """Return a word of the file; raise `ParameterError` if it is not valid."""
-    check_choice(name, value, tuple(valid))
-    return str(value)

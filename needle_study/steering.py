@@ -8,16 +8,9 @@ from math import nan
 from typing import Any, Final
 
 from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
+from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
 from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits, STEP_LENGTH
-from needle_controller.steering.simulation import (
-    GroundTruth,
-    simulate_steering,
-    SteeringPlant,
-    step_depths,
-    SteppedTipErrors,
-    SteppedTipSensor,
-)
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
 from needle_dynamics.simulated.tip_errors import TipErrorParameters
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
@@ -33,7 +26,7 @@ _OPEN_LOOP: Final = 'open_loop'
 
 _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 _JOINTS: Final = contract.steered_states(efforts=False)
-_EXACT: Final = SteppedTipErrors()  # of a sensor with white noise alone
+_EXACT: Final = simulation.SteppedTipErrors()  # of a sensor with white noise alone
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _MOST: Final = 1000  #: most steps of an insertion
 _SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]
@@ -127,7 +120,7 @@ class SteeringScenario(Scenario):
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        self._depths = step_depths(numbers.depth, numbers.step)
+        self._depths = simulation.step_depths(numbers.depth, numbers.step)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
         self.variables: Mapping[str, Variable] = {
@@ -166,7 +159,7 @@ class SteeringScenario(Scenario):
             miss = float(np.hypot(x, z))
             yield {**found, 'miss': miss, 'hit': float(miss <= self._numbers.hit_radius)}
 
-    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> GroundTruth:
+    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> simulation.GroundTruth:
         needle, steering = with_lengths(
             self._needle, self._steering, row['bending_length'], row['skin']
         )
@@ -177,7 +170,7 @@ class SteeringScenario(Scenario):
             path_noise=row['path_noise'],
             path_noise_length=self._prior.path_noise_length,
         )
-        return GroundTruth(
+        return simulation.GroundTruth(
             needle=needle,
             steering=steering,
             tilt=(row['tilt_x'], row['tilt_z']),
@@ -186,7 +179,7 @@ class SteeringScenario(Scenario):
             seed=int(rng.integers(_SEEDS)),
         )
 
-    def _open(self, truths: Sequence[GroundTruth]) -> Iterable[dict[str, float]]:
+    def _open(self, truths: Sequence[simulation.GroundTruth]) -> Iterable[dict[str, float]]:
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
         rolls = np.array([np.arctan2(*truth.bevel) for truth in truths])[:, np.newaxis]
@@ -213,7 +206,7 @@ class SteeringScenario(Scenario):
         tilt = row['tilt_x'], row['tilt_z']
         still, messages = [0.0] * len(_JOINTS.joints), list[MeasuredRun]()
 
-        def watch(plant: SteeringPlant) -> None:
+        def watch(plant: simulation.SteeringPlant) -> None:
             one = plant.needle
             stamp = round(one.depth / _SPEED * NANOSECONDS)
             messages.append(
@@ -230,10 +223,10 @@ class SteeringScenario(Scenario):
 
     def _steered(
         self,
-        truth: GroundTruth,
+        truth: simulation.GroundTruth,
         row: Mapping[str, float],
         rng: np.random.Generator,
-        watch: Callable[[SteeringPlant], object] | None = None,
+        watch: Callable[[simulation.SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
         try:
             law = build_law(
@@ -243,14 +236,14 @@ class SteeringScenario(Scenario):
             return {'refused': 1.0}
 
         metrics, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
-        errors = SteppedTipErrors(
+        errors = simulation.SteppedTipErrors(
             interval=self._numbers.interval,
             dropout=row['lost'],
             **{name: row[name] for name in _ERRORS},
         )
-        sensor = SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
+        sensor = simulation.SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
         try:
-            done = simulate_steering(law, plant, sensor, watch)
+            done = simulation.simulate_steering(law, plant, sensor, watch)
         except SteeringFaultError:
             return {**metrics, 'stopped': 1.0}
         tip = plant.tip

@@ -14,10 +14,10 @@ from needle_dynamics.display import Displayed, new_figure, shown
 from needle_dynamics.progress import Progress, progress_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
-from needle_ros.settings import find_class
+from needle_ros.settings import check_choice, find_class
 from needle_study.designs import BELOW, DESIGNS, INSIDE, RandomDesign, SobolDesign
 from needle_study.distribution import Distribution, distribution, from_table, is_number
-from needle_study.scenario import check_names, mapping, one_of, Scenario, SCENARIOS
+from needle_study.scenario import check_names, mapping, Scenario, SCENARIOS
 import numpy as np
 
 if TYPE_CHECKING:
@@ -142,7 +142,8 @@ def build_study(document: Any) -> Study:
     if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
         raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
-    design = one_of('design', document.get('design', SobolDesign.name), DESIGNS)
+    design = document.get('design', SobolDesign.name)
+    check_choice('design', design, DESIGNS)
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
     scenario: Scenario = of_class(settings)
     known = scenario.variables
