@@ -66,7 +66,13 @@ def run(options: argparse.Namespace) -> int:
         options.force,
         options.sliding,
     )
-    files = _write_map(parameters, options) if options.map else []
+    files = list[Path]()
+    if options.map:
+        common.make_folder(options.output)
+        largest = max(map(abs, options.tip_deflection)) or report.LARGEST_DEFLECTION
+        (speed,) = options.speed
+        found = report.map_needle(parameters, speed, largest, options.force, options.sliding)
+        files = report.write_map(options.output, found)
     document = {
         'needle': options.needle,
         'parameters': asdict(parameters),
@@ -77,16 +83,3 @@ def run(options: argparse.Namespace) -> int:
     text = table([point.row for point in points], report.POINT_HEADS)
     common.print_result(document, text, files, as_json=options.json)
     return 0
-
-
-def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> list[Path]:
-    common.make_folder(options.output)
-    (speed,) = options.speed
-    found = report.map_needle(
-        parameters,
-        speed,
-        max(map(abs, options.tip_deflection)) or report.LARGEST_DEFLECTION,
-        options.force,
-        options.sliding,
-    )
-    return report.write_map(options.output, found)

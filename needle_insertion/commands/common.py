@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared parts of the commands: options, model constants from words, results and their folders."""
 
-from argparse import Action, ArgumentParser, ArgumentTypeError, Namespace
+from argparse import _ArgumentGroup, Action, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Iterable, Sequence
 import json
 import os
@@ -11,6 +11,9 @@ from typing import Any
 
 from needle_ros.errors import ParameterError, shown
 from needle_ros.quantities import EXAMPLES, quantity
+
+#: End of the help on recordings.
+SKIPPED = '; an unusable recording is reported and skipped, and the exit status is 2'
 
 
 def add_needle(parser: ArgumentParser, default: str | None, otherwise: str = '') -> None:
@@ -48,6 +51,33 @@ def add_recordings(parser: ArgumentParser, otherwise: str = '') -> None:
         help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, table (.csv, .tsv, .mat), or a '
         f'folder of these{otherwise}',
     )
+
+
+def add_time(reading: ArgumentParser | _ArgumentGroup) -> None:
+    from needle_identification.recordings import TIMES
+
+    reading.add_argument(
+        '--time',
+        choices=TIMES,
+        default='header',
+        help='time of a sample: stamp of its message or time of receipt (default header)',
+    )
+
+
+def add_output(parser: ArgumentParser | _ArgumentGroup, use: str = '') -> None:
+    """Add the options of the results, of which the parameter file has a use."""
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        metavar='FILE',
+        help=f'ROS parameter file with the result{use}',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+
+
+def words_of(text: str) -> list[str]:
+    return [word.strip() for word in text.split(',')]
 
 
 def with_unit(
@@ -95,6 +125,19 @@ def print_result(
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
     else:
         sys.stdout.write(''.join([f'{text}\n', *(f'wrote {path}\n' for path in files)]))
+
+
+def try_write(path: Path | None, write: Callable[[Path], object]) -> tuple[list[Path], list[str]]:
+    """Write a parameter file, if any; return it, or the error if no parameter is determined."""
+    from needle_identification import IdentificationError
+
+    if path is None:
+        return [], []
+    try:
+        write(path)
+    except IdentificationError as error:
+        return [], [f'{path} is not written: {error}']
+    return [path], []
 
 
 def print_each(kind: str, lines: Iterable[object]) -> None:

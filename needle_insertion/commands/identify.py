@@ -5,38 +5,19 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
+from functools import partial
 from itertools import takewhile
 from pathlib import Path
 import shlex
 import sys
 from typing import Any, Final
 
-from needle_identification import (
-    ESTIMATORS,
-    FrictionSettings,
-    IdentificationError,
-    identify_friction,
-    identify_stiffness,
-    inspect_recording,
-    read_friction_recording,
-    read_indentation_recording,
-    StiffnessSettings,
-    summarize,
-    summarize_stiffness,
-    TERMS,
-    write_result,
-)
+import needle_identification as identification
 from needle_identification.recordings.tables import column_roles, recordings_in, ROLES
 from needle_identification.steering.columns import STEERING_ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
-from needle_insertion.commands.identify_steering import (
-    add_output,
-    add_steering,
-    add_time,
-    SKIPPED,
-    words_of,
-)
+from needle_insertion.commands.identify_steering import add_steering
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
@@ -47,6 +28,12 @@ from needle_ros.quantities import quantities
 SIGNED: Final = ('--force-axis', '--motion-axis', '--axes', '--truth')
 
 KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')  #: Kinds of identification.
+
+#: Reader and estimator of the kinds with a result for all recordings.
+_FITS: Final[Mapping[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
+    'friction': (identification.read_friction_recording, identification.identify_friction),
+    'stiffness': (identification.read_indentation_recording, identification.identify_stiffness),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         epilog='example: needle identify friction run_1 run_2.mcap --wrench-topic /ft '
         '--motion-axis -slide -o result.yaml --report page',
     )
-    reading, fitting = _add_common(friction, FrictionSettings())
+    reading, fitting = _add_common(friction, identification.FrictionSettings())
     reading.add_argument(
         '--force-axis',
         default='y',
@@ -85,11 +72,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fitting.add_argument(
         '--terms',
-        type=words_of,
+        type=common.words_of,
         action='extend',
         metavar='TERM,...',
-        help=f'terms of the force model, from {", ".join(TERMS)} '
-        f'(default {",".join(FrictionSettings().terms)})',
+        help=f'terms of the force model, from {", ".join(identification.TERMS)} '
+        f'(default {",".join(identification.FrictionSettings().terms)})',
     )
     fitting.add_argument(
         '--layers',
@@ -106,10 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         epilog='example: needle identify stiffness place_1 place_2.mcap --axes x,-z '
         '-o result.yaml --report page',
     )
-    reading, fitting = _add_common(stiffness, StiffnessSettings())
+    reading, fitting = _add_common(stiffness, identification.StiffnessSettings())
     reading.add_argument(
         '--axes',
-        type=words_of,
+        type=common.words_of,
         default=['x', 'z'],
         metavar='X,Z',
         help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
@@ -125,12 +112,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_common(
-    parser: argparse.ArgumentParser, defaults: FrictionSettings | StiffnessSettings
+    parser: argparse.ArgumentParser,
+    defaults: identification.FrictionSettings | identification.StiffnessSettings,
 ) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
     """Add the options of all kinds; return the option groups of reading and of fitting."""
-    common.add_recordings(parser, SKIPPED)
+    common.add_recordings(parser, common.SKIPPED)
     writing = parser.add_argument_group('output')
-    add_output(writing)
+    common.add_output(writing)
     writing.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
     )
@@ -151,10 +139,10 @@ def _add_common(
         help='topic of the motion (default: the only topic of a suitable type, or joint_states or '
         'end_effector_pose)',
     )
-    add_time(reading)
+    common.add_time(reading)
     fitting = parser.add_argument_group('identification')
     # The default of the settings is the first choice.
-    estimators = tuple(dict.fromkeys([defaults.estimator, *ESTIMATORS]))
+    estimators = tuple(dict.fromkeys([defaults.estimator, *identification.ESTIMATORS]))
     fitting.add_argument(
         '--estimator',
         choices=estimators,
@@ -188,80 +176,70 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
 
 
 def _run_friction(options: argparse.Namespace) -> int:
-    settings = _settings(FrictionSettings, options)
+    settings = _settings(identification.FrictionSettings, options)
+    fit = (settings, len(options.recordings))
     axes = {
         'force_axis': options.force_axis,
         'motion_axis': options.motion_axis,
         'columns': column_roles(options.columns) if options.columns else None,
     }
     return _identify(
-        options,
-        settings,
-        axes,
-        read_friction_recording,
-        lambda recording: identify_friction(recording, settings, len(options.recordings)),
-        summarize,
-        write_result,
-        ('stiffness', lambda bag: identify_stiffness(read_indentation_recording(bag))),
+        options, 'friction', fit, axes, identification.summarize, identification.write_result
     )
 
 
 def _run_stiffness(options: argparse.Namespace) -> int:
-    settings = _settings(StiffnessSettings, options)
+    settings = _settings(identification.StiffnessSettings, options)
     if len(options.axes) != 2:
         raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
+    summarize = partial(
+        identification.summarize_stiffness,
+        force=options.level,
+        level_tolerance=settings.level_tolerance,
+    )
+    axes = {'axes': tuple(options.axes)}
     return _identify(
         options,
-        settings,
-        {'axes': tuple(options.axes)},
-        read_indentation_recording,
-        lambda recording: identify_stiffness(recording, settings),
-        lambda estimates: summarize_stiffness(
-            estimates, force=options.level, level_tolerance=settings.level_tolerance
-        ),
-        lambda path, summary: write_result(path, None, summary),
-        ('friction', lambda bag: identify_friction(read_friction_recording(bag))),
+        'stiffness',
+        (settings,),
+        axes,
+        summarize,
+        lambda path, summary: identification.write_result(path, None, summary),
     )
 
 
 def _identify(
     options: argparse.Namespace,
-    settings: Any,
+    kind: str,
+    fit: tuple[Any, ...],
     axes: Mapping[str, Any],
-    read: Callable[..., Any],
-    identify: Callable[[Any], Any],
     summarize: Callable[[list[Any]], Any],
     write: Callable[[Path, Any], None],
-    other: tuple[str, Callable[[Path], Any]],
 ) -> int:
-    """Identify all bags, write the results, print warnings and tables; return the exit status."""
+    """Identify all bags with the settings and other arguments of a fit, and write the results."""
     common.check_file(options.output)
     common.check_folder(options.report)
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
+    read, identify = _FITS[kind]
     estimates, origin = identify_all(
         options.recordings,
-        lambda bag: read(bag, **reading),
-        identify,
-        Origin(settings=settings, reading=reading, result=options.output),
+        partial(read, **reading),
+        lambda recording: identify(recording, *fit),
+        Origin(settings=fit[0], reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
     common.print_each('error', origin.failed)
-    what, identify_other = other
+    (other,) = _FITS.keys() - {kind}
+    read, identify = _FITS[other]
     for name, _reason in origin.failures:
         with suppress(NeedleError, OSError):
-            identify_other(Path(name))
-            sys.stderr.write(shown(f'{name}: try needle identify {what}') + '\n')
+            identify(read(Path(name)))
+            sys.stderr.write(shown(f'{name}: try needle identify {other}') + '\n')
     if not estimates:
         return 2
     summary = summarize(estimates)
-    written, errors = list[Path](), list[str]()
-    if options.output is not None:
-        try:
-            write(options.output, summary)
-            written.append(options.output)
-        except IdentificationError as error:
-            errors.append(f'{options.output} is not written: {error}')
+    written, errors = common.try_write(options.output, lambda path: write(path, summary))
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
@@ -291,7 +269,7 @@ def completed(words: Sequence[str]) -> list[str]:
     for path in [one for name in given for one in recordings_in(Path(name))]:
         try:
             with ProgressLine(f'reading {path}', brief=True):
-                found = inspect_recording(path)
+                found = identification.inspect_recording(path)
         except (NeedleError, OSError) as error:
             reasons.append(str(error))
             continue
@@ -300,7 +278,7 @@ def completed(words: Sequence[str]) -> list[str]:
         reasons.append(f'{found.path}: {found.lacking or "; ".join(found.words)}')
     else:
         # The reason of the first recording: the others are probably alike.
-        raise IdentificationError(reasons[0])
+        raise identification.IdentificationError(reasons[0])
     kind, _, *options = shlex.split(found.command)[2:]
     if own:
         steered = any(f'{role}=' in word for word in words for role in STEERING_ROLES[1:])

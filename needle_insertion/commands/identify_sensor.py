@@ -12,8 +12,7 @@ from needle_identification.recordings.tables import column_roles, is_table
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
 from needle_identification.sensor.recording import SensorRecording
-from needle_insertion.commands.common import check_file, print_each, print_result
-from needle_insertion.commands.identify_steering import add_output, add_time, words_of
+from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import interval_of, title_of
 from needle_insertion.report.text import table
@@ -41,7 +40,7 @@ def add_sensor(what: Any) -> None:
         help='true position: constant, such as 0mm,52.3mm,0mm, or a bag or table by the same '
         'clock (default: LOG itself, with --truth-topic or --truth-columns)',
     )
-    add_output(parser, ', for plant and steering')
+    common.add_output(parser, ', for plant and steering')
     reading = parser.add_argument_group('input')
     for option, of in (('--columns', 'the sensor'), ('--truth-columns', 'the true position')):
         reading.add_argument(
@@ -62,7 +61,7 @@ def add_sensor(what: Any) -> None:
         help='axes to compare (default x,y,z)',
         metavar='AXIS,...',
     )
-    add_time(reading)
+    common.add_time(reading)
     parser.set_defaults(identify=_run)
 
 
@@ -94,26 +93,19 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification import identify_sensor
     from needle_identification.result import sensor_yaml
 
-    check_file(options.output)
+    common.check_file(options.output)
 
-    def roles(text: str | None) -> dict[str, str]:
-        return column_roles(text, SENSOR_ROLES) if text else {}
-
+    reading = {name: getattr(options, name) for name in ('tip_topic', 'truth_topic', 'time')}
+    for name in ('columns', 'truth_columns'):
+        text = getattr(options, name)
+        reading[name] = column_roles(text, SENSOR_ROLES) if text else {}
+    axes = tuple(common.words_of(options.axes))
     with ProgressLine('reading', brief=True):
-        recording = read_sensor_recording(
-            options.log,
-            _truth(options),
-            axes=tuple(words_of(options.axes)),
-            tip_topic=options.tip_topic,
-            truth_topic=options.truth_topic,
-            time=options.time,
-            columns=roles(options.columns),
-            truth_columns=roles(options.truth_columns),
-        )
-    print_each('warning', recording.losses)
+        recording = read_sensor_recording(options.log, _truth(options), axes=axes, **reading)
+    common.print_each('warning', recording.losses)
     with ProgressLine('identification', brief=True):
         found = identify_sensor(recording)
-    print_each('warning', found.warnings)
+    common.print_each('warning', found.warnings)
     written = list(filter(None, [options.output]))
     if written:
         # Stamps of headers are the times of the samples: their messages come later.
@@ -121,7 +113,7 @@ def _run(options: argparse.Namespace) -> int:
         text = sensor_yaml(found, ExecutiveSettings().measurement_time, delayed=delayed)
         write_whole(options.output, text.encode())
     document = sensor_document(found, recording)
-    print_result(document, sensor_text(found), written, as_json=options.json)
+    common.print_result(document, sensor_text(found), written, as_json=options.json)
     return 0
 
 
@@ -146,9 +138,7 @@ def sensor_document(found: SensorEstimate, recording: SensorRecording) -> dict[s
     return {
         'parameters': {one.name: entry(one) for one in found.parameters},
         'axes': list(found.axes),
-        'rate': found.rate,
-        'samples': found.samples,
-        'duration': found.duration,
+        **{name: getattr(found, name) for name in ('rate', 'samples', 'duration')},
         'recording': {'name': recording.name, 'losses': list(recording.losses)},
         'warnings': list(found.warnings),
     }

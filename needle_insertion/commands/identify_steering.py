@@ -2,29 +2,21 @@
 """`needle identify steering`: fit the bending of a needle that cuts its path to recordings."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 import re
 from typing import Any
 
-from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
-from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.columns import STEERING_ROLES
 from needle_identification.steering.estimate import HeldOut, SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_insertion.commands.common import (
-    add_recordings,
-    check_file,
-    print_each,
-    print_result,
-    with_unit,
-)
+from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import interval_of, plain, title_of
 from needle_insertion.report.text import table
@@ -32,9 +24,6 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
 
 _ONE = 'all'  #: name of a medium without a name
-
-#: End of the help on recordings.
-SKIPPED = '; an unusable recording is reported and skipped, and the exit status is 2'
 
 #: Columns of the table of media.
 _FITS = (
@@ -53,8 +42,8 @@ def add_steering(what: Any) -> None:
         "'depth=-robot[m],guide_x=base.x[mm]@1,guide_z=base.z[mm]@1,tip_x=tip.x[mm],"
         "tip_z=tip.z[mm]'",
     )
-    add_recordings(parser, SKIPPED)
-    add_output(parser, ', for a steered plant; for a single medium only')
+    common.add_recordings(parser, common.SKIPPED)
+    common.add_output(parser, ', for a steered plant; for a single medium only')
     reading = parser.add_argument_group('input')
     reading.add_argument(
         '--columns',
@@ -74,7 +63,7 @@ def add_steering(what: Any) -> None:
         metavar='TOPIC',
         help='topic of the joints, a JointState (default: the only such topic, or joint_states)',
     )
-    add_time(reading)
+    common.add_time(reading)
     reading.add_argument(
         '--medium',
         type=_pattern,
@@ -95,34 +84,9 @@ def add_steering(what: Any) -> None:
         '(default: the most likely order)',
     )
     fitting.add_argument(
-        '--free-length', help='known free length (default: fitted)', **with_unit('m')
+        '--free-length', help='known free length (default: fitted)', **common.with_unit('m')
     )
     parser.set_defaults(identify=_run)
-
-
-def add_time(reading: argparse._ArgumentGroup) -> None:
-    reading.add_argument(
-        '--time',
-        choices=TIMES,
-        default='header',
-        help='time of a sample: stamp of its message or time of receipt (default header)',
-    )
-
-
-def add_output(parser: argparse._ActionsContainer, use: str = '') -> None:
-    """Add the options of the results, of which the parameter file has a use."""
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        metavar='FILE',
-        help=f'ROS parameter file with the result{use}',
-    )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
-
-
-def words_of(text: str) -> list[str]:
-    return [word.strip() for word in text.split(',')]
 
 
 def _pattern(text: str) -> re.Pattern[str]:
@@ -143,53 +107,38 @@ def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
     return str(match[1])
 
 
-def _read(
-    path: Path, columns: Mapping[str, str], options: argparse.Namespace
-) -> SteeringRecording | None:
-    try:
-        return read_steering_recording(
-            path,
-            medium=_medium_of(path, options.medium),
-            tip_topic=options.tip_topic,
-            motion_topic=options.motion_topic,
-            time=options.time,
-            columns=columns,
-        )
-    except (NeedleError, OSError) as error:
-        print_each('error', [error])
-        return None
-
-
 def _run(options: argparse.Namespace) -> int:
     # A large import, which the other subcommands do not need.
     from needle_identification import identify_steering, SteeringSettings
     from needle_identification.result import steering_yaml
 
-    check_file(options.output)
-    terms = options.terms and tuple(words_of(options.terms))
+    common.check_file(options.output)
+    terms = options.terms and tuple(common.words_of(options.terms))
     settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
-    columns = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
+    reading = {name: getattr(options, name) for name in ('tip_topic', 'motion_topic', 'time')}
+    reading['columns'] = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
+    recordings = list[SteeringRecording]()
     with ProgressLine('reading', brief=True):
-        read = [_read(path, columns, options) for path in options.recordings]
-    recordings = [one for one in read if one is not None]
+        for path in options.recordings:
+            try:
+                medium = _medium_of(path, options.medium)
+                recordings.append(read_steering_recording(path, medium=medium, **reading))
+            except (NeedleError, OSError) as error:  # noqa: PERF203
+                common.print_each('error', [error])
     if not recordings:
         return 2
-    print_each('warning', _alike(recordings))
+    common.print_each('warning', _alike(recordings))
     with ProgressLine('identification', brief=True) as show:
         fits = count(1)
         found = identify_steering(recordings, settings, lambda: show(f'fit {next(fits)}'))
-    print_each('warning', found.warnings)
-    written, errors = list[Path](), list[str]()
-    if options.output is not None:
-        try:
-            write_whole(options.output, steering_yaml(found).encode())
-            written.append(options.output)
-        except IdentificationError as error:
-            errors.append(f'{options.output} is not written: {error}')
+    common.print_each('warning', found.warnings)
+    written, errors = common.try_write(
+        options.output, lambda path: write_whole(path, steering_yaml(found).encode())
+    )
     document = steering_document(found, recordings)
-    print_result(document, steering_text(found), written, as_json=options.json)
-    print_each('error', errors)
-    return 2 if errors or len(recordings) < len(read) else 0
+    common.print_result(document, steering_text(found), written, as_json=options.json)
+    common.print_each('error', errors)
+    return 2 if errors or len(recordings) < len(options.recordings) else 0
 
 
 def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:

@@ -11,16 +11,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Final, TYPE_CHECKING
 
-from needle_dynamics import (
-    DEFAULT_NEEDLE,
-    find_needle,
-    FloatArray,
-    Insertion,
-    NeedleModel,
-    NeedleParameters,
-    simulate,
-    SteeringParameters,
-)
+import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE
@@ -30,7 +21,7 @@ from needle_insertion.progress import ProgressLine, Show
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
-from needle_ros.settings import unknown_name
+from needle_study.scenario import check_names
 import numpy as np
 
 if TYPE_CHECKING:
@@ -65,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='modes: model of the paper; steering: the needle bends about the path that it cuts '
         '(default: modes for a needle of the paper, steering for all others)',
     )
-    common.add_needle(parser, None, f'{DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
+    common.add_needle(parser, None, f'{dynamics.DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
     common.add_constants(parser, '--set', 'any other constant of the model')
     for name, unit, words in (
         ('depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)'),
@@ -114,7 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--seed', type=int, help='seed of the noise of the path (default 0)')
 
 
-def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
+def _time_to_hub(parameters: dynamics.NeedleParameters, depth: float, force: float) -> float:
     """Return the time of insertion up to the hub under a constant force, to two digits [s]."""
     drive, distance = force - parameters.coulomb_friction, parameters.length - depth
     if drive <= 0.0 or distance <= 0.0:
@@ -133,8 +124,10 @@ def run(options: argparse.Namespace) -> int:
         if not path.suffix and path.exists():
             raise ParameterError(f'{path}: a bag must not exist')
         common.check_file(path)
-    needle = options.needle or (PAPER_NEEDLE if options.model == _MODES else DEFAULT_NEEDLE)
-    chosen = options.model or ('steering' if find_needle(needle).bends else _MODES)
+    needle = options.needle or (
+        PAPER_NEEDLE if options.model == _MODES else dynamics.DEFAULT_NEEDLE
+    )
+    chosen = options.model or ('steering' if dynamics.find_needle(needle).bends else _MODES)
     for model, names in _ONLY.items():
         given = [name for name in names if getattr(options, name) is not None]
         if given and model != chosen:
@@ -148,20 +141,20 @@ def run(options: argparse.Namespace) -> int:
 def _run_modes(needle: str, options: argparse.Namespace) -> int:
     depth = _DEPTH if options.depth is None else options.depth
     force = _FORCE if options.force is None else options.force
-    parameters = NeedleParameters.preset(needle, **common.constants(options.set))
+    parameters = dynamics.NeedleParameters.preset(needle, **common.constants(options.set))
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
     duration = options.duration
     if duration is None:
         duration = _time_to_hub(parameters, depth, force)
-    start = NeedleModel(parameters).state_at(depth, deflection, modal)
+    start = dynamics.NeedleModel(parameters).state_at(depth, deflection, modal)
     # Loads the machine code, which takes longer than most runs.
-    simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
+    dynamics.simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
     accuracy = {'interval': options.interval, 'tolerance': options.tolerance}
     with ProgressLine('simulation', brief=True):
         begin = perf_counter()
-        trajectory = simulate(parameters, start, force, duration=duration, **accuracy)
+        trajectory = dynamics.simulate(parameters, start, force, duration=duration, **accuracy)
         taken = perf_counter() - begin
     for path in options.output:
         report.write(path, trajectory)
@@ -183,17 +176,7 @@ def _pace(ratio: float) -> str:
     return f'{float(f"{times:.2g}"):g} times {word} than'
 
 
-def _changed(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
-    given = common.constants(words)
-    valid = [*NEEDLE_CONSTANTS, *DIAMETERS, *(item.name for item in fields(SteeringParameters))]
-    for key in given:
-        if key not in valid:
-            raise ParameterError(unknown_name(key, valid))
-    needle, steering, _ = find_needle(name).changed(given)
-    return needle, steering
-
-
-def _read_motion(path: Path) -> dict[str, FloatArray]:
+def _read_motion(path: Path) -> dict[str, dynamics.FloatArray]:
     """Read guide, tilt and roll by depth from a table: ``depth`` and any of `_COLUMNS`."""
     # Imported here, as the report below: the modal model does not need these 0.5 s.
     from needle_identification import RecordingError
@@ -221,7 +204,10 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
     for path in options.output:
         if path.suffix not in ('.csv', '.png'):
             raise ParameterError(f'{path}: output of --model steering must be .csv or .png')
-    needle, steering = _changed(needle_name, options.set)
+    changes = common.constants(options.set)
+    own = (item.name for item in fields(dynamics.SteeringParameters))
+    check_names('', changes, (*NEEDLE_CONSTANTS, *DIAMETERS, *own))
+    needle, steering, _ = dynamics.find_needle(needle_name).changed(changes)
     to = _TO if options.to is None else options.to
     speed = _SPEED if options.speed is None else options.speed
     if not 0.0 < speed < inf:
@@ -239,7 +225,7 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
             f'--interval, got {to!r} m and {interval!r} s'
         )
     motion = _read_motion(options.motion) if options.motion is not None else {}
-    insertion = Insertion(needle, steering, depth=start, seed=options.seed or 0)
+    insertion = dynamics.Insertion(needle, steering, depth=start, seed=options.seed or 0)
     recorder = report.InsertionRecord(insertion)
     with ProgressLine('simulation', brief=True) as show:
         _insert(recorder, motion, show, to, speed, interval)
@@ -257,7 +243,7 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
 
 def _insert(
     recorder: InsertionRecord,
-    motion: Mapping[str, FloatArray],
+    motion: Mapping[str, dynamics.FloatArray],
     show: Show,
     to: float,
     speed: float,

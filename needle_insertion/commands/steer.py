@@ -8,26 +8,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
+from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
 from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
-from needle_controller.steering.simulation import (
-    GroundTruth,
-    sample_truth,
-    simulate_steering,
-    SteeringPlant,
-    step_depths,
-    SteppedTipErrors,
-    SteppedTipSensor,
-)
-from needle_dynamics import (
-    DEFAULT_NEEDLE,
-    find_needle,
-    FloatArray,
-    NeedleParameters,
-    SteeringParameters,
-)
-from needle_dynamics.needles import DIAMETERS
+import needle_dynamics as dynamics
+from needle_dynamics.needles import DIAMETERS, NeedlePreset
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
 from needle_dynamics.steering.parameters import bending_length
 from needle_insertion.commands import common
@@ -39,7 +25,8 @@ from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
 from needle_ros.quantities import target as read_target
 from needle_ros.quantities import TARGET_HELP
-from needle_ros.settings import from_values, unknown_name
+from needle_ros.settings import from_values
+from needle_study.scenario import check_names
 import numpy as np
 
 TARGET = '4mm,100mm,-2mm'  #: default target
@@ -63,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='X,Y,Z',
         help=f'target of the tip: {TARGET_HELP} (default {TARGET})',
     )
-    common.add_needle(parser, DEFAULT_NEEDLE)
+    common.add_needle(parser, dynamics.DEFAULT_NEEDLE)
     parser.add_argument(
         '--law',
         default=DEFAULT_LAW,
@@ -74,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     words, prior = ', '.join(CONSTANTS), ', '.join(asdict(SteeringPrior()))
     common.add_constants(parser, '--set', f'constant of the nominal model, one of {words}')
     common.add_constants(parser, '--prior', f'prior uncertainty of the model, one of {prior}')
-    errors = ', '.join(asdict(SteppedTipErrors()))
+    errors = ', '.join(asdict(simulation.SteppedTipErrors()))
     common.add_constants(
         parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}'
     )
@@ -104,18 +91,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-def _line(line: NeedleShape | NeedlePath, frame: FloatArray) -> FloatArray:
+def _line(line: NeedleShape | NeedlePath, frame: dynamics.FloatArray) -> dynamics.FloatArray:
     """Return a needle or its path in the frame of the sensor, as points x, y, z, (k, 3) [m]."""
     shape = line.deflections + np.outer(line.depths, frame)
     return np.insert(shape, 1, line.depths, axis=1)
 
 
-def _task(
-    options: argparse.Namespace,
-) -> tuple[
-    FloatArray, NeedleParameters, SteeringParameters, SteeringPrior, SteppedTipErrors, FloatArray
-]:
-    """Return target, nominal needle, prior, errors of the sensor and depths, from the options."""
+def _target(options: argparse.Namespace, needle: NeedlePreset) -> dynamics.FloatArray:
+    """Return the target, x, y and z [m]; raise `ParameterError` for options that are not valid."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
@@ -123,9 +106,8 @@ def _task(
     find_law(options.law)
     if options.seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {options.seed}')
-    found = find_needle(options.needle)
     target = np.array(read_target(' '.join(options.target)))
-    reach = found.needle.length - found.steering.free_length
+    reach = needle.needle.length - needle.steering.free_length
     if not 0.0 < target[1] <= reach:
         raise ParameterError(
             f'--target: the depth must be in (0, {1e3 * reach:g}] mm with the needle '
@@ -136,22 +118,18 @@ def _task(
             f'--step must be in (0, {target[1]:g}] m, the depth of the target, got '
             f'{options.step!r} m'
         )
-    for name in common.constants(options.set):
-        if name not in (*CONSTANTS, *DIAMETERS):
-            raise ParameterError(unknown_name(name, [*CONSTANTS, *DIAMETERS]))
-    given = {**asdict(SteeringPrior()), **common.constants(options.prior)}
-    needle, steering, _ = found.changed(common.constants(options.set))
-    prior = from_values(SteeringPrior, given)
-    errors = from_values(SteppedTipErrors, common.constants(options.sensor))
-    return target, needle, steering, prior, errors, step_depths(target[1], options.step)
+    return target
 
 
 def sample_needle(
-    needle: NeedleParameters, steering: SteeringParameters, prior: SteeringPrior, seed: int
-) -> GroundTruth:
+    needle: dynamics.NeedleParameters,
+    steering: dynamics.SteeringParameters,
+    prior: SteeringPrior,
+    seed: int,
+) -> simulation.GroundTruth:
     """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
     nearer = {name: _DRAWN * getattr(prior, name) for name in ('tilt', 'frame', 'bevel')}
-    found = sample_truth(
+    found = simulation.sample_truth(
         needle, steering, replace(prior, **nearer), np.random.default_rng(seed), seed
     )
     bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
@@ -160,8 +138,14 @@ def sample_needle(
 
 
 def run(options: argparse.Namespace) -> int:
-    target, needle, steering, prior, errors, depths = _task(options)
-    aim = target[[0, 2]]
+    nominal = dynamics.find_needle(options.needle)
+    target = _target(options, nominal)
+    aim, depths = target[[0, 2]], simulation.step_depths(target[1], options.step)
+    changes = common.constants(options.set)
+    check_names('', changes, (*CONSTANTS, *DIAMETERS))
+    needle, steering, _ = nominal.changed(changes)
+    prior = from_values(SteeringPrior, common.constants(options.prior))
+    errors = from_values(simulation.SteppedTipErrors, common.constants(options.sensor))
     limits = replace(
         SIMULATION_LIMITS,
         guide_limit=options.limit,
@@ -178,16 +162,16 @@ def run(options: argparse.Namespace) -> int:
         raise
     truth = sample_needle(needle, steering, prior, options.seed)
     noise, losses = (np.random.default_rng([options.seed, stream]) for stream in (1, 3))
-    shapes = list[FloatArray]()
+    shapes = list[dynamics.FloatArray]()
 
-    def watch(plant: SteeringPlant) -> None:
+    def watch(plant: simulation.SteeringPlant) -> None:
         shapes.append(_line(plant.needle.shape, truth.frame))
         show(f'step {len(shapes)} of {len(depths) - 1}')
 
     ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
-    sensor = SteppedTipSensor(ours, prior.noise, errors, options.seed, noise, losses)
+    sensor = simulation.SteppedTipSensor(ours, prior.noise, errors, options.seed, noise, losses)
     with ProgressLine('steering', brief=True) as show:
-        done = simulate_steering(law, ours, sensor, watch)
+        done = simulation.simulate_steering(law, ours, sensor, watch)
         alone.insert()
     tip, other, expected = ours.tip, alone.tip, law.expected()
     found: dict[str, Any] = {

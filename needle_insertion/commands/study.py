@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle study`: simulate a population of insertions on all cores or on a cluster."""
 
+from __future__ import annotations
+
 import argparse
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -9,13 +11,17 @@ from functools import partial
 import os
 from pathlib import Path
 import sys
-from typing import Any, Final
+from typing import Any, Final, TYPE_CHECKING
 
 from needle_insertion.commands.common import check_folder, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.text import table
 from needle_ros.errors import JobError, missing_extra, ParameterError
 from needle_ros.process_pool import processes
+
+if TYPE_CHECKING:
+    # Needs optional packages.
+    from needle_study.engine import Results
 
 _PATIENCE: Final = 10  #: timeout for the answer of a scheduler, and for its first worker [s]
 
@@ -43,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     try:
         with ProgressLine('study', brief=True):
-            from needle_insertion.replay.study_sample import replay_sample
             from needle_insertion.report.study_page import write_study
             from needle_study import engine
             from needle_study.study import read_study
@@ -63,7 +68,7 @@ def run(options: argparse.Namespace) -> int:
     results = engine.Results(folder, study)
     if options.replay is not None:
         bag = folder / f'sample_{options.replay}'
-        compared = replay_sample(results, options.replay, bag)
+        compared = _replay(results, options.replay, bag)
         same = 'the same numbers as in the table' if compared else 'there is no table yet'
         sys.stdout.write(f'sample {options.replay}: {bag}; {same}\n')
         return 0
@@ -88,6 +93,27 @@ def run(options: argparse.Namespace) -> int:
         found, table(found, ('result', 'value', 'interval')), (results.table, file), as_json=False
     )
     return 0
+
+
+def _replay(results: Results, number: int, bag: Path) -> bool:
+    """Record a sample to a bag; return whether it was compared with a table of the study."""
+    from needle_insertion.report.trajectory import write_bag
+    from needle_study.summary import picked
+    import numpy as np
+
+    study = results.study
+    row = study.rows(number, 1)
+    if compared := results.table.exists():
+        for name, values in row.items():
+            (recorded,) = picked(results.table, name, [number])
+            if not np.array_equal(values, [recorded], equal_nan=True):
+                raise JobError(
+                    f'sample {number} differs from {results.table}: {name} was {recorded!r}, '
+                    f'and is {values[0]!r}'
+                )
+    drawn = {name: float(row[name][0]) for name in study.population}
+    write_bag(bag, study.scenario.replay(drawn, study.design.noise(number)))
+    return compared
 
 
 @contextmanager

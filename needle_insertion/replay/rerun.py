@@ -7,26 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_dynamics import FloatArray, NeedleError
+from needle_dynamics.simulated import run
 from needle_dynamics.simulated.commands import AppliedForces
-from needle_dynamics.simulated.run import (
-    CONFIGURED,
-    Event,
-    MOTION,
-    PARAMETERS,
-    PlantRun,
-    RESET,
-    TARE,
-    TIME,
-    TRAJECTORY,
-)
 from needle_insertion.replay.recorded_run import recorded_runs, RecordedRun
-from needle_ros.contract import (
-    BASE_WRENCH,
-    END_EFFECTOR_POSE,
-    GROUND_TRUTH,
-    JOINT_STATES,
-    TIP_DEFLECTION,
-)
+from needle_ros import contract
 import numpy as np
 
 #: Largest accepted difference relative to the largest value of a topic and unit: far above
@@ -35,13 +19,13 @@ TOLERANCE: Final = 1e-6
 
 #: Descriptions of events, by kind.
 _WORDS: Final = {
-    MOTION: 'joint_commands from sample {number} on',
-    TRAJECTORY: 'joint_trajectory from sample {number} on',
-    PARAMETERS: '{names} changed before sample {number}',
-    TARE: 'the sensor was zeroed (~/tare) before sample {number}',
-    RESET: 'the plant was reset (~/reset) before sample {number}',
-    TIME: 'time was paused, or samples were given up, before sample {number}',
-    CONFIGURED: 'the plant was configured again before sample {number}',
+    run.MOTION: 'joint_commands from sample {number} on',
+    run.TRAJECTORY: 'joint_trajectory from sample {number} on',
+    run.PARAMETERS: '{names} changed before sample {number}',
+    run.TARE: 'the sensor was zeroed (~/tare) before sample {number}',
+    run.RESET: 'the plant was reset (~/reset) before sample {number}',
+    run.TIME: 'time was paused, or samples were given up, before sample {number}',
+    run.CONFIGURED: 'the plant was configured again before sample {number}',
 }
 
 
@@ -131,7 +115,7 @@ class Rerun:
         for name, rows in self.recorded.rows.items():
             topic = self.recorded.topics[name]
             efforts = [k for k, q in enumerate(topic.quantities) if q.name.startswith('effort')]
-            if topic.name == GROUND_TRUTH.name and efforts:
+            if topic.name == contract.GROUND_TRUTH.name and efforts:
                 forces = zip(rows.numbers.tolist(), rows.values[:, efforts].tolist(), strict=True)
                 # Insertion reduces d.
                 return {
@@ -152,7 +136,7 @@ class Rerun:
             topic.name: np.full((end + 1, len(topic.quantities)), np.nan)
             for topic in recorded.topics.values()
         }
-        plant = PlantRun(recorded.values)
+        plant = run.PlantRun(recorded.values)
         for number in range(1, end + 1):
             stamp = recorded.stamp(number)
             try:
@@ -168,16 +152,16 @@ class Rerun:
                 plant.commands.offer(*command, now=stamp)
         return computed
 
-    def _perform(self, plant: PlantRun, event: Event, number: int) -> PlantRun:
-        if event.kind in (CONFIGURED, TIME) and number == 1:
+    def _perform(self, plant: run.PlantRun, event: run.Event, number: int) -> run.PlantRun:
+        if event.kind in (run.CONFIGURED, run.TIME) and number == 1:
             return plant
         names = ', '.join(sorted(event.content))
         # A driver sends motion commands many times a second.
-        if event.kind != MOTION or not self._driven:
+        if event.kind != run.MOTION or not self._driven:
             self.notes.append(_WORDS[event.kind].format(number=number, names=names))
-        self._driven |= event.kind == MOTION
-        if event.kind == CONFIGURED:
-            return PlantRun(event.content, number - 1)
+        self._driven |= event.kind == run.MOTION
+        if event.kind == run.CONFIGURED:
+            return run.PlantRun(event.content, number - 1)
         plant.perform(event)
         return plant
 
@@ -223,11 +207,11 @@ class Rerun:
         units = np.array([quantity.unit for quantity in topic.quantities])
         largest = np.array([sizes[units == unit].max() for unit in units])
         resolution = np.zeros(len(units))
-        if topic.name == BASE_WRENCH.name:
+        if topic.name == contract.BASE_WRENCH.name:
             resolution[:] = constants.sensor.per_axis('resolution')
-        elif topic.name == END_EFFECTOR_POSE.name:
+        elif topic.name == contract.END_EFFECTOR_POSE.name:
             resolution[:3] = constants.indenter.encoder_resolution
-        elif topic.name == JOINT_STATES.name and constants.mode == 'robot':
+        elif topic.name == contract.JOINT_STATES.name and constants.mode == 'robot':
             resolution[0] = constants.base.encoder_resolution
         # Rounded values may differ by a count.
         return np.asarray(tolerance * largest + (1.0 + 1e-6) * resolution)
@@ -248,14 +232,14 @@ class Rerun:
                 self._unknown and not recorded.commands
             ),
             'the bag holds no joint_trajectory: record it with the rest': (
-                not simulated and not kinds & {MOTION, TRAJECTORY}
+                not simulated and not kinds & {run.MOTION, run.TRAJECTORY}
             ),
             f'the bag begins with sample {start}: earlier commands are missing': (
                 simulated and start > 1
             ),
             'which command acted is not in the bag': self._unknown,
             'the motion is as computed: the seed or the constants of a sensor differ': (
-                len(wrong - {BASE_WRENCH.name, TIP_DEFLECTION.name}) == 0
+                len(wrong - {contract.BASE_WRENCH.name, contract.TIP_DEFLECTION.name}) == 0
                 and len(differing) > len(wrong)
             ),
         }

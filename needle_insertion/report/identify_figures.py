@@ -10,15 +10,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_identification import (
-    Fit,
-    FrictionEstimate,
-    LevelEstimate,
-    ParameterEstimate,
-    Statistic,
-    StiffnessEstimate,
-    StiffnessSummary,
-)
+import needle_identification as identification
 from needle_insertion.report.identify_text import label_of
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_2
 import numpy as np
@@ -40,13 +32,13 @@ _SYMBOL: Final = re.compile(r'\b(mu|k|f)_(\w{1,3})\b')
 _GREEK: Final = {'mu': r'\mu'}
 
 
-def _sides(fit: Fit) -> Iterator[tuple[BoolArray, str, str, str]]:
+def _sides(fit: identification.Fit) -> Iterator[tuple[BoolArray, str, str, str]]:
     """Yield used samples, label, color and marker of each direction of motion."""
     yield fit.used & (fit.velocity > 0.0), 'insertion', _IN, 'o'
     yield fit.used & (fit.velocity < 0.0), 'withdrawal', _OUT, '^'
 
 
-def friction_data(estimate: FrictionEstimate) -> Figure:
+def friction_data(estimate: identification.FrictionEstimate) -> Figure:
     """Draw the filtered force over time and against velocity, with the fit."""
     fit = estimate.fit
     figure = Figure(figsize=(_WIDTH, 7.5), layout='constrained')
@@ -78,13 +70,13 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
     return figure
 
 
-def _excluded(axes: Axes, fit: Fit, most: int, size: float) -> None:
+def _excluded(axes: Axes, fit: identification.Fit, most: int, size: float) -> None:
     out = ~fit.used
     speed, force = _thinned(1e3 * fit.velocity[out], fit.force[out], most=most)
     axes.plot(speed, force, 'x', color=_EXCLUDED, markersize=size, alpha=0.5, label=_NAMED)
 
 
-def friction_residuals(estimate: FrictionEstimate) -> Figure:
+def friction_residuals(estimate: identification.FrictionEstimate) -> Figure:
     """Draw the residual over time, against velocity, and as a histogram."""
     fit = estimate.fit
     figure = Figure(figsize=(_WIDTH, 8.0), layout='constrained')
@@ -112,7 +104,9 @@ def friction_residuals(estimate: FrictionEstimate) -> Figure:
     return figure
 
 
-def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -> Figure:
+def friction_each(
+    estimates: Sequence[identification.FrictionEstimate], names: Sequence[str]
+) -> Figure:
     """Draw force against velocity of each recording, with the fit."""
     figure, panels = _small_multiples(
         names, 'insertion velocity [mm/s]', 'force on the needle [N]'
@@ -131,7 +125,9 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
     return figure
 
 
-def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str]) -> Figure:
+def stiffness_each(
+    estimates: Sequence[identification.StiffnessEstimate], names: Sequence[str]
+) -> Figure:
     """Draw the rest positions of the end-effector in each recording, with fitted ellipses."""
     figure, panels = _small_multiples(names, 'displacement x [mm]', 'displacement z [mm]')
     for axes, estimate in zip(panels, estimates, strict=True):
@@ -164,7 +160,7 @@ def _panels(
     return figure, list(panels.flat[:count])
 
 
-def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
+def _ellipses(axes: Axes, estimate: identification.StiffnessEstimate) -> None:
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = np.array([np.cos(turn), np.sin(turn)])
     for level in estimate.levels:
@@ -173,7 +169,7 @@ def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
             axes.plot(*ellipse, color=_DATA, linewidth=0.8, zorder=1)
 
 
-def stiffness_levels(summary: StiffnessSummary) -> Figure:
+def stiffness_levels(summary: identification.StiffnessSummary) -> Figure:
     """Draw each entry of the matrix against the force, with Table 2."""
     figure = Figure(figsize=(_WIDTH, 5.5), layout='constrained')
     for axes, (name, (means, deviations)) in zip(
@@ -206,7 +202,7 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
     return figure
 
 
-def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
+def stiffness_presses(estimate: identification.StiffnessEstimate) -> Figure:
     """Draw force against displacement, and the displacements in the plane, with the fit."""
     presses = estimate.presses
     figure = Figure(figsize=(_WIDTH, 8.5), layout='constrained')
@@ -234,7 +230,7 @@ def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
     return figure
 
 
-def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
+def _principal_axes(axes: Axes, level: identification.LevelEstimate) -> None:
     """Draw the principal axes at the largest force, scaled to its displacement."""
     if not level.angle.determined:
         return
@@ -251,7 +247,8 @@ def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
 
 
 def spread_figure(
-    means: Sequence[Statistic], rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]]
+    means: Sequence[identification.Statistic],
+    rows: Sequence[tuple[str, Mapping[str, identification.ParameterEstimate]]],
 ) -> Figure:
     """Draw each parameter of each recording with its interval, and the mean with its interval."""
     figure, panels = _panels(len(means), 2, 0.0, 1.2 + 0.24 * len(rows), sharex=False)

@@ -7,33 +7,12 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
-from needle_identification import (
-    FrictionEstimate,
-    FrictionSummary,
-    LevelEstimate,
-    ParameterEstimate,
-    Statistic,
-    StiffnessEstimate,
-    StiffnessSummary,
-)
+import needle_identification as identification
 from needle_identification.estimation.formatting import between, measured, rounded, spread
 from needle_identification.result import model_parameters
 from needle_insertion.report import identify_figures as figures
+from needle_insertion.report import identify_text as text
 from needle_insertion.report.content import Picture
-from needle_insertion.report.identify_text import (
-    friction_parameters,
-    friction_statistics,
-    label_of,
-    MEAN_HEADS,
-    mean_row,
-    parameter_cells,
-    prediction_lines,
-    PUNCTURE_HEADS,
-    puncture_rows,
-    short_names,
-    warned,
-    with_deviation,
-)
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.page import write_page
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
@@ -49,13 +28,17 @@ _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
 
 
 def write_identified_page(
-    folder: Path, summary: FrictionSummary | StiffnessSummary, origin: Origin
+    folder: Path,
+    summary: identification.FrictionSummary | identification.StiffnessSummary,
+    origin: Origin,
 ) -> Path:
     """Write ``friction.html`` or ``stiffness.html`` and its pictures; return the page."""
     estimates = summary.estimates
-    label = short_names([estimate.name for estimate in estimates])
-    short, full = warned(summary, origin)
-    if isinstance(summary, FrictionSummary):
+    label = text.short_names([estimate.name for estimate in estimates])
+    short, full = text.warned(summary, origin)
+    number = len(estimates)
+    recordings = _counted(number, 'recording')
+    if isinstance(summary, identification.FrictionSummary):
         name, content = 'friction.html', _friction_content(summary, label)
     else:
         name, content = 'stiffness.html', _stiffness_content(summary, label)
@@ -67,22 +50,26 @@ def write_identified_page(
         origin=origin,
         warnings=(short, full if len(full) > len(short) else []),
         name=label[content['shown'].name],
-        recordings=_counted(len(estimates), 'recording'),
-        drawn=_drawn(len(estimates)),
-        predictions=prediction_lines(summary),
+        recordings=recordings,
+        drawn=f'the first {_MOST_EACH} recordings of {number}'
+        if number > _MOST_EACH
+        else recordings,
+        predictions=text.prediction_lines(summary),
         **content,
     )
     return folder / name
 
 
-def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dict[str, Any]:
+def _friction_content(
+    summary: identification.FrictionSummary, label: Mapping[str, str]
+) -> dict[str, Any]:
     estimates = summary.estimates
-    means = friction_statistics(summary)
+    means = text.friction_statistics(summary)
     main = [one for one in summary.statistics if one.name in TABLE_1]
     shown = estimates[_typical(one[summary.statistics[0].name].value for one in estimates)]
     values = model_parameters(summary.statistics)
     names = [label[one.name] for one in estimates]
-    parameters = list(zip(names, map(friction_parameters, estimates), strict=True))
+    parameters = list(zip(names, map(text.friction_parameters, estimates), strict=True))
     return {
         'figures': {
             'friction_data': figures.friction_data(shown),
@@ -91,17 +78,17 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
             'friction_spread': figures.spread_figure(means, parameters),
         },
         'cards': [_card(one) for one in main or summary.statistics[:2]],
-        'mean_rows': [(*mean_row(one), _published(one)) for one in means],
-        'mean_heads': (*MEAN_HEADS, 'Table 1, mean ± STD'),
+        'mean_rows': [(*text.mean_row(one), _published(one)) for one in means],
+        'mean_heads': (*text.MEAN_HEADS, 'Table 1, mean ± STD'),
         'shown': shown,
         'term_rows': _term_rows(shown, estimates),
         'rows': [
-            (label[one.name], *parameter_cells(one, means), f'{one.samples}', *_quality(one))
+            (label[one.name], *text.parameter_cells(one, means), f'{one.samples}', *_quality(one))
             for one in estimates
         ],
-        'heads': ('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
-        'puncture_rows': puncture_rows(summary),
-        'puncture_heads': PUNCTURE_HEADS,
+        'heads': ('recording', *map(text.label_of, means), 'samples used', *_QUALITY_HEADS),
+        'puncture_rows': text.puncture_rows(summary),
+        'puncture_heads': text.PUNCTURE_HEADS,
         'values': values,
         'live': [
             f'ros2 param set /plant {name} {values[name]:.6g}' for name in _LIVE if name in values
@@ -109,7 +96,7 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
     }
 
 
-def _published(one: Statistic) -> str:
+def _published(one: identification.Statistic) -> str:
     if one.name not in TABLE_1:
         return ''
     mean, deviation = TABLE_1[one.name]
@@ -117,7 +104,7 @@ def _published(one: Statistic) -> str:
 
 
 def _term_rows(
-    shown: FrictionEstimate, estimates: Sequence[FrictionEstimate]
+    shown: identification.FrictionEstimate, estimates: Sequence[identification.FrictionEstimate]
 ) -> list[tuple[str, ...]]:
     """Return the alternative sets of terms with the number of supporting recordings."""
     supported = Counter(
@@ -134,10 +121,16 @@ def _term_rows(
     ]
 
 
-def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> dict[str, Any]:
+def _stiffness_content(
+    summary: identification.StiffnessSummary, label: Mapping[str, str]
+) -> dict[str, Any]:
     estimates, levels, result = summary.estimates, summary.levels, summary.tissue_stiffness
     force = next(level.force for level in levels if level[result.name] is result)
-    found = [_tissue_stiffness(one, force) for one in estimates]
+    # At the level nearest to the force of the result.
+    found = [
+        min(one.levels, key=lambda level: abs(level.force - force)).tissue_stiffness
+        for one in estimates
+    ]
     shown = estimates[_typical(one.value for one in found)]
     springs = [level.is_spring for estimate in estimates for level in estimate.levels]
     names = [label[one.name] for one in estimates]
@@ -161,16 +154,16 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
         'places': _counted(len(estimates), 'place'),
         'heads': ('force', *_ENTRY_HEADS),
         'mean_rows': [
-            (f'{level.force:.2f} N', *(with_deviation(level[name]) for name in TABLE_2))
+            (f'{level.force:.2f} N', *(text.with_deviation(level[name]) for name in TABLE_2))
             for level in levels
         ],
         'published_rows': [
             (f'{level:g} N', *(f'{means[k]:g} ({stds[k]:g})' for means, stds in TABLE_2.values()))
             for k, level in enumerate(FORCE_LEVELS)
         ],
-        'result_heads': ('force', *MEAN_HEADS[1:]),
+        'result_heads': ('force', *text.MEAN_HEADS[1:]),
         'result_rows': [
-            (f'{level.force:.2f} N', *mean_row(level[result.name])[1:]) for level in levels
+            (f'{level.force:.2f} N', *text.mean_row(level[result.name])[1:]) for level in levels
         ],
         'shown': shown,
         'spring_rows': [_spring_row(level) for level in shown.levels],
@@ -191,12 +184,7 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
     }
 
 
-def _tissue_stiffness(estimate: StiffnessEstimate, force: float) -> ParameterEstimate:
-    """Return k_a of a recording at the level nearest to a force."""
-    return min(estimate.levels, key=lambda one: abs(one.force - force)).tissue_stiffness
-
-
-def _spring_row(level: LevelEstimate) -> tuple[str, ...]:
+def _spring_row(level: identification.LevelEstimate) -> tuple[str, ...]:
     return (
         f'{level.force:.2f} N',
         *map(_cell, (level.curl, level.spring, *level.principal)),
@@ -207,15 +195,17 @@ def _spring_row(level: LevelEstimate) -> tuple[str, ...]:
 # Functions of both pages.
 
 
-def _cell(one: ParameterEstimate) -> str:
+def _cell(one: identification.ParameterEstimate) -> str:
     return measured(one.value, one.error)
 
 
-def _quality(one: FrictionEstimate | LevelEstimate) -> tuple[str, ...]:
+def _quality(
+    one: identification.FrictionEstimate | identification.LevelEstimate,
+) -> tuple[str, ...]:
     return f'{1e3 * one.residual:.2f}', f'{one.determination:.4f}', f'{one.condition:.1f}'
 
 
-def _card(one: Statistic) -> tuple[str, str, str]:
+def _card(one: identification.Statistic) -> tuple[str, str, str]:
     """Return a main result: name, value, and interval with scatter."""
     what = f'{one.name.replace("_", " ").capitalize()} {one.symbol}'
     if not isfinite(one.mean):
@@ -224,11 +214,6 @@ def _card(one: Statistic) -> tuple[str, str, str]:
     if one.deviation is not None:
         note += f'; STD {spread(one.deviation)} over {_counted(one.count, "recording")}'
     return what, rounded(one.mean, one.error, one.unit), note
-
-
-def _drawn(number: int) -> str:
-    shown = _counted(min(number, _MOST_EACH), 'recording')
-    return shown if number <= _MOST_EACH else f'the first {shown} of {number}'
 
 
 def _counted(number: int, what: str) -> str:

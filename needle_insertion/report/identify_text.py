@@ -96,12 +96,8 @@ def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> l
 
 
 def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
-    if isinstance(summary, FrictionSummary):
-        return _friction_text(summary)
-    return _stiffness_text(summary)
-
-
-def _friction_text(summary: FrictionSummary) -> str:
+    if not isinstance(summary, FrictionSummary):
+        return _stiffness_text(summary)
     means = friction_statistics(summary)
     rows = [
         (one.name, *parameter_cells(one, means), f'{one.samples}', f'{one.residual:.4f}')
@@ -150,23 +146,17 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
     rows = [
         (label_of(one), *(with_deviation(level[one.name]) for level in levels)) for one in entries
     ]
-    by_force = [
-        (
-            force,
-            *(between(one.interval) for one in level.statistics),
-            f'{level.statistics[0].count}',
-        )
-        for force, level in zip(forces, levels, strict=True)
-    ]
+    spans = [[between(one.interval) for one in level.statistics] for level in levels]
+    counts = [f'{level.statistics[0].count}' for level in levels]
+    by_force = [(force, *ends, n) for force, ends, n in zip(forces, spans, counts, strict=True)]
     matrices = table(rows, ('mean ± SE (STD)', *forces))
     intervals = table(by_force, ('95 % interval', *(one.symbol for one in entries), 'bags'))
     predictions = '\n'.join(prediction_lines(summary))
-    predictions += '\n\n' if predictions else ''
-    return (
-        f'{matrices}\n\n{intervals}\n\n{predictions}'
+    stiffness = (
         f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
         f'95 % interval {between(result.interval)}'
     )
+    return '\n\n'.join(filter(None, [matrices, intervals, predictions, stiffness]))
 
 
 def warned(

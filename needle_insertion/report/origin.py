@@ -10,6 +10,7 @@ from typing import Any, Final
 from needle_insertion.progress import ProgressLine
 from needle_ros.errors import NeedleError
 
+_CLOCKS: Final = 'the clock of the force was {:+.2f} ms off the clock of the motion; corrected'
 _PIECE: Final = 1 << 20  #: block size for reading a file [bytes]
 
 
@@ -54,7 +55,11 @@ class Origin:
         return [
             *((name, f'the same samples as {other}: counts once') for name, other in self.copies),
             *((one.name, words) for one in self.sources for words in one.losses),
-            *((one.name, _clocks(one.clock_offset)) for one in self.sources if one.clock_offset),
+            *(
+                (one.name, _CLOCKS.format(1e3 * one.clock_offset))
+                for one in self.sources
+                if one.clock_offset
+            ),
         ]
 
     @property
@@ -79,12 +84,6 @@ class Origin:
         return [
             (path, f'{one.samples}', digest) for one in self.sources for path, digest in one.files
         ]
-
-
-def _clocks(offset: float) -> str:
-    return (
-        f'the clock of the force was {1e3 * offset:+.2f} ms off the clock of the motion; corrected'
-    )
 
 
 def _worded(value: Any, unit: str) -> str:

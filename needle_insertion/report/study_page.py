@@ -10,22 +10,12 @@ from matplotlib.figure import Figure as Drawing
 from needle_dynamics import FloatArray
 from needle_insertion.report.content import Picture
 from needle_insertion.report.page import write_page
+from needle_study import summary
 from needle_study.engine import Results
 from needle_study.scenario import Metric
 from needle_study.study import Study
-from needle_study.summary import (
-    batches,
-    column,
-    Estimate,
-    Indices,
-    indices,
-    NOISE,
-    picked,
-    probability,
-    quantile,
-    worst,
-)
 import numpy as np
+from scipy.stats import binned_statistic_2d
 import yaml
 
 _PARTS: Final = (0.5, 0.95, 0.99)  #: quantiles of each metric
@@ -56,28 +46,29 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     study, table = results.study, results.table
     metrics, drawn = study.scenario.metrics, list(study.population)
     main = next(iter(metrics))
-    values = column(table, main, _MOST)
-    probabilities, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
+    values = summary.column(table, main, _MOST)
+    probabilities, quantiles = dict[str, summary.Estimate](), list[tuple[str, ...]]()
     for name, one in metrics.items():
         if not one.unit:
-            probabilities[name] = probability(batches(table, name), study.design)
+            probabilities[name] = summary.probability(summary.batches(table, name), study.design)
             continue
-        found = values if name == main else column(table, name, _MOST)
-        parts = [quantile(found, part, study.design) for part in _PARTS]
+        found = values if name == main else summary.column(table, name, _MOST)
+        parts = [summary.quantile(found, part, study.design) for part in _PARTS]
         if known := parts[0].samples:
             words = (f'{value} ({ends})' for value, ends in (_rounded(p, one.unit) for p in parts))
             quantiles.append((_head(name, one.unit), *words, str(known), one.meaning))
-    columns = {name: column(table, name, _MOST) for name in drawn}
-    shares = indices(values, columns, study)
-    order = sorted(shares or drawn, key=lambda name: -_part(shares.get(name)))
+    columns = {name: summary.column(table, name, _MOST) for name in drawn}
+    shares = summary.indices(values, columns, study)
+    # By the part of the variance that varies with a variable, in any way.
+    order = sorted(shares, key=lambda name: -_influence(shares[name]).value) or drawn
     named = [name for name in order if name in columns]
     meanings = {name: study.scenario.variables[name].meaning for name in drawn}
-    meanings[NOISE] = 'noise of path, sensors and losses'
+    meanings[summary.NOISE] = 'noise of path, sensors and losses'
     meanings = {name: meanings.get(name, 'row of this table') for name in order}
     # The two most influential variables are drawn.
     most = {name: columns[name] for name in named[:2]}
-    bad, listed = worst(batches(table, main), _WORST), [main, *named[:4]]
-    of_bad = {name: picked(table, name, bad) for name in listed}
+    bad, listed = summary.worst(summary.batches(table, main), _WORST), [main, *named[:4]]
+    of_bad = {name: summary.picked(table, name, bad) for name in listed}
     units = {name: study.scenario.variables[name].unit for name in drawn}
     units[main] = metrics[main].unit
     hit = probabilities.get('hit')
@@ -85,7 +76,7 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     if hit is not None:
         value, ends = _rounded(hit, '%')
         cards.append(('Hit', value, f'95 %: {ends}'))
-    value, ends = _rounded(quantile(values, 0.5, study.design), units[main])
+    value, ends = _rounded(summary.quantile(values, 0.5, study.design), units[main])
     unit, _ = _shown(units[main])
     cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
     pictures = [_distribution(main, metrics[main], values)]
@@ -105,11 +96,14 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
         ],
         quantile_heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
         quantiles=quantiles,
-        totals=NOISE in shares,
+        totals=summary.NOISE in shares,
         shares=[(name, *_shares(shares[name]), meanings[name]) for name in order if shares],
         worst_heads=('sample', *(_head(name, units[name]) for name in listed)),
         worst=[
-            (str(number), *(_number(of_bad[name][place], units[name]) for name in listed))
+            (
+                str(number),
+                *(f'{_shown(units[name])[1] * of_bad[name][place]:.4g}' for name in listed),
+            )
             for place, number in enumerate(bad)
         ],
         variables=[
@@ -119,7 +113,7 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
     for name in order if shares else ():
-        value, ends = _rounded(shares[name].total or shares[name].first, '%')
+        value, ends = _rounded(_influence(shares[name]), '%')
         cards.append((f'Variance by {name}', value, f'95 %: {ends}'))
     return cards
 
@@ -134,11 +128,7 @@ def _head(name: str, unit: str) -> str:
     return f'{name} [{shown}]' if shown else name
 
 
-def _number(value: float, unit: str) -> str:
-    return f'{_shown(unit)[1] * value:.4g}'
-
-
-def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
+def _rounded(one: summary.Estimate, unit: str) -> tuple[str, str]:
     """Format a value and its interval, with digits according to the width of the interval."""
     value, low, high = (_shown(unit)[1] * number for number in one[:3])
     wide = sum(end for end in (value - low, high - value) if isfinite(end))
@@ -149,12 +139,11 @@ def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
     return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else 'too few samples'
 
 
-def _part(one: Indices | None) -> float:
-    """Return the part of the variance that varies with a variable, in any way."""
-    return 0.0 if one is None else (one.total or one.first).value
+def _influence(one: summary.Indices) -> summary.Estimate:
+    return one.total or one.first
 
 
-def _shares(one: Indices) -> list[str]:
+def _shares(one: summary.Indices) -> list[str]:
     """Format the indices of a variable with their intervals."""
     both = [_rounded(found, '%') for found in (one.first, one.total) if found is not None]
     return [f'{value} ({ends})' for value, ends in both]
@@ -187,27 +176,21 @@ def _map(
         return []
     inside = np.isfinite(values)
     count = max(1, min(_CELLS, floor(sqrt(inside.sum() / _MEAN))))
-    heads, edges, cells = list[str](), list[FloatArray](), np.zeros(len(values), dtype=np.int16)
-    for one, of in over.items():
-        low, high = np.quantile(of, [0.005, 0.995])
-        if low == high or not inside.any():
-            return []
-        at = np.linspace(low, high, count + 1)
-        # The last edge belongs to the last cell.
-        place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
-        inside &= (of >= low) & (of <= high)
-        cells = count * cells + place
-        unit = study.scenario.variables[one].unit
-        heads.append(_head(one, unit))
-        edges.append(_shown(unit)[1] * at)
-    cells[~inside] = last = count * count
-    ends = np.cumsum(np.bincount(cells, minlength=last))[:last]
-    groups = np.split(values[np.argsort(cells, kind='stable')], ends)[:last]
-    shown = np.array([np.median(one) if len(one) >= _FEWEST else nan for one in groups])
-    shown *= _shown(figure.unit)[1]
+    ends = [np.quantile(of, [0.005, 0.995]).tolist() for of in over.values()]
+    if any(low == high for low, high in ends) or not inside.any():
+        return []
+    points, of_points = np.array(list(over.values()))[:, inside], values[inside]
+    (medians, *edges, _), (numbers, *_) = (
+        binned_statistic_2d(*points, of_points, statistic, count, ends)
+        for statistic in ('median', 'count')
+    )
+    shown = _shown(figure.unit)[1] * np.where(numbers >= _FEWEST, medians, nan)
+    units = [study.scenario.variables[one].unit for one in over]
+    heads = [_head(one, unit) for one, unit in zip(over, units, strict=True)]
     drawing = Drawing(figsize=(8.0, 4.5), layout='constrained')
     axes = drawing.subplots()
-    mesh = axes.pcolormesh(*edges, shown.reshape(count, count).T, cmap='viridis')
+    x, y = (_shown(unit)[1] * at for unit, at in zip(units, edges, strict=True))
+    mesh = axes.pcolormesh(x, y, shown.T, cmap='viridis')
     drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
     axes.set(xlabel=heads[0], ylabel=heads[1])
     words = f'Median {name} over the two most influential variables. White: too few samples.'

@@ -3,21 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics import linearize, NeedleModel, Trajectory
 from needle_insertion.report.content import csv_table, png
-from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION, Topic
 from needle_ros.files import write_whole
 from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Template
 import numpy as np
 
 if TYPE_CHECKING:
     # Takes half a second to import; only the picture needs it.
     from matplotlib.figure import Figure
-    from needle_identification import BagWriter
 
 _LINEAR: Final = 0.1  #: largest deflection of a linear beam, as a fraction of the insertion depth
 
@@ -83,11 +83,22 @@ def write(path: Path, trajectory: Trajectory) -> None:
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
-        # Takes a tenth of a second to import.
-        from needle_identification import BagWriter
+        write_bag(path, _messages(trajectory))
 
-        with BagWriter(path) as bag:
-            _write_bag(bag, trajectory)
+
+def write_bag(path: Path, messages: Iterable[tuple[Topic, int, Sequence[float]]]) -> None:
+    """Write messages to a new bag: topic, stamp [ns], and numbers of `Topic.quantities`."""
+    # Takes a tenth of a second to import.
+    from needle_identification import BagWriter
+
+    templates: dict[str, Template] = {}
+    with BagWriter(path) as bag:
+        for topic, stamp, values in messages:
+            name = f'/{topic.name}'
+            if name not in templates:
+                templates[name] = topic.template()
+                bag.add_topic(name, topic.type_name)
+            bag.write(name, templates[name].serialize(stamp, *values), stamp)
 
 
 def _figure(trajectory: Trajectory) -> Figure:
@@ -101,23 +112,17 @@ def _figure(trajectory: Trajectory) -> Figure:
     return result
 
 
-def _write_bag(bag: BagWriter, trajectory: Trajectory) -> None:
+def _messages(trajectory: Trajectory) -> Iterator[tuple[Topic, int, list[float]]]:
     states, depths, tips = trajectory.states, trajectory.depth, trajectory.tip_deflection
     m = states.shape[1] // 2
     forces = np.append(trajectory.forces, trajectory.forces[-1])
-    truth = ground_truth(m - 2, commanded=False)
     rows = {
         JOINT_STATES: np.column_stack(
             [depths, states[:, 1], -states[:, m], states[:, m + 1], forces, 0.0 * forces]
         ),
-        truth: states,
+        ground_truth(m - 2, commanded=False): states,
         TIP_DEFLECTION: np.column_stack([0.0 * depths, depths, tips]),
     }
-    for topic in rows:
-        bag.add_topic(f'/{topic.name}', topic.type_name)
-    templates = {topic: topic.template() for topic in rows}
     for k, time in enumerate(trajectory.time):
-        stamp = round(time * NANOSECONDS)
         for topic, values in rows.items():
-            data = templates[topic].serialize(stamp, *values[k].tolist())
-            bag.write(f'/{topic.name}', data, stamp)
+            yield topic, round(time * NANOSECONDS), values[k].tolist()

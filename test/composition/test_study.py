@@ -445,7 +445,7 @@ def test_pages_limit_the_number_of_samples(
         return column(table, name, most)
 
     monkeypatch.setattr(page, '_MOST', 8)
-    monkeypatch.setattr(page, 'column', limited)
+    monkeypatch.setattr('needle_study.summary.column', limited)
     page.write_study(results, tmp_path / 'study.html')
     assert asked == {8}
     text = (tmp_path / 'study.html').read_text(encoding='utf-8')
