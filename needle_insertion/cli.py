@@ -69,6 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         sys.stderr.write(f'error: {missing_ros(error, shlex.join(["needle", *words[:1]]))}\n')
         return 1
+    except (NeedleError, OSError) as error:
+        sys.stderr.write(f'error: {error}\n')
+        return 1 if isinstance(error, JobError) else 2
+    except KeyboardInterrupt:
+        sys.stderr.write('interrupted\n')
+        return 130
     finally:
         for name, handler in previous.items():
             signal.signal(name, handler)
@@ -89,13 +95,9 @@ def _run(words: list[str]) -> int:
     if chosen in COMMANDS:
         command = _load(chosen)
         at = words.index(chosen) + 1
-        try:
-            # A completion must not read recordings.
-            if '_ARGCOMPLETE' not in os.environ:
-                words = [*words[:at], *getattr(command, 'completed', list)(words[at:])]
-        except NeedleError as error:
-            sys.stderr.write(f'error: {error}\n')
-            return 2
+        # A completion must not read recordings.
+        if '_ARGCOMPLETE' not in os.environ:
+            words = [*words[:at], *getattr(command, 'completed', list)(words[at:])]
         words = _joined(words, getattr(command, 'SIGNED', ()))
     parser = _parser(chosen, command)
     if '_ARGCOMPLETE' in os.environ:
@@ -103,20 +105,10 @@ def _run(words: list[str]) -> int:
 
         argcomplete.autocomplete(parser)
     options = parser.parse_args([_as_value(word) for word in words])
-    try:
-        # From here on a signal must end the nodes that the command has started.
-        for name in ENDINGS:
-            signal.signal(name, _interrupt)
-        status: int = command.run(options)  # type: ignore[union-attr]
-    except JobError as error:
-        sys.stderr.write(f'error: {error}\n')
-        return 1
-    except (NeedleError, OSError) as error:
-        sys.stderr.write(f'error: {error}\n')
-        return 2
-    except KeyboardInterrupt:
-        sys.stderr.write('interrupted\n')
-        return 130
+    # From here on a signal must end the nodes that the command has started.
+    for name in ENDINGS:
+        signal.signal(name, _interrupt)
+    status: int = command.run(options)  # type: ignore[union-attr]
     return status
 
 

@@ -289,13 +289,12 @@ def dask(client: Any) -> Iterator[Executor]:
     pool = client.get_executor(pure=False)
     try:
         yield pool
-    except (CancelledError, ImportError) as error:
+    except Exception as error:
+        of_dask = type(error).__module__.startswith('distributed')
+        if not of_dask and not isinstance(error, (CancelledError, ImportError)):
+            raise
         reason = str(error) or 'the scheduler is not available'
         raise JobError(f'the cluster has lost a chunk of the study: {reason}') from error
-    except Exception as error:
-        if not type(error).__module__.startswith('distributed'):
-            raise
-        raise JobError(f'the cluster has lost a chunk of the study: {error}') from error
     finally:
         if client.status == 'running':
             pool.shutdown(wait=False)

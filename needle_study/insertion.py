@@ -18,7 +18,8 @@ from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice, constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.scenario import check_names, mapping, MeasuredRun, Metric, Scenario, Variable
+from needle_study import scenario
+from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
 import numpy as np
 from scipy.optimize import brentq
 
@@ -115,7 +116,9 @@ class InsertionScenario(Scenario):
     metrics, at_once = METRICS, _AT_ONCE
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
+        scenario.check_names(
+            'settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__]
+        )
         numbers = {name: value for name, value in settings.items() if name not in _PARTS}
         self._numbers = from_values(InsertionStudy, numbers, 'settings.')
         words: dict[str, str] = {}
@@ -123,7 +126,7 @@ class InsertionScenario(Scenario):
             words[name] = settings.get(name, valid[0])
             check_choice(f'settings: {name}', words[name], valid)
         constants, gains, uncertainty = (
-            mapping(f'settings: {name}', settings.get(name))
+            scenario.mapping(f'settings: {name}', settings.get(name))
             for name in ('constants', 'gains', 'uncertainty')
         )
         self._needle = from_values(
@@ -209,14 +212,10 @@ class InsertionScenario(Scenario):
         )
         return law
 
-    def insert(
-        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[dict[str, float]]:
+    def insert(self, rows: Sequence[Row], streams: Streams) -> Iterator[dict[str, float]]:
         return map(self._metrics_of, rows, self._simulate(rows, streams))
 
-    def replay(
-        self, sample: Mapping[str, float], rng: np.random.Generator
-    ) -> Iterator[MeasuredRun]:
+    def replay(self, sample: Row, rng: np.random.Generator) -> Iterator[MeasuredRun]:
         """Yield joints, tip and commands at each sample up to a stop, and the target."""
         row = self.row(sample)
         (run,) = self._simulate([row], [rng])
@@ -235,7 +234,7 @@ class InsertionScenario(Scenario):
                 force = (0.0, float(run.commands[k]), 0.0)
                 yield MeasuredRun(contract.WRENCH_COMMAND, stamp, (*force, 0.0, 0.0, 0.0))
 
-    def _truth(self, row: Mapping[str, float]) -> NeedleParameters:
+    def _truth(self, row: Row) -> NeedleParameters:
         p, stiffness = self._needle, row['tissue_stiffness']
         factors = ('coulomb_friction', 'viscous_friction', 'tissue_damping', 'tissue_stiffness')
         return replace(
@@ -245,20 +244,18 @@ class InsertionScenario(Scenario):
             carriage_mass=row['carriage_mass'],
         )
 
-    def _simulate(
-        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[_Insertion]:
+    def _simulate(self, rows: Sequence[Row], streams: Streams) -> Iterator[_Insertion]:
         law = self._law
         if law is None:
             return self._open(rows, streams)
         return (self._closed(law, row, rng) for row, rng in zip(rows, streams, strict=True))
 
-    def _noise(self, row: Mapping[str, float], rng: np.random.Generator, count: int) -> FloatArray:
+    def _noise(self, row: Row, rng: np.random.Generator, count: int) -> FloatArray:
         """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
         sizes = [row[name] for name in ('depth_noise', 'speed_noise', 'force_noise')]
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
-    def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Insertion:
+    def _closed(self, law: Law, row: Row, rng: np.random.Generator) -> _Insertion:
         numbers, model = self._numbers, NeedleModel(self._truth(row))
         # The reference starts at the measured depth.
         begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
@@ -307,14 +304,13 @@ class InsertionScenario(Scenario):
                 return k
         return None
 
-    def _open(
-        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[_Insertion]:
+    def _open(self, rows: Sequence[Row], streams: Streams) -> Iterator[_Insertion]:
         """Simulate insertions under a constant force, for the duration of the nominal needle."""
         numbers, nominal = self._numbers, control.Axis.insertion(self._needle)
-        models = [NeedleModel(self._truth(row)) for row in rows]
-        commands, noise = [], []
+        models, starts, commands, noise = [], [], [], []
         for row, rng in zip(rows, streams, strict=True):
+            models.append(NeedleModel(self._truth(row)))
+            starts.append(models[-1].state_at(row['depth'], row['tip']))
             distance = row['target'] - row['depth']
             force = copysign(numbers.push, distance)
             pushed = round(_time(nominal, force, distance) * numbers.rate)
@@ -326,10 +322,7 @@ class InsertionScenario(Scenario):
             line[: len(pushes)] = pushes + blur[:, 2]
         batch = simulate_batch(
             [model.parameters for model in models],
-            [
-                model.state_at(row['depth'], row['tip'])
-                for model, row in zip(models, rows, strict=True)
-            ],
+            starts,
             forces,
             duration=forces.shape[1] * self._period,
             interval=self._period,
@@ -344,7 +337,7 @@ class InsertionScenario(Scenario):
                 np.full(count + 1, nan), nan, float(done < count),
             ).until(done)  # fmt: skip
 
-    def _metrics_of(self, row: Mapping[str, float], run: _Insertion) -> dict[str, float]:
+    def _metrics_of(self, row: Row, run: _Insertion) -> dict[str, float]:
         depth, speed, target = run.depth, run.speed, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)

@@ -4,13 +4,16 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, nan
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from needle_dynamics import FloatArray
 from needle_ros.contract import Topic
 from needle_ros.errors import ParameterError
 from needle_ros.settings import unknown_name
 import numpy as np
+
+Row: TypeAlias = Mapping[str, float]  #: value of each variable of a sample
+Streams: TypeAlias = Sequence[np.random.Generator]  #: random numbers of each sample
 
 
 class Variable(NamedTuple):
@@ -45,9 +48,7 @@ class Scenario(ABC):
     metrics: Mapping[str, Metric]  #: metrics, the primary metric first
     at_once: int  #: samples that are simulated together
 
-    def run(
-        self, samples: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
-    ) -> dict[str, FloatArray]:
+    def run(self, samples: Mapping[str, FloatArray], streams: Streams) -> dict[str, FloatArray]:
         """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
         rows = [
             self.row({name: float(values[k]) for name, values in samples.items()})
@@ -62,20 +63,16 @@ class Scenario(ABC):
         ]
         return {name: np.array([one.get(name, nan) for one in found]) for name in self.metrics}
 
-    def row(self, sample: Mapping[str, float]) -> dict[str, float]:
+    def row(self, sample: Row) -> dict[str, float]:
         """Return the value of each variable, by default its default."""
         return {name: sample.get(name, one.default) for name, one in self.variables.items()}
 
     @abstractmethod
-    def insert(
-        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterable[Mapping[str, float]]:
+    def insert(self, rows: Sequence[Row], streams: Streams) -> Iterable[Mapping[str, float]]:
         """Simulate samples with a value of each variable; return the known metrics of each."""
 
     @abstractmethod
-    def replay(
-        self, sample: Mapping[str, float], rng: np.random.Generator
-    ) -> Iterator[MeasuredRun]:
+    def replay(self, sample: Row, rng: np.random.Generator) -> Iterator[MeasuredRun]:
         """Simulate one sample again; yield measurements and commands in time order per topic."""
 
 

@@ -18,7 +18,8 @@ from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_ros.timing import NANOSECONDS
-from needle_study.scenario import check_names, mapping, MeasuredRun, Metric, Scenario, Variable
+from needle_study import scenario
+from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
 import numpy as np
 
 #: Law of a guide at rest, for which a batch is simulated without a law.
@@ -85,7 +86,9 @@ class SteeringScenario(Scenario):
     metrics, at_once = METRICS, _AT_ONCE
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
+        scenario.check_names(
+            'settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__]
+        )
         given = {name: value for name, value in settings.items() if name not in _PARTS}
         self._numbers = numbers = from_values(
             SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
@@ -93,11 +96,11 @@ class SteeringScenario(Scenario):
         needle, steering, _ = find_needle(settings.get('needle', DEFAULT_NEEDLE))
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
-        given = dict(mapping('settings: constants', settings.get('constants')))
+        given = dict(scenario.mapping('settings: constants', settings.get('constants')))
         of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
         self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
         self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
-        prior = mapping('settings: prior', settings.get('prior'))
+        prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
         reach = self._needle.length - self._steering.free_length
         if numbers.depth > reach:
@@ -148,9 +151,7 @@ class SteeringScenario(Scenario):
     def _model(self) -> SteeringModel:
         return SteeringModel(self._needle, self._steering, self._depths, self._prior)
 
-    def insert(
-        self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
-    ) -> Iterator[dict[str, float]]:
+    def insert(self, rows: Sequence[Row], streams: Streams) -> Iterator[dict[str, float]]:
         truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
         steered = map(self._steered, truths, rows, streams)
         each = self._open(truths) if self._law == _OPEN_LOOP else steered
@@ -159,7 +160,7 @@ class SteeringScenario(Scenario):
             miss = float(np.hypot(x, z))
             yield {**found, 'miss': miss, 'hit': float(miss <= self._numbers.hit_radius)}
 
-    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> simulation.GroundTruth:
+    def _truth(self, row: Row, rng: np.random.Generator) -> simulation.GroundTruth:
         needle, steering = with_lengths(
             self._needle, self._steering, row['bending_length'], row['skin']
         )
@@ -198,9 +199,7 @@ class SteeringScenario(Scenario):
             for x, z in (tips[:, -1, [0, 2]] + frames * depth).tolist()
         ]
 
-    def replay(
-        self, sample: Mapping[str, float], rng: np.random.Generator
-    ) -> Iterator[MeasuredRun]:
+    def replay(self, sample: Row, rng: np.random.Generator) -> Iterator[MeasuredRun]:
         """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = self.row(sample)
         tilt = row['tilt_x'], row['tilt_z']
@@ -224,14 +223,13 @@ class SteeringScenario(Scenario):
     def _steered(
         self,
         truth: simulation.GroundTruth,
-        row: Mapping[str, float],
+        row: Row,
         rng: np.random.Generator,
         watch: Callable[[simulation.SteeringPlant], object] | None = None,
     ) -> dict[str, float]:
         try:
-            law = build_law(
-                self._law, self._model, (row['target_x'], row['target_z']), self._numbers
-            )
+            target = row['target_x'], row['target_z']
+            law = build_law(self._law, self._model, target, self._numbers)
         except OutOfReachError:
             return {'refused': 1.0}
 

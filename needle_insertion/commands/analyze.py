@@ -3,6 +3,7 @@
 
 import argparse
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters
@@ -20,17 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
     points = parser.add_argument_group('operating points', 'every combination of the values given')
-    for name, unit, default, text in (
-        ('depth', 'm', [0.1], 'insertion depths (default 100mm)'),
-        ('tip-deflection', 'm', [0.0, 5e-4], 'tip deflections (default 0 0.5mm)'),
-        ('speed', 'm/s', [5e-3], 'insertion velocities, negative for retraction (default 5mm/s)'),
-    ):
-        points.add_argument(
-            f'--{name}', nargs='+', default=default, help=text, **common.with_unit(unit)
-        )
-    points.add_argument(
-        '--force', default=0.0, help='insertion force (default 0)', **common.with_unit('N')
-    )
+    add = partial(common.add_quantity, points)
+    add('--depth', 'm', 'insertion depths (default 100mm)', [0.1], nargs='+')
+    add('--tip-deflection', 'm', 'tip deflections (default 0 0.5mm)', [0.0, 5e-4], nargs='+')
+    speeds = 'insertion velocities, negative for retraction (default 5mm/s)'
+    add('--speed', 'm/s', speeds, [5e-3], nargs='+')
+    add('--force', 'N', 'insertion force (default 0)', 0.0)
     points.add_argument(
         '--sliding',
         choices=tuple(SLIDING),

@@ -94,6 +94,18 @@ def with_unit(
     return {'type': parse, 'metavar': EXAMPLES.get(unit, unit)}
 
 
+def add_quantity(
+    parser: ArgumentParser | _ArgumentGroup,
+    name: str,
+    unit: str,
+    meaning: str,
+    default: Any = None,
+    **options: Any,
+) -> None:
+    """Add an option for a quantity, or for several with the option `nargs`."""
+    parser.add_argument(name, default=default, help=meaning, **with_unit(unit), **options)
+
+
 def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
     parser.add_argument(
         option,

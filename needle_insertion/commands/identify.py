@@ -101,11 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='X,Z',
         help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
     )
-    fitting.add_argument(
-        '--level',
-        **common.with_unit('N'),
-        help='force level of the stiffness to report (default: the largest)',
-    )
+    level = 'force level of the stiffness to report (default: the largest)'
+    common.add_quantity(fitting, '--level', 'N', level)
     stiffness.set_defaults(identify=_run_stiffness)
     add_steering(what)
     add_sensor(what)
@@ -154,12 +151,9 @@ def _add_common(
         if 'unit' in item.metadata:
             unit = item.metadata['unit']
             default = f'{item.default:g} {unit}'.removesuffix(' 1')
-            fitting.add_argument(
-                f'--{item.name.replace("_", "-")}',
-                default=item.default,
-                **common.with_unit(unit),
-                help=f'{item.metadata["description"]} (default {default})',
-            )
+            name = f'--{item.name.replace("_", "-")}'
+            meaning = f'{item.metadata["description"]} (default {default})'
+            common.add_quantity(fitting, name, unit, meaning, item.default)
     return reading, fitting
 
 

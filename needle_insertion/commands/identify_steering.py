@@ -83,9 +83,7 @@ def add_steering(what: Any) -> None:
         help='order of motion between samples: guide and needle together, or the guide first '
         '(default: the most likely order)',
     )
-    fitting.add_argument(
-        '--free-length', help='known free length (default: fitted)', **common.with_unit('m')
-    )
+    common.add_quantity(fitting, '--free-length', 'm', 'known free length (default: fitted)')
     parser.set_defaults(identify=_run)
 
 

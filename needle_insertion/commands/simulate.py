@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import partial
 from math import inf, sqrt
 from pathlib import Path
 from time import perf_counter
@@ -58,21 +59,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     common.add_needle(parser, None, f'{dynamics.DEFAULT_NEEDLE}, model modes: {PAPER_NEEDLE}')
     common.add_constants(parser, '--set', 'any other constant of the model')
-    for name, unit, words in (
-        ('depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)'),
-        ('force', 'N', f'insertion force (default {_FORCE:g}N)'),
-        ('duration', 's', 'time to simulate (default: until the hub is at the skin)'),
-        ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)'),
-        ('tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})'),
-    ):
-        parser.add_argument(f'--{name}', help=words, **common.with_unit(unit))
+    add = partial(common.add_quantity, parser)
+    add('--depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)')
+    add('--force', 'N', f'insertion force (default {_FORCE:g}N)')
+    add('--duration', 's', 'time to simulate (default: until the hub is at the skin)')
+    add('--interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)')
+    add('--tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})')
     start = parser.add_mutually_exclusive_group()
-    start.add_argument(
-        '--tip-deflection',
-        help='tip deflection at the start, in the shape of least elastic energy (default '
-        f'{1e3 * _DEFLECTION:g}mm)',
-        **common.with_unit('m'),
-    )
+    deflection = 'tip deflection at the start, in the shape of least elastic energy (default '
+    common.add_quantity(start, '--tip-deflection', 'm', f'{deflection}{1e3 * _DEFLECTION:g}mm)')
     start.add_argument(
         '--modal',
         type=float,
@@ -90,11 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
     group = parser.add_argument_group('model steering only')
-    for name, unit, words in (
-        ('to', 'm', f'target depth (default {1e3 * _TO:g}mm)'),
-        ('speed', 'm/s', f'insertion velocity (default {1e3 * _SPEED:g}mm/s)'),
-    ):
-        group.add_argument(f'--{name}', help=words, **common.with_unit(unit))
+    add = partial(common.add_quantity, group)
+    add('--to', 'm', f'target depth (default {1e3 * _TO:g}mm)')
+    add('--speed', 'm/s', f'insertion velocity (default {1e3 * _SPEED:g}mm/s)')
     group.add_argument(
         '--motion',
         type=Path,

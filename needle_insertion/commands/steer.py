@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -66,16 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, '--sensor', f'error of the tip sensor beyond noise, one of {errors}'
     )
     limits = SIMULATION_LIMITS
-    most = (
-        f'largest displacement of the guide along x and z (default {1e3 * limits.guide_limit:g}mm)'
-    )
+    add = partial(common.add_quantity, parser)
+    add('--step', 'm', f'depth per step (default {1e3 * STEP_LENGTH:g}mm)', STEP_LENGTH)
+    most = f'along x and z (default {1e3 * limits.guide_limit:g}mm)'
+    add('--limit', 'm', f'largest displacement of the guide {most}', limits.guide_limit)
     load = 'largest planned lateral force on the guide (default: no limit)'
-    for name, unit, default, text in (
-        ('step', 'm', STEP_LENGTH, f'depth per step (default {1e3 * STEP_LENGTH:g}mm)'),
-        ('limit', 'm', limits.guide_limit, most),
-        ('load-limit', 'N', limits.load_limit, load),
-    ):
-        parser.add_argument(f'--{name}', default=default, help=text, **common.with_unit(unit))
+    add('--load-limit', 'N', load, limits.load_limit)
     parser.add_argument(
         '--turns',
         type=int,

@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import print_each, with_unit
+from needle_insertion.commands.common import add_quantity, print_each
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
 
@@ -34,11 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'other', type=Path, nargs='?', metavar='OTHER', help='recording to compare with BAG'
     )
-    parser.add_argument(
-        '--shift',
-        help='time added to those of OTHER (default: both start to move at the same time)',
-        **with_unit('s'),
-    )
+    shift = 'time added to those of OTHER (default: both start to move at the same time)'
+    add_quantity(parser, '--shift', 's', shift)
     parser.add_argument(
         '--time',
         choices=TIMES,

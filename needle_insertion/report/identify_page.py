@@ -27,11 +27,7 @@ _ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
 _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
 
 
-def write_identified_page(
-    folder: Path,
-    summary: identification.FrictionSummary | identification.StiffnessSummary,
-    origin: Origin,
-) -> Path:
+def write_identified_page(folder: Path, summary: text.Summary, origin: Origin) -> Path:
     """Write ``friction.html`` or ``stiffness.html`` and its pictures; return the page."""
     estimates = summary.estimates
     label = text.short_names([estimate.name for estimate in estimates])

@@ -6,7 +6,7 @@ from dataclasses import fields, is_dataclass, replace
 from math import isfinite
 from pathlib import Path
 import re
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from needle_identification import (
     Fit,
@@ -31,6 +31,8 @@ MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags'
 
 #: Heads of the rows of `puncture_rows`.
 PUNCTURE_HEADS: Final = ('bag', 'puncture at [s]', 'depth [mm] ± SE', 'drop [N] ± SE')
+
+Summary: TypeAlias = FrictionSummary | StiffnessSummary  #: Result of recordings of one kind.
 
 
 def label_of(one: ParameterEstimate | Statistic) -> str:
@@ -95,7 +97,7 @@ def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> l
     return ['' if one is None else measured(one.value, one.error) for one in found]
 
 
-def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
+def identified_text(summary: Summary) -> str:
     if not isinstance(summary, FrictionSummary):
         return _stiffness_text(summary)
     means = friction_statistics(summary)
@@ -111,7 +113,7 @@ def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
     return '\n\n'.join(tables)
 
 
-def prediction_lines(summary: FrictionSummary | StiffnessSummary) -> list[str]:
+def prediction_lines(summary: Summary) -> list[str]:
     """Return a sentence with the error of predicted recordings, for each level of force."""
     if isinstance(summary, FrictionSummary):
         found = [('', summary.prediction)]
@@ -159,9 +161,7 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
     return '\n\n'.join(filter(None, [matrices, intervals, predictions, stiffness]))
 
 
-def warned(
-    summary: FrictionSummary | StiffnessSummary, origin: Origin
-) -> tuple[list[str], list[str]]:
+def warned(summary: Summary, origin: Origin) -> tuple[list[str], list[str]]:
     """Return one warning of each group that differs in numbers only, and all warnings."""
     names = short_names([one.name for one in summary.estimates])
     found = [('', words) for words in summary.warnings]

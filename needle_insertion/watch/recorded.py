@@ -6,10 +6,10 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from math import ceil, log2, nan
+from math import ceil, isnan, log2, nan
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from needle_identification import Bag, RecordingError
 from needle_identification.bags.bag import Recorded
@@ -45,6 +45,8 @@ _SLACK: Final = 10.0  #: Difference of the durations by stamps and by arrival th
 
 SLOWEST, FASTEST = 0.02, 50.0  #: Range of the playback speed, relative to real time.
 
+_Effect: TypeAlias = Callable[[View], object]  #: Effect of a message on the state of the page.
+
 
 class _Kept:
     """Messages by time, decimated to an interval [s] and to `_MOST`, each as its effect."""
@@ -52,9 +54,9 @@ class _Kept:
     def __init__(self, interval: float = 0.0) -> None:
         self.interval = interval
         self._times: list[float] = []
-        self._effects: list[Callable[[View], object]] = []
+        self._effects: list[_Effect] = []
 
-    def add(self, time: float, effect: Callable[[View], object]) -> None:
+    def add(self, time: float, effect: _Effect) -> None:
         """Store the effect of a message on a view, unless it is too soon after the previous."""
         if self._times and time < self._times[-1] + self.interval:
             return
@@ -109,14 +111,13 @@ class _Curve:
         values = np.array(self._values)
         if not np.isfinite(values).any():
             return None
-        steps = np.diff(np.array(self._times), prepend=self._times[0])
+        times = np.array(self._times)
+        steps = np.diff(times, prepend=times[0])
         gaps = steps > _GAP * self._interval if self._interval else are_gaps(steps)
-        columns: list[list[float | None]] = [[], []]
-        for time, value, gap in zip(self._times, values.tolist(), gaps.tolist(), strict=True):
-            for one in (None, value) if gap else (value,):
-                columns[0].append(round(time, 6))
-                columns[1].append(None if one is None or one != one else one)
-        return columns
+        at = np.flatnonzero(gaps)
+        times, values = np.insert(times, at, times[at]), np.insert(values, at, nan)
+        known = [None if isnan(value) else value for value in values.tolist()]
+        return [[round(time, 6) for time in times.tolist()], known]
 
 
 #: Signals of each topic.
@@ -213,11 +214,7 @@ class ShownRecording:
             self._keep((name, ''), time, lambda view: view.configuration(name, parameters))
 
     def _keep(
-        self,
-        key: tuple[str, str],
-        time: float,
-        effect: Callable[[View], object],
-        interval: float = 0.0,
+        self, key: tuple[str, str], time: float, effect: _Effect, interval: float = 0.0
     ) -> None:
         self._kept.setdefault(key, _Kept(interval)).add(time, effect)
 
@@ -283,11 +280,8 @@ def compare(
         still = first.name if here is None else other.name
         return Comparison(other, 0.0, f'not aligned: the needle does not move in {still}')
     shift = here - there
-    return Comparison(
-        other,
-        shift,
-        f'{other.name}: times shifted by {shift:+.3f} s, so that both move at {here:.3f} s',
-    )
+    words = f'{other.name}: times shifted by {shift:+.3f} s, so that both move at {here:.3f} s'
+    return Comparison(other, shift, words)
 
 
 class PagePlayback:
