@@ -13,7 +13,7 @@ from typing import Any, Final, Protocol, TextIO
 _UPDATE: Final = 0.5
 _LINE: Final = 10.0
 
-_CLEAR: Final = '\r\033[K'  #: Moves to the start of the line and clears it.
+CLEAR: Final = '\r\033[K'  #: Moves to the start of the line and clears it.
 
 
 class Show(Protocol):
@@ -52,7 +52,7 @@ class ProgressLine:
         self._text = 'done' if kind is None else 'failed'
         self._write()
         if self._terminal:
-            self._stream.write(_CLEAR if self._brief else '\n')
+            self._stream.write(CLEAR if self._brief else '\n')
             self._stream.flush()
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
@@ -64,7 +64,7 @@ class ProgressLine:
 
     def note(self, text: str) -> None:
         """Write a line of its own."""
-        clear = _CLEAR if self._terminal else ''
+        clear = CLEAR if self._terminal else ''
         self._stream.write(f'{clear}{text}\n')
         self._stream.flush()
 
@@ -79,7 +79,7 @@ class ProgressLine:
         self._written = monotonic()
         elapsed = f'{self._written - self._begin:.0f} s'
         if self._terminal:
-            self._stream.write(f'{_CLEAR}{self._title:30} {self._text:40} {elapsed:>6}')
+            self._stream.write(f'{CLEAR}{self._title:30} {self._text:40} {elapsed:>6}')
         else:
             self._stream.write(f'{self._title}: {self._text}, {elapsed}\n')
         self._stream.flush()

@@ -85,13 +85,9 @@ class Distribution:
     def quantiles(self, parts: FloatArray) -> FloatArray:
         """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""
         if self.kind == _CHOICE:
-            number = len(self.numbers)
-            at = (parts * number).astype(int)
-            if self.weights:
-                ends = np.cumsum(self.weights)
-                at = np.searchsorted(ends, parts * ends[-1], side='right')
-            at = np.minimum(at, number - 1)
-            return np.asarray(np.array(self.numbers)[at])
+            ends = np.cumsum(self.weights or np.ones(len(self.numbers)))
+            at = np.searchsorted(ends, parts * ends[-1], side='right')
+            return np.asarray(np.array(self.numbers)[np.minimum(at, len(ends) - 1)])
         frozen = _frozen(self.kind, self.numbers)
         low, high = frozen.cdf(self.within)
         return np.asarray(np.clip(frozen.ppf(low + parts * (high - low)), *self.within))

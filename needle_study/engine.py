@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 import fcntl
 from functools import lru_cache
 from importlib.metadata import version
-from itertools import chain
+from itertools import accumulate, chain
 import json
 import os
 from pathlib import Path
@@ -160,15 +160,12 @@ class Results:
 
     def missing(self) -> list[tuple[int, int]]:
         """Return the samples to compute, as ranges of first and last + 1."""
-        begin, gaps = 0, list[tuple[int, int]]()
         if self.table.exists():
-            return gaps
-        parts = [(part.first, part.end) for part in self._done()]
-        for first, end in [*parts, (self.study.samples, self.study.samples)]:
-            if first > begin:
-                gaps.append((begin, first))
-            begin = max(begin, end)
-        return gaps
+            return []
+        parts = self._done()
+        begins = accumulate((part.end for part in parts), max, initial=0)
+        firsts = [*(part.first for part in parts), self.study.samples]
+        return [gap for gap in zip(begins, firsts, strict=True) if gap[0] < gap[1]]
 
     def _done(self) -> list[_Part]:
         found = ((_PART.fullmatch(path.name), path) for path in self._parts.iterdir())

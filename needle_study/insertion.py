@@ -119,8 +119,8 @@ class InsertionScenario(Scenario):
         scenario.check_names(
             'settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__]
         )
-        numbers = {name: value for name, value in settings.items() if name not in _PARTS}
-        self._numbers = from_values(InsertionStudy, numbers, 'settings.')
+        given = {name: value for name, value in settings.items() if name not in _PARTS}
+        self._numbers = from_values(InsertionStudy, given, 'settings.')
         words: dict[str, str] = {}
         for name, valid in (('controller', CONTROLLERS), ('reference', tuple(control.REFERENCES))):
             words[name] = settings.get(name, valid[0])
@@ -143,7 +143,13 @@ class InsertionScenario(Scenario):
         )
         plants = from_values(Uncertainty, uncertainty, 'settings.uncertainty.')
         self._law = self._made(words['controller'], gains, plants)
-        p, samples = self._needle, self._longest * self._numbers.rate
+        p, numbers = self._needle, self._numbers
+        # Upper bound of the duration of an insertion.
+        if self._law is None:
+            longest = _time(control.Axis.insertion(p), numbers.push, p.length - p.minimum_depth)
+        else:
+            longest = self._kind(control.Setpoint(p.minimum_depth), p.length, numbers).duration
+        samples = (longest + numbers.wait) * numbers.rate
         if samples > _MOST:
             raise ParameterError(
                 f'settings: an insertion must have <= {_MOST} samples, and would have up to '
@@ -174,18 +180,6 @@ class InsertionScenario(Scenario):
                 0.0, 100.0,
             ),
         }  # fmt: skip
-
-    @property
-    def _longest(self) -> float:
-        """Upper bound of the duration of an insertion [s]."""
-        p, numbers = self._needle, self._numbers
-        if self._law is None:
-            axis = control.Axis.insertion(p)
-            return _time(axis, numbers.push, p.length - p.minimum_depth) + numbers.wait
-        reference: control.Reference = self._kind(
-            control.Setpoint(p.minimum_depth), p.length, numbers
-        )
-        return reference.duration + numbers.wait
 
     def _made(
         self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty

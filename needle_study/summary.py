@@ -64,7 +64,6 @@ def batches(table: Path, name: str) -> Iterator[FloatArray]:
 
 
 def column(table: Path, name: str, most: int | None = None) -> FloatArray:
-    """Read one column of a table, up to `most` values."""
     found, size = list[FloatArray](), 0
     for values in batches(table, name):
         found.append(values)
@@ -216,11 +215,9 @@ def _sorted(values: FloatArray, by: FloatArray, parts: IntArray) -> Estimate:
 
     def index(kept: BoolArray) -> float:
         y_, by_ = y[kept], by[kept]
-        means = [
-            (len(one), one.mean())
-            for one in np.array_split(y_[np.argsort(by_, kind='stable')], _GROUPS)
-        ]
-        between = sum(n * (mean - y_.mean()) ** 2 for n, mean in means) / (len(y_) * y_.var())
+        groups = np.array_split(y_[np.argsort(by_, kind='stable')], _GROUPS)
+        between = sum(len(one) * (one.mean() - y_.mean()) ** 2 for one in groups)
+        between /= len(y_) * y_.var()
         by_chance = (_GROUPS - 1) / (len(y_) - 1)
         return float((between - by_chance) / (1.0 - by_chance))
 

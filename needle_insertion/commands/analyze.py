@@ -32,12 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(SLIDING),
         help='branch of dry friction at speed 0, where it has no derivative',
     )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
-    parser.add_argument(
-        '--map',
-        action='store_true',
-        help='also map depth and deflection, up to the largest deflection given',
-    )
+    common.add_flag(parser, '--json', 'print JSON instead of a table')
+    mapped = 'also map depth and deflection, up to the largest deflection given'
+    common.add_flag(parser, '--map', mapped)
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
 
 

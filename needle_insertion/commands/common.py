@@ -73,7 +73,7 @@ def add_output(parser: ArgumentParser | _ArgumentGroup, use: str = '') -> None:
         metavar='FILE',
         help=f'ROS parameter file with the result{use}',
     )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_flag(parser, '--json', 'print JSON instead of tables')
 
 
 def words_of(text: str) -> list[str]:
@@ -92,6 +92,18 @@ def with_unit(
             raise ArgumentTypeError(str(error)) from None
 
     return {'type': parse, 'metavar': EXAMPLES.get(unit, unit)}
+
+
+def add_flag(parser: ArgumentParser | _ArgumentGroup, name: str, meaning: str) -> None:
+    parser.add_argument(name, action='store_true', help=meaning)
+
+
+def add_topic(
+    parser: ArgumentParser | _ArgumentGroup, name: str, of: str, otherwise: str = ''
+) -> None:
+    """Add the option of a topic, by default the only one of its type, or the one named."""
+    default = f'the only such topic{otherwise and f", or {otherwise}"}'
+    parser.add_argument(name, metavar='TOPIC', help=f'topic of {of} (default: {default})')
 
 
 def add_quantity(

@@ -5,17 +5,15 @@ import argparse
 import os
 import sys
 
+from needle_insertion.commands.common import add_flag
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--portable',
-        action='store_true',
-        help='compile for every processor of the level x86-64-v3, for a wheel',
-    )
+    portable = 'compile for every processor of the level x86-64-v3, for a wheel'
+    add_flag(parser, '--portable', portable)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Compile all kernels; return 1 if no folder is writable."""
     from needle_dynamics.compiled.store import PORTABLE, writable_folder
 
     if options.portable:

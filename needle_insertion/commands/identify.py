@@ -119,17 +119,10 @@ def _add_common(
     writing.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
     )
-    writing.add_argument(
-        '--all-warnings',
-        action='store_true',
-        help='print the warnings of each recording, not one warning of each kind',
-    )
+    all_warnings = 'print the warnings of each recording, not one warning of each kind'
+    common.add_flag(writing, '--all-warnings', all_warnings)
     reading = parser.add_argument_group('input')
-    reading.add_argument(
-        '--wrench-topic',
-        metavar='TOPIC',
-        help='topic of the force, a WrenchStamped (default: the only such topic, or base_wrench)',
-    )
+    common.add_topic(reading, '--wrench-topic', 'the force, a WrenchStamped', 'base_wrench')
     reading.add_argument(
         '--motion-topic',
         metavar='TOPIC',
@@ -254,7 +247,9 @@ def _identify(
 def completed(words: Sequence[str]) -> list[str]:
     """Insert the kind and the options for recordings that are given without a kind."""
     first = words[0] if words else '-'
-    if first in KINDS or first.startswith('-') or not _is_recording(first):
+    path = Path(first)
+    is_recording = path.exists() or path.suffix or len(path.parts) > 1
+    if first in KINDS or first.startswith('-') or not is_recording:
         return list(words)
     given = list(takewhile(lambda word: not word.startswith('-'), words))
     #: Columns of the user, in place of those that are found.
@@ -281,11 +276,6 @@ def completed(words: Sequence[str]) -> list[str]:
     # Values with a minus sign are quoted where the terminal needs it.
     sys.stderr.write(shown(f'chosen: {shlex.join(["needle", "identify", *chosen])}') + '\n')
     return chosen
-
-
-def _is_recording(word: str) -> bool:
-    path = Path(word)
-    return path.exists() or bool(path.suffix) or len(path.parts) > 1
 
 
 def run(options: argparse.Namespace) -> int:

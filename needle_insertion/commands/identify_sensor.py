@@ -50,11 +50,7 @@ def add_sensor(what: Any) -> None:
             'usual names); for a bag, axes such as tip_x=-z',
         )
     for option, of in (('--tip-topic', 'the tip'), ('--truth-topic', 'the true position')):
-        reading.add_argument(
-            option,
-            metavar='TOPIC',
-            help=f'topic of {of}, a PointStamped or PoseStamped (default: the only such topic)',
-        )
+        common.add_topic(reading, option, f'{of}, a PointStamped or PoseStamped')
     reading.add_argument(
         '--axes',
         default=','.join(AXES),

@@ -52,17 +52,9 @@ def add_steering(what: Any) -> None:
         '(default: recognized by usual names); for a bag, the joints of depth, guide and roll, '
         'and the axes of the tip',
     )
-    reading.add_argument(
-        '--tip-topic',
-        metavar='TOPIC',
-        help='topic of the tip, a PointStamped or PoseStamped (default: the only such topic, or '
-        'tip_deflection)',
-    )
-    reading.add_argument(
-        '--motion-topic',
-        metavar='TOPIC',
-        help='topic of the joints, a JointState (default: the only such topic, or joint_states)',
-    )
+    tip = 'the tip, a PointStamped or PoseStamped'
+    common.add_topic(reading, '--tip-topic', tip, 'tip_deflection')
+    common.add_topic(reading, '--motion-topic', 'the joints, a JointState', 'joint_states')
     common.add_time(reading)
     reading.add_argument(
         '--medium',

@@ -5,7 +5,7 @@ import argparse
 from math import isfinite
 
 from needle_identification import inspect_recording, Inspection
-from needle_insertion.commands.common import add_recordings, print_each, print_result
+from needle_insertion.commands.common import add_flag, add_recordings, print_each, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
@@ -14,7 +14,7 @@ from needle_ros.errors import NeedleError, shown
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_recordings(parser)
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    add_flag(parser, '--json', 'print JSON instead of tables')
 
 
 def run(options: argparse.Namespace) -> int:

@@ -6,21 +6,19 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from needle_insertion.commands.common import add_needle, check_folder
+from needle_insertion.commands.common import add_flag, add_needle, check_folder
 from needle_insertion.progress import ProgressLine
 from needle_ros.errors import ParameterError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--hardware', action='store_true', help='start no plant: a robot publishes joint_states'
-    )
+    add_flag(parser, '--hardware', 'start no plant: a robot publishes joint_states')
     add_needle(parser, None, 'from the parameter file; the tip of a needle that bends is steered')
-    parser.add_argument(
+    add_flag(
+        parser,
         '--realtime',
-        action='store_true',
-        help='run the plant in real time instead of lock-step: it does not wait for nodes that a '
-        'busy machine delays',
+        'run the plant in real time instead of lock-step: it does not wait for nodes that a busy '
+        'machine delays',
     )
     parser.add_argument('--law', help='control law (default: from the parameter file)')
     parser.add_argument(
@@ -43,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help='folder for recording and logs (default needle_runs/ and the time)',
     )
-    parser.add_argument('--no-recording', action='store_true', help='do not record')
+    add_flag(parser, '--no-recording', 'do not record')
 
 
 def run(options: argparse.Namespace) -> int:

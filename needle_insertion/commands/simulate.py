@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help='file.csv, file.png or a folder for a bag; repeatable',
     )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
+    common.add_flag(parser, '--json', 'print JSON instead of a table')
     group = parser.add_argument_group('model steering only')
     add = partial(common.add_quantity, group)
     add('--to', 'm', f'target depth (default {1e3 * _TO:g}mm)')
@@ -153,20 +153,19 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
     common.print_each('warning', report.warnings(trajectory))
+    word, ratio = (
+        ('faster', duration / taken) if duration >= taken else ('slower', taken / duration)
+    )
+    times = float(f'{ratio:.2g}')
     # Decayed values have no significant digits left.
     rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
     text = (
         f'{needle}: inserted {depth:g} m at the start, force {force:g} N, for {duration:g} s\n\n'
         f'{table(rows, ("quantity", "value"))}\n'
-        f'{duration:g} s simulated in {taken:.2g} s, {_pace(duration / taken)} real time'
+        f'{duration:g} s simulated in {taken:.2g} s, {times:g} times {word} than real time'
     )
     common.print_result(summary, text, options.output, as_json=options.json)
     return 0
-
-
-def _pace(ratio: float) -> str:
-    times, word = (ratio, 'faster') if ratio >= 1.0 else (1.0 / ratio, 'slower')
-    return f'{float(f"{times:.2g}"):g} times {word} than'
 
 
 def _read_motion(path: Path) -> dict[str, dynamics.FloatArray]:

@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-o', '--output', type=Path, metavar='FILE', help='picture to write (.png)'
     )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    common.add_flag(parser, '--json', 'print JSON instead of tables')
 
 
 def _line(line: NeedleShape | NeedlePath, frame: dynamics.FloatArray) -> dynamics.FloatArray:

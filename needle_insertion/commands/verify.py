@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 import sys
 
-from needle_insertion.commands.common import print_result
+from needle_insertion.commands.common import add_flag, print_result
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='largest difference as a fraction of the largest value of its topic and unit; a '
         f'value that is rounded to counts may also differ by one count (default {TOLERANCE:g})',
     )
-    parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
+    add_flag(parser, '--json', 'print JSON instead of a table')
 
 
 def run(options: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import add_quantity, print_each
+from needle_insertion.commands.common import add_flag, add_quantity, print_each
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
 
@@ -42,11 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=TIMES[0],
         help='stamps of a recording: header of each message, or receive time (default header)',
     )
-    parser.add_argument(
-        '--control',
-        action='store_true',
-        help='buttons: target, pause, retract, stop (default: view only)',
-    )
+    add_flag(parser, '--control', 'buttons: target, pause, retract, stop (default: view only)')
     parser.add_argument(
         '--host',
         default=HOST,

@@ -104,8 +104,7 @@ class Graph:
         try:
             # SIGTERM first: a recorder closes its bag.
             for started in self._processes:
-                if started.process.poll() is None:
-                    started.process.terminate()
+                started.process.terminate()
             deadline = time.monotonic() + _PATIENCE
             for started in self._processes:
                 with suppress(subprocess.TimeoutExpired):
@@ -113,8 +112,7 @@ class Graph:
         finally:
             # Kill all before waiting: a second interrupt may arrive during the wait.
             for started in self._processes:
-                if started.process.poll() is None:
-                    started.process.kill()
+                started.process.kill()
             for started in self._processes:
                 started.process.wait()
             for file in self._files:

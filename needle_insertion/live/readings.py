@@ -36,24 +36,20 @@ class Readings:
 
     def __init__(self, node: Node, robot: Robot | None = None) -> None:
         self._robot = robot
-        topics = dict(zip(_TOPICS, _TOPICS, strict=True))
+        own: dict[Topic, str] = {}
         if robot is not None:
-            own = robot.settings
-            for topic, name in (
-                (contract.JOINT_STATES, own.state_topic),
-                (contract.BASE_WRENCH, own.wrench_topic),
-            ):
-                topics[topic] = replace(topic, name=name or topic.name)
+            own[contract.JOINT_STATES] = robot.settings.state_topic
+            own[contract.BASE_WRENCH] = robot.settings.wrench_topic
         #: Kept alive for its subscriptions.
         self._node = node
         self._newest: dict[str, bytes] = {}
         #: Time of the last message [ns], for a robot without stamps.
         self._received = 0
         self._readers = {topic.name: MessageReader(topic.type_name) for topic in _TOPICS}
-        self._waiting = {
-            topic.name: waiting(node, used, topic.qos._replace(depth=1))
-            for topic, used in topics.items()
-        }
+        self._waiting = {}
+        for topic in _TOPICS:
+            used = replace(topic, name=own.get(topic) or topic.name)
+            self._waiting[topic.name] = waiting(node, used, topic.qos._replace(depth=1))
 
     def newest(self, topic: Topic) -> Reading | None:
         """Return the newest message of a topic; None before the first, or if unreadable."""

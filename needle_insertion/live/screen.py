@@ -11,11 +11,10 @@ import termios
 from threading import Semaphore, Thread
 from typing import Final
 
+from needle_insertion.progress import CLEAR
 from needle_ros.errors import ParameterError
 
 _PROMPT: Final = 'needle> '
-
-_CLEAR: Final = '\r\033[K'  #: Moves to the start of a line and clears it.
 
 
 class Screen:
@@ -104,11 +103,11 @@ class Screen:
     def show(self, line: str) -> None:
         """Show a line that the next line replaces; no effect in a file or pipe."""
         if self._terminal:
-            sys.stdout.write(f'{_CLEAR}{line}')
+            sys.stdout.write(f'{CLEAR}{line}')
             sys.stdout.flush()
             self._shown = True
 
     def _clear(self) -> None:
         if self._shown or (self._asked and self.typed):
-            sys.stdout.write(_CLEAR)
+            sys.stdout.write(CLEAR)
         self._shown = False

@@ -248,5 +248,4 @@ class Rerun:
 
 
 def verify(path: Path, tolerance: float = TOLERANCE) -> list[Rerun]:
-    """Recompute and compare the runs of all plants in a bag."""
     return [Rerun(recorded, tolerance) for recorded in recorded_runs(path)]

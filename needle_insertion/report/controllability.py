@@ -169,7 +169,6 @@ def draw_map(found: ControllabilityMap) -> Figure:
 
 
 def write_map(folder: Path, found: ControllabilityMap) -> list[Path]:
-    """Write a map as CSV and PNG to a folder; return the files."""
     depths, deflections = np.meshgrid(found.depths, found.deflections, indexing='ij')
     columns = (depths, deflections, *(getattr(found, name) for name in _MAPPED))
     text = StringIO()

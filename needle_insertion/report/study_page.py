@@ -119,7 +119,6 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
 
 
 def _shown(unit: str) -> tuple[str, float]:
-    """Return the display unit of an SI unit, and the factor to it."""
     return _SHOWN.get(unit, (unit, 1.0))
 
 
@@ -144,7 +143,6 @@ def _influence(one: summary.Indices) -> summary.Estimate:
 
 
 def _shares(one: summary.Indices) -> list[str]:
-    """Format the indices of a variable with their intervals."""
     both = [_rounded(found, '%') for found in (one.first, one.total) if found is not None]
     return [f'{value} ({ends})' for value, ends in both]
 

@@ -33,7 +33,6 @@ class Live:
         self.number, self.frame = 0, ''
 
     async def run(self) -> None:
-        """Generate frames until cancelled."""
         due = monotonic()
         while True:
             now = monotonic()

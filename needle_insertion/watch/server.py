@@ -162,7 +162,6 @@ class Server:
         self._port = self._runner.addresses[0][1]
 
     async def end(self) -> None:
-        """Disconnect all readers and stop listening."""
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None
@@ -243,7 +242,6 @@ class Server:
             await connection.answer(success=False, words=str(error))
 
     async def _do(self, message: dict[str, Any]) -> tuple[bool, str]:
-        """Execute a command if it is valid and authorized."""
         if self._control is None:
             raise ParameterError('this page is read-only: use needle watch --control')
         token = message.pop('token', '')

@@ -108,7 +108,6 @@ class Buttons:
             self._executor.spin_once(timeout_sec=0.0)
 
     async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
-        """Send a target [m]; return acceptance and answer, `JobError` without an answer."""
         # The `WatchNode` of this process is a subscriber too.
         if self._node.count_subscribers(contract.TARGET.name) < 2:
             raise JobError('no node subscribes to target: start a controller or the node steering')
