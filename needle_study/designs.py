@@ -62,7 +62,6 @@ class RandomDesign:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
 
     def noise(self, number: int) -> np.random.Generator:
-        """Return the random generator of the noise of a sample."""
         return self.rng(number, 1)
 
     def replicate(self, numbers: IntArray) -> IntArray:
@@ -150,7 +149,6 @@ class SaltelliDesign(SobolDesign):
 
     @property
     def group(self) -> int:
-        """Number of samples of a group."""
         return self.dimensions + 3
 
     def noise(self, number: int) -> np.random.Generator:

@@ -127,7 +127,7 @@ class Results:
         if self.table.exists():
             if not self._is_intact():
                 raise JobError(f'{self.table} is damaged; remove it to compute it again')
-            self._clear()
+            shutil.rmtree(self._parts, ignore_errors=True)
         else:
             self._parts.mkdir(exist_ok=True)
 
@@ -199,15 +199,12 @@ class Results:
                 with suppress(OSError):
                     draft.unlink()
                 raise JobError(f'{self.table} cannot be written: {error}') from error
-        self._clear()
+        shutil.rmtree(self._parts, ignore_errors=True)
 
     def _is_intact(self) -> bool:
         with suppress(OSError, UnicodeDecodeError):
             return self._sum.read_text() == _checksum(0, self.study.samples, _blocks(self.table))
         return False
-
-    def _clear(self) -> None:
-        shutil.rmtree(self._parts, ignore_errors=True)
 
     def _groups(self) -> Iterator[Any]:
         """Yield all samples in tables of equal size."""

@@ -54,13 +54,8 @@ class Scenario(ABC):
             self.row({name: float(values[k]) for name, values in samples.items()})
             for k in range(len(streams))
         ]
-        found = [
-            one
-            for first in range(0, len(rows), self.at_once)
-            for one in self.insert(
-                rows[first : first + self.at_once], streams[first : first + self.at_once]
-            )
-        ]
+        parts = [slice(k, k + self.at_once) for k in range(0, len(rows), self.at_once)]
+        found = [one for part in parts for one in self.insert(rows[part], streams[part])]
         return {name: np.array([one.get(name, nan) for one in found]) for name in self.metrics}
 
     def row(self, sample: Row) -> dict[str, float]:

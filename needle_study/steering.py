@@ -161,9 +161,8 @@ class SteeringScenario(Scenario):
             yield {**found, 'miss': miss, 'hit': float(miss <= self._numbers.hit_radius)}
 
     def _truth(self, row: Row, rng: np.random.Generator) -> simulation.GroundTruth:
-        needle, steering = with_lengths(
-            self._needle, self._steering, row['bending_length'], row['skin']
-        )
+        lengths = row['bending_length'], row['skin']
+        needle, steering = with_lengths(self._needle, self._steering, *lengths)
         bevel = np.array([row['bevel_x'], row['bevel_z']])
         steering = replace(
             steering,
@@ -208,16 +207,14 @@ class SteeringScenario(Scenario):
         def watch(plant: simulation.SteeringPlant) -> None:
             one = plant.needle
             stamp = round(one.depth / _SPEED * NANOSECONDS)
-            messages.append(
-                MeasuredRun(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still))
-            )
+            joints = (one.depth, *one.guide, *tilt, one.roll, *still)
+            messages.append(MeasuredRun(_JOINTS, stamp, joints))
             x, z = plant.tip.tolist()
             messages.append(MeasuredRun(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
 
         self._steered(self._truth(row, rng), row, rng, watch)
-        yield MeasuredRun(
-            contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z'])
-        )
+        target = (row['target_x'], float(self._depths[-1]), row['target_z'])
+        yield MeasuredRun(contract.TARGET, 0, target)
         yield from messages
 
     def _steered(

@@ -44,7 +44,6 @@ class _Needles:
         self.forces = np.zeros(number)
 
     def begin(self, k: int, rng: np.random.Generator) -> None:
-        """Sample a new needle and target for episode k."""
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
         changed: dict[str, Any] = {
             name: float(factor * getattr(self._nominal, name))

@@ -51,9 +51,8 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         if render_mode is not None:
             check_choice('render_mode', render_mode, self.metadata['render_modes'])
         self.render_mode = render_mode
-        for name, value in (
-            ('depth', depth), ('step', step), ('guide_limit', guide_limit), ('aside', aside),
-        ):  # fmt: skip
+        sizes = {'depth': depth, 'step': step, 'guide_limit': guide_limit, 'aside': aside}
+        for name, value in sizes.items():
             if not 0.0 < value < np.inf:
                 raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
         self._needle, self._steering, _ = find_needle(needle)
@@ -72,9 +71,8 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         """Start an episode; options: ``truth``, a `GroundTruth`, and ``target``, x and z [m]."""
         super().reset(seed=seed, options=options)
         rng, given = self.np_random, options or {}
-        truth = sample_truth(
-            self._needle, self._steering, self._prior, rng, int(rng.integers(_SEEDS))
-        )
+        path_seed = int(rng.integers(_SEEDS))
+        truth = sample_truth(self._needle, self._steering, self._prior, rng, path_seed)
         target = rng.uniform(-self._aside, self._aside, 2)
         self._plant = given.get('truth', truth).plant(self._depths)
         self._target = np.array(given.get('target', target))
