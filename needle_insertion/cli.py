@@ -120,7 +120,6 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
 
 
 def _load(name: str) -> ModuleType:
-    """Import a subcommand; the benchmarks are not installed."""
     if name == 'bench':
         if not (_ROOT / 'benchmarks').is_dir():
             _Parser(prog='needle bench').error(

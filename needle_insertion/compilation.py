@@ -53,7 +53,6 @@ def compile_kernels(names: Sequence[str] = MODULES) -> int:
 
 
 def compile_nodes() -> int:
-    """Compile the kernels of the nodes that are not in the cache; return their number."""
     from needle_controller.controller_node import ControllerNode
     from needle_controller.steering_node import SteeringNode
     from needle_dynamics.plant_node import PlantNode

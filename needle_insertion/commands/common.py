@@ -165,7 +165,6 @@ def try_write(path: Path | None, write: Callable[[Path], object]) -> tuple[list[
 
 
 def print_each(kind: str, lines: Iterable[object]) -> None:
-    """Print warnings or errors on stderr, one per line."""
     for line in lines:
         sys.stderr.write(shown(f'{kind}: {line}') + '\n')
 

@@ -170,9 +170,7 @@ def _run_friction(options: argparse.Namespace) -> int:
         'motion_axis': options.motion_axis,
         'columns': column_roles(options.columns) if options.columns else None,
     }
-    return _identify(
-        options, 'friction', fit, axes, identification.summarize, identification.write_result
-    )
+    return _identify(options, 'friction', fit, axes, identification.summarize)
 
 
 def _run_stiffness(options: argparse.Namespace) -> int:
@@ -185,14 +183,7 @@ def _run_stiffness(options: argparse.Namespace) -> int:
         level_tolerance=settings.level_tolerance,
     )
     axes = {'axes': tuple(options.axes)}
-    return _identify(
-        options,
-        'stiffness',
-        (settings,),
-        axes,
-        summarize,
-        lambda path, summary: identification.write_result(path, None, summary),
-    )
+    return _identify(options, 'stiffness', (settings,), axes, summarize)
 
 
 def _identify(
@@ -201,7 +192,6 @@ def _identify(
     fit: tuple[Any, ...],
     axes: Mapping[str, Any],
     summarize: Callable[[list[Any]], Any],
-    write: Callable[[Path, Any], None],
 ) -> int:
     """Identify all bags with the settings and other arguments of a fit, and write the results."""
     common.check_file(options.output)
@@ -226,7 +216,10 @@ def _identify(
     if not estimates:
         return 2
     summary = summarize(estimates)
-    written, errors = common.try_write(options.output, lambda path: write(path, summary))
+    result = {'friction': None, kind: summary}
+    written, errors = common.try_write(
+        options.output, lambda path: identification.write_result(path, **result)
+    )
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page

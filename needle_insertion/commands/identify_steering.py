@@ -151,9 +151,7 @@ def _predicted(one: HeldOut | None) -> str:
 
 
 def steering_text(found: SteeringEstimate) -> str:
-    parameters = [
-        (medium.medium or _ONE, one) for medium in found.media for one in medium.parameters
-    ]
+    parameters = [(one.medium or _ONE, each) for one in found.media for each in one.parameters]
     rows = [
         (
             medium,

@@ -18,7 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the contents of each recording; return 2 if a recording cannot be read."""
     found, bad = list[Inspection](), 0
     for path in options.recordings:
         try:

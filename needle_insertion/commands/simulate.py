@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from math import inf, sqrt
 from pathlib import Path
 from time import perf_counter
-from typing import Final, TYPE_CHECKING
+from typing import Final, TYPE_CHECKING, TypeAlias
 
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS
@@ -40,6 +39,8 @@ _TO, _SPEED, _STEP = 0.1, 5e-3, 1e-3
 
 #: Columns of a table of guide motion, in addition to the depth.
 _COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
+
+_Motion: TypeAlias = dict[str, dynamics.FloatArray]  #: positions by the name of a column
 
 _MOST = 1_000_000  #: most samples of a run
 
@@ -138,9 +139,8 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
-    duration = options.duration
-    if duration is None:
-        duration = _time_to_hub(parameters, depth, force)
+    hub = _time_to_hub(parameters, depth, force)
+    duration = hub if options.duration is None else options.duration
     start = dynamics.NeedleModel(parameters).state_at(depth, deflection, modal)
     # Loads the machine code, which takes longer than most runs.
     dynamics.simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
@@ -168,7 +168,7 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     return 0
 
 
-def _read_motion(path: Path) -> dict[str, dynamics.FloatArray]:
+def _read_motion(path: Path) -> _Motion:
     """Read guide, tilt and roll by depth from a table: ``depth`` and any of `_COLUMNS`."""
     # Imported here, as the report below: the modal model does not need these 0.5 s.
     from needle_identification import RecordingError
@@ -235,7 +235,7 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
 
 def _insert(
     recorder: InsertionRecord,
-    motion: Mapping[str, dynamics.FloatArray],
+    motion: _Motion,
     show: Show,
     to: float,
     speed: float,
@@ -248,17 +248,12 @@ def _insert(
         show('inserting', (one.depth - begin) / (to - begin))
         # The first interval accelerates to the speed, the last ends at the target depth.
         ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
-        at = {key: float(np.interp(ahead, motion['depth'], motion[key])) for key in motion}
+        at = dict.fromkeys(_COLUMNS, 0.0)
+        at |= {key: float(np.interp(ahead, motion['depth'], motion[key])) for key in motion}
+        guide, tilt = (at['guide_x'], at['guide_z']), (at['tilt_x'], at['tilt_z'])
         duration = interval
         if ahead == to:
             duration = max(2.0 * (to - one.depth) / (one.velocity + speed), 1e-9)
-        force = one.carry(
-            duration,
-            speed,
-            guide=(at.get('guide_x', 0.0), at.get('guide_z', 0.0)),
-            tilt=(at.get('tilt_x', 0.0), at.get('tilt_z', 0.0)),
-            roll=at.get('roll', 0.0),
-        )
-        recorder.take(force)
+        recorder.take(one.carry(duration, speed, guide=guide, tilt=tilt, roll=at['roll']))
         if ahead == to:
             break

@@ -175,10 +175,8 @@ def run(options: argparse.Namespace) -> int:
         'target [m]': aim.tolist(),
         'tip [m]': tip.tolist(),
         'tip open loop [m]': other.tolist(),
-        'expected tip [m]': None if expected is None else expected.mean.tolist(),
-        'expected tip half width [m]': (
-            None if expected is None else expected.half_width.tolist()
-        ),
+        'expected tip [m]': expected and expected.mean.tolist(),
+        'expected tip half width [m]': expected and expected.half_width.tolist(),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
         'bending length [m]': bending_length(needle.bending_stiffness, needle.tissue_stiffness),

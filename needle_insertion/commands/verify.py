@@ -52,12 +52,8 @@ def _table(results: Sequence[Rerun]) -> str:
         name = shown(result.recorded.path.name)
         for topic, found in result.topics.items():
             worst = f'{found.largest_difference:.3g} {found.unit} ({found.quantity})'
-            rows.append(
-                (
-                    name, shown(topic), str(found.compared), worst if found.quantity else '0',
-                    str(found.differing), found.verdict,
-                )
-            )  # fmt: skip
+            counts = str(found.compared), worst if found.quantity else '0', str(found.differing)
+            rows.append((name, shown(topic), *counts, found.verdict))
             name = ''
     return table(
         rows, ('bag', 'topic', 'compared', 'largest difference', 'beyond tolerance', 'verdict')

@@ -77,13 +77,8 @@ def waiting(
     Messages are taken on demand only: a topic of 1 kHz costs no more Python time than a topic that
     is read 30 times a second. The node must not be spun. `raw` messages are bytes.
     """
-    made = node.create_subscription(
-        message_class(topic.type_name),
-        topic.name,
-        lambda _: None,
-        profile(qos, request=True),
-        raw=raw,
-    )
+    kind, reliability = message_class(topic.type_name), profile(qos, request=True)
+    made = node.create_subscription(kind, topic.name, lambda _: None, reliability, raw=raw)
 
     def take() -> Iterator[Any]:
         for _ in range(qos.depth):

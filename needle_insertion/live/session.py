@@ -181,13 +181,11 @@ def _converse(terminal: Terminal, screen: Screen, witness: Witness | None) -> No
         word = (line.partition('#')[0].split() or [''])[0]
         if witness is not None and word not in _AT_REST:
             witness.release()
-            witness = None
         try:
             if terminal.onecmd(line):
                 return
             if witness is not None and word == 'target':
                 witness.release()
-                witness = None
         except GraphError:
             raise
         except NeedleError as error:

@@ -144,14 +144,10 @@ class Terminal(Cmd):
     def rests(self) -> bool:
         """Whether the needle rests and no steered insertion is under way."""
         insertion = self._readings.insertion()
-        return (
-            insertion is not None
-            and abs(insertion[1]) < _REST
-            and not any(
-                isinstance(state.status, SteeringStatus) and state.status.phase not in _AT_REST
-                for state in self._operator.states.values()
-            )
-        )
+        still = insertion is not None and abs(insertion[1]) < _REST
+        states = self._operator.states.values()
+        phases = [one.status.phase for one in states if isinstance(one.status, SteeringStatus)]
+        return still and all(phase in _AT_REST for phase in phases)
 
     def stop(self) -> None:
         """Stop the needle by the nodes that still run; wait until it rests, or for a timeout."""
@@ -290,11 +286,8 @@ class Terminal(Cmd):
         return True
 
     def do_status(self, _words: list[str]) -> None:
-        states = self._operator.states
-        rows = [
-            (name, _LEVELS[min(state.level, 3)], state.message)
-            for name, state in sorted(states.items())
-        ]
+        states = sorted(self._operator.states.items())
+        rows = [(name, _LEVELS[min(one.level, 3)], one.message) for name, one in states]
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
     def _state(self, node: str) -> State:

@@ -68,11 +68,10 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
         except (MessageError, RecordingError):
             invalid[name] += 1
     losses = [*bag.losses, *(f'{n} messages of {name} are invalid' for name, n in invalid.items())]
-    plants = [name for name in messages if name.endswith('/configuration')]
     runs = [
-        RecordedRun(path, name.rpartition('/')[0], messages, losses)
-        for name in plants
-        if _configurations(messages[name])
+        RecordedRun(path, name.removesuffix('/configuration'), messages, losses)
+        for name, found in messages.items()
+        if name.endswith('/configuration') and _configurations(found)
     ]
     if not runs:
         raise RecordingError(
@@ -105,17 +104,6 @@ def _events(messages: _Messages) -> list[tuple[int, int, Event]]:
                 event = Event(status.message, content)
                 found.append((nanoseconds(message.header.stamp), number, event))
     return found
-
-
-def _trajectory(message: Any) -> Event:
-    points = message.points
-    content = {
-        'joints': list(message.joint_names),
-        'times': [seconds(point.time_from_start) for point in points],
-        'positions': [point.positions.tolist() for point in points],
-        'efforts': [point.effort.tolist() for point in points],
-    }
-    return Event(TRAJECTORY, content)
 
 
 class Rows(NamedTuple):
@@ -238,9 +226,15 @@ class RecordedRun:
         self, configurations: list[tuple[int, dict[str, Any]]], trajectories: _Messages
     ) -> Iterator[tuple[int, Event]]:
         """Yield events of a plant without recorded events, with the next sample number."""
-        found = [(received, _trajectory(message)) for received, message in trajectories]
-        if self.constants.mode == 'simulation':
-            found.clear()
+        found = list[tuple[int, Event]]()
+        for received, message in () if self.constants.mode == 'simulation' else trajectories:
+            content = {
+                'joints': list(message.joint_names),
+                'times': [seconds(point.time_from_start) for point in message.points],
+                'positions': [point.positions.tolist() for point in message.points],
+                'efforts': [point.effort.tolist() for point in message.points],
+            }
+            found.append((received, Event(TRAJECTORY, content)))
         for (_, old), (received, new) in pairwise(configurations):
             changes = {name: new[name] for name in new if new[name] != old.get(name)}
             found.append((received, Event(PARAMETERS, changes)))

@@ -46,7 +46,6 @@ class TopicComparison:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Document for JSON."""
         names = ('compared', 'differing', 'largest_difference', 'quantity', 'unit', 'verdict')
         return {name.replace('_', ' '): getattr(self, name) for name in names}
 

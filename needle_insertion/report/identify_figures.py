@@ -91,10 +91,7 @@ def friction_residuals(estimate: identification.FrictionEstimate) -> Figure:
         style: dict[str, Any] = {'color': color, 'markersize': 2.0, 'alpha': 0.5}
         over.plot(time, left, mark, label=words, **style)
         against.plot(speed, left, mark, **style)
-        often.hist(
-            residual[side], edges, color=color, histtype='step',
-            linewidth=1.4,
-        )  # fmt: skip
+        often.hist(residual[side], edges, color=color, histtype='step', linewidth=1.4)
     for axes in (over, against):
         axes.axhline(0.0, color=_FIT, linewidth=0.8)
     _label(over, 'time [s]', 'residual [mN]')
@@ -195,10 +192,8 @@ def stiffness_levels(summary: identification.StiffnessSummary) -> Figure:
         axes.axhline(0.0, color=_FIT, linewidth=0.6)
     for axes in figure.axes[2:]:
         axes.set_xlabel('force [N]')
-    figure.legend(
-        *figure.axes[0].get_legend_handles_labels(), loc='outside upper left',
-        frameon=False,
-    )  # fmt: skip
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper left', frameon=False)
     return figure
 
 

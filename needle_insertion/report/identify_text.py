@@ -186,7 +186,6 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
-    """Return the result and its origin as plain values for JSON."""
     return {
         **plain(summary),
         'settings': plain(origin.settings),

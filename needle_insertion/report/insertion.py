@@ -43,16 +43,11 @@ class InsertionRecord:
 
     def take(self, force: float) -> None:
         """Record a sample; ``force`` is the mean axial force since the previous sample [N]."""
-        one = self.one
-        (guide_x, guide_z), (tip_x, _, tip_z) = one.needle.guide, one.needle.tip
-        force_x, force_z, *torques = one.wrench
-        self._rows.append(
-            [
-                one.time, one.depth, one.velocity, force, guide_x, guide_z, one.needle.roll,
-                tip_x, tip_z, one.needle.tip_roll, force_x, force_z, *torques,
-            ]
-        )  # fmt: skip
-        self._shapes.append(one.needle.shape)
+        one, needle = self.one, self.one.needle
+        x, _, z = needle.tip
+        pose = (*needle.guide, needle.roll, x, z, needle.tip_roll)
+        self._rows.append([one.time, one.depth, one.velocity, force, *pose, *one.wrench])
+        self._shapes.append(needle.shape)
 
     @property
     def table(self) -> FloatArray:

@@ -41,9 +41,7 @@ class Origin:
 
     @property
     def failed(self) -> list[str]:
-        return [
-            reason if name in reason else f'{name}: {reason}' for name, reason in self.failures
-        ]
+        return [why if name in why else f'{name}: {why}' for name, why in self.failures]
 
     @property
     def losses(self) -> list[str]:
@@ -121,15 +119,9 @@ def identify_all(
                 assumed = () if recording is None else recording.losses
                 failures.append((str(bag), '; '.join([str(error), *assumed])))
                 continue
-            sources.append(
-                RecordingSource(
-                    name=recording.name,
-                    losses=recording.losses,
-                    clock_offset=recording.clock_offset,
-                    samples=len(recording.time),
-                    files=_digests(bag) if digest else (),
-                )
-            )
+            kept = {name: getattr(recording, name) for name in ('name', 'losses', 'clock_offset')}
+            files = _digests(bag) if digest else ()
+            sources.append(RecordingSource(**kept, samples=len(recording.time), files=files))
     return estimates, replace(
         origin, sources=tuple(sources), failures=tuple(failures), copies=tuple(copies)
     )

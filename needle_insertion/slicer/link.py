@@ -91,7 +91,6 @@ class Connection:
 
     @property
     def place(self) -> str:
-        """Configured address and port."""
         return f'{self._settings.host}:{self._settings.port}'
 
     @property
@@ -118,9 +117,8 @@ class Connection:
             return False
         if len(self._out) + len(message) > _MOST_WAITING:
             self.left_out += 1
-            self._events.add(
-                Severity.WARNING, f'{self.peer} reads too slowly: messages are left out', 'slow'
-            )
+            line = f'{self.peer} reads too slowly: messages are left out'
+            self._events.add(Severity.WARNING, line, 'slow')
             return False
         if not self._out:
             self._moved = self._steady()
@@ -146,11 +144,9 @@ class Connection:
     def _listen(self) -> None:
         if self._listener is not None or not self._is_time():
             return
-        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener = _new_socket()
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
-            listener.setblocking(False)
             listener.bind((self._settings.host, self._settings.port))
             listener.listen(_MOST_REJECTED)
         except OSError as error:
@@ -173,11 +169,8 @@ class Connection:
                 return
             if self.peer:
                 accepted.close()
-                self._events.add(
-                    Severity.WARNING,
-                    f'{host}:{port} turned away: {self.peer} is connected',
-                    'stranger',
-                )
+                line = f'{host}:{port} turned away: {self.peer} is connected'
+                self._events.add(Severity.WARNING, line, 'stranger')
             else:
                 accepted.setblocking(False)
                 self._establish(accepted, f'{host}:{port}')
@@ -187,10 +180,7 @@ class Connection:
         if coming is None:
             if not self._is_time():
                 return
-            coming = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-            coming.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
-            coming.setblocking(False)
-            self._socket = coming
+            self._socket = coming = _new_socket()
             found = coming.connect_ex((self._settings.host, self._settings.port))
             if found == EINPROGRESS:
                 return
@@ -275,6 +265,13 @@ class Connection:
             self._socket.close()
         self._socket, self.peer = None, ''
         self._out.clear()
+
+
+def _new_socket() -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
+    made.setblocking(False)
+    return made
 
 
 def _words(error: OSError) -> str:

@@ -77,7 +77,6 @@ class SlicerNode(BaseNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Read the address of the peer, and load the protocol."""
         if find_spec(_PACKAGE) is None:
             raise JobError(
                 f'the Python package {_PACKAGE} is not installed: '
@@ -255,7 +254,6 @@ class SlicerNode(BaseNode):
     # Status.
 
     def diagnose(self) -> Diagnosis[SlicerStatus]:
-        """Report the connection, the transmitted shapes and the received targets."""
         link = self._link
         if link is None or not self.is_active:
             return Diagnosis(Severity.INFO, self.state, SlicerStatus())

@@ -44,11 +44,10 @@ class NodeStates:
 
     def lines(self, now: float) -> list[str]:
         """Return a line for each node, sorted by name; nodes without a state are removed."""
-        self._states = {
-            name: state for name, state in self._states.items() if now - state[0] < _REMOVED
-        }
+        known = sorted(self._states.items())
+        self._states = {name: state for name, state in known if now - state[0] < _REMOVED}
         lines = []
-        for name, (when, level, message) in sorted(self._states.items()):
+        for name, (when, level, message) in self._states.items():
             age = now - when
             silent = f', silent for {age:.0f} s' if age > _SILENT else ''
             lines.append(f'{name} [{_LEVELS.get(level, str(level))}{silent}]: {message}')

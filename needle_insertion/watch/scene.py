@@ -54,8 +54,7 @@ def _number(parameters: Mapping[str, Any], name: str) -> float | None:
 
 def _numbers(parameters: Mapping[str, Any], name: str) -> list[float]:
     values = parameters.get(name)
-    if not isinstance(values, list):
-        return []
+    values = values if isinstance(values, list) else []
     return [float(v) for v in values if isinstance(v, (int, float)) and isfinite(v)]
 
 

@@ -13,9 +13,10 @@ Access control:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 import errno
+from functools import partial
 from hmac import compare_digest
 from ipaddress import ip_address
 import json
@@ -141,7 +142,8 @@ class Server:
         """Start to listen; `ParameterError` if the port is in use or the address is not local."""
         app = web.Application(middlewares=[self._guard], client_max_size=LONGEST)
         for path, (file, kind) in _FILES.items():
-            app.router.add_get(path, _file(file, kind))
+            content = {'text': file.read_text(encoding='utf-8'), 'content_type': kind}
+            app.router.add_get(path, partial(_answer, content))
         app.router.add_get('/frames', self._frames)
         app.on_shutdown.append(self._close)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
@@ -284,7 +286,6 @@ class _Connection:
                 return
 
     def begin(self, doing: Coroutine[Any, Any, tuple[bool, str]], what: str) -> None:
-        """Execute a command in a task and answer at its end."""
 
         async def answer() -> None:
             try:
@@ -318,13 +319,8 @@ def _break_off(request: web.Request) -> None:
         request.transport.abort()
 
 
-def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
-    text = file.read_text(encoding='utf-8')
-
-    async def answer(_request: web.Request) -> web.StreamResponse:
-        return web.Response(text=text, content_type=kind, charset='utf-8', headers=_HEADERS)
-
-    return answer
+async def _answer(content: Mapping[str, str], _request: web.Request) -> web.StreamResponse:
+    return web.Response(**content, charset='utf-8', headers=_HEADERS)  # type: ignore[arg-type]
 
 
 def _message(message: WSMessage) -> dict[str, Any]:

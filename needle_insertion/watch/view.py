@@ -141,7 +141,6 @@ class View:
             self.scene = scene(self._configurations)
 
     def status(self, status: Any, now: float) -> None:
-        """Store the status of a node at a time [s]."""
         node = node_of(status.name)
         if node in self._nodes or len(self._nodes) < _NODES:
             values = {pair.key: pair.value for pair in status.values}

@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_insertion.graph.messages import waiting
-from needle_insertion.live.operator import Operator
+from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.watch.recorded import STREAMS
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import View
@@ -32,6 +32,9 @@ _LINES: Final = contract.SENSOR._replace(depth=4)  #: QoS for needle and path of
 _PLANNED: Final = 60.0
 _CHECK: Final = 0.01
 
+#: Options of a node without a topic of its log and services of its parameters.
+_QUIET: Final[dict[str, Any]] = {'enable_rosout': False, 'start_parameter_services': False}
+
 _EVENTS: Final = 50  #: largest number of events per call
 
 #: QoS for the burst of status messages at the start.
@@ -47,9 +50,7 @@ class WatchNode(Node):
     """
 
     def __init__(self, view: View, context: Context) -> None:
-        super().__init__(
-            'watch', context=context, enable_rosout=False, start_parameter_services=False
-        )
+        super().__init__('watch', context=context, **_QUIET)
         self._view = view
         self._takers: list[tuple[Callable[[], Iterator[Any]], Callable[[Any, float], None]]] = []
         for topic in STREAMS:
@@ -96,9 +97,7 @@ class Buttons:
     """Requests of the buttons of the page, through an `Operator` in a node of its own."""
 
     def __init__(self, context: Context) -> None:
-        self._node = Node(
-            'watch_control', context=context, enable_rosout=False, start_parameter_services=False
-        )
+        self._node = Node('watch_control', context=context, **_QUIET)
         self._operator = Operator(self._node)
         self._executor = EventsExecutor(context=context)
         self._executor.add_node(self._node)
@@ -127,8 +126,8 @@ class Buttons:
         answer = self._operator.ask(what)
         # Ends without an answer, too.
         await self._spin_until(answer.done, what)
-        success, words = answer.result()
-        return bool(success), str(words)
+        outcome: RequestOutcome = answer.result()
+        return outcome
 
     def end(self) -> None:
         self._executor.remove_node(self._node)
