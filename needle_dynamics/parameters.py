@@ -12,7 +12,7 @@ from typing import Any, Final
 from needle_dynamics.friction import Friction, LAW_NUMBERS
 from needle_dynamics.tissue import Tissue
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, choice, constant, flag, from_values
+from needle_ros.settings import check_constants, choice, constant, flag, from_values, positive
 
 #: Formulations: all terms of the Euler-Lagrange equations, or the final form in the source.
 FORMULATIONS: Final = ('complete', 'as_printed')
@@ -56,15 +56,15 @@ class NeedleParameters:
 
     """
 
-    length: float = constant(0.2, 'm', 'needle length l', open_low=True)
-    density: float = constant(8000.0, 'kg/m^3', 'mass density rho of the needle', open_low=True)
-    area: float = constant(1.27e-6, 'm^2', 'effective cross-section A', open_low=True)
-    youngs_modulus: float = constant(200e9, 'Pa', "Young's modulus E", open_low=True)
-    area_moment: float = constant(
-        1.28e-13, 'm^4', 'second moment of area I_y of the cross-section', open_low=True
+    length: float = positive(0.2, 'm', 'needle length l')
+    density: float = positive(8000.0, 'kg/m^3', 'mass density rho of the needle')
+    area: float = positive(1.27e-6, 'm^2', 'effective cross-section A')
+    youngs_modulus: float = positive(200e9, 'Pa', "Young's modulus E")
+    area_moment: float = positive(
+        1.28e-13, 'm^4', 'second moment of area I_y of the cross-section'
     )
-    rotary_inertia: float = constant(
-        1.0626e-9, 'kg m^2', 'I_x, used as a mass moment of inertia about x', open_low=True
+    rotary_inertia: float = positive(
+        1.0626e-9, 'kg m^2', 'I_x, used as a mass moment of inertia about x'
     )
     carriage_mass: float = constant(0.0, 'kg', 'mass that moves with the needle base')
     tissue_stiffness: float = constant(520.0, 'N/m^2', 'tissue stiffness k_a per length')
@@ -78,7 +78,7 @@ class NeedleParameters:
         0.0, '1', 'final relative change of the tissue stiffness by swelling',
         low=-1.0, open_low=True,
     )  # fmt: skip
-    swelling_time: float = constant(1.0, 's', 'time constant of the swelling', open_low=True)
+    swelling_time: float = positive(1.0, 's', 'time constant of the swelling')
     tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
     coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
     viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
@@ -89,20 +89,15 @@ class NeedleParameters:
     breakaway_friction: float = constant(
         1.0, '1', 'ratio of friction at rest to Coulomb friction (law stribeck)', low=1.0
     )
-    stribeck_speed: float = constant(
-        1e-3,
-        'm/s',
-        'speed scale over which break-away friction decays (law stribeck)',
-        open_low=True,
+    stribeck_speed: float = positive(
+        1e-3, 'm/s', 'speed scale over which break-away friction decays (law stribeck)'
     )
-    smoothing_speed: float = constant(
-        1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)', open_low=True
+    smoothing_speed: float = positive(
+        1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)'
     )
     modes: int = field(default=2, metadata={'description': 'number of shape modes n'})
     formulation: str = choice('complete', FORMULATIONS)
-    minimum_depth: float = constant(
-        1e-3, 'm', 'insertion depth below which the model stops', open_low=True
-    )
+    minimum_depth: float = positive(1e-3, 'm', 'insertion depth below which the model stops')
     hub_stop: bool = flag(True, 'the hub stops on the skin (inelastic)')
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from math import expm1, inf
 from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.modes import ModeShapes
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, positive
 import numpy as np
 
 
@@ -28,7 +28,7 @@ class Tissue:
         0.0, '1', 'final relative increase of the stiffness over its value at time 0',
         low=-1.0, open_low=True,
     )  # fmt: skip
-    swelling_time: float = constant(1.0, 's', 'time constant of the swelling', open_low=True)
+    swelling_time: float = positive(1.0, 's', 'time constant of the swelling')
 
     def __post_init__(self) -> None:
         check_constants(self)

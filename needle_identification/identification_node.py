@@ -35,7 +35,7 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.requests import no_answer
 from needle_ros.run_node import run
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import CheckedSettings, constant, positive
 from needle_ros.status import Diagnosis, IdentificationStatus
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
@@ -57,11 +57,8 @@ class IdentificationSettings(CheckedSettings):
     """Settings of the node; each field has its meaning and unit."""
 
     level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
-    forgetting: float = constant(
-        60.0,
-        's',
-        'live: time in motion in which the weight of a sample falls to 1/e',
-        open_low=True,
+    forgetting: float = positive(
+        60.0, 's', 'live: time in motion in which the weight of a sample falls to 1/e'
     )
 
 

@@ -23,7 +23,7 @@ from needle_dynamics.steering.insertion import Insertion
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.sample_clock import SampleClock
-from needle_ros.settings import check_choice, check_constants, constant, from_values
+from needle_ros.settings import check_choice, check_constants, constant, from_values, positive
 
 #: Modes: needle under force commands, needle moved by a robot, indenter.
 MODES: Final = ('simulation', 'robot', 'indenter')
@@ -40,23 +40,21 @@ class PlantSettings:
         1.0, '1', "simulated seconds per second of the node's clock; 0: as fast as possible",
         high=100.0,
     )  # fmt: skip
-    depth: float = constant(0.02, 'm', 'initial insertion depth', open_low=True)
+    depth: float = positive(0.02, 'm', 'initial insertion depth')
     tip_deflection: float = constant(0.0, 'm', 'initial tip deflection', low=-0.1, high=0.1)
     modal: tuple[float, ...] = field(
         default=(), metadata={'description': 'initial q1 to qn [m^3/2], instead of tip_deflection'}
     )
     step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
-    command_timeout: float = constant(0.1, 's', 'age at which a command expires', open_low=True)
+    command_timeout: float = positive(0.1, 's', 'age at which a command expires')
     force_limit: float = constant(15.0, 'N', 'largest commanded force')
     torque_limit: float = constant(1.0, 'N m', 'largest commanded torque')
-    force_rate_limit: float = constant(
-        3e4, 'N/s', 'largest growth rate of a commanded force; it may end at once', open_low=True
+    force_rate_limit: float = positive(
+        3e4, 'N/s', 'largest growth rate of a commanded force; it may end at once'
     )
-    power_limit: float = constant(
-        1.5, 'W', 'largest energy supplied by commands within a second', open_low=True
-    )
-    backlog: float = constant(
-        0.05, 's', 'longest stall after which all samples are still computed', open_low=True
+    power_limit: float = positive(1.5, 'W', 'largest energy supplied by commands within a second')
+    backlog: float = positive(
+        0.05, 's', 'longest stall after which all samples are still computed'
     )
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ from math import copysign, inf, nan, sqrt
 from typing import Final
 
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import CheckedSettings, constant, positive
 from needle_ros.trajectories import check_times, JointReference
 import numpy as np
 
@@ -25,13 +25,11 @@ _LATE: Final = 1e-4  #: position error above which the base is late [m]
 class BaseParameters(CheckedSettings):
     """Limits of the motion-controlled base (the robot that moves the needle)."""
 
-    speed_limit: float = constant(0.05, 'm/s', 'highest speed of the base', open_low=True)
-    acceleration_limit: float = constant(
-        0.5, 'm/s^2', 'highest acceleration of the motion-controlled base', open_low=True
+    speed_limit: float = positive(0.05, 'm/s', 'highest speed of the base')
+    acceleration_limit: float = positive(
+        0.5, 'm/s^2', 'highest acceleration of the motion-controlled base'
     )
-    position_gain: float = constant(
-        20.0, '1/s', 'rate at which the base closes a position error', open_low=True
-    )
+    position_gain: float = positive(20.0, '1/s', 'rate at which the base closes a position error')
     encoder_resolution: float = constant(1e-6, 'm', 'length per count of the joint position')
 
 

@@ -9,7 +9,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.force_sensor import sense, straight
 from needle_ros.errors import JobError, ParameterError, ShapeError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, positive
 import numpy as np
 
 MOST_FILTERS: Final = 6  #: number of filters of the sensor, in cascade
@@ -29,16 +29,11 @@ def low_pass(cutoff: float, rate: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForceSensorParameters:
-    """
-    Constants of the sensor; zero disables an imperfection.
+    """Constants of the sensor, one number or three for x y z; zero disables an imperfection."""
 
-    Constants of forces and torques are one number, or three for x y z.
-    """
-
-    rate: float = constant(
-        HIGHEST_RATE, 'Hz', 'samples per second within the sensor', high=HIGHEST_RATE,
-        open_low=True,
-    )  # fmt: skip
+    rate: float = positive(
+        HIGHEST_RATE, 'Hz', 'samples per second within the sensor', high=HIGHEST_RATE
+    )
     filter: int = field(
         default=2,
         metadata={

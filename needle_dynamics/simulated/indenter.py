@@ -13,7 +13,7 @@ from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.measured import AT_REST, Measurement, SimulatedPlant
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant
+from needle_ros.settings import check_constants, constant, positive
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values, JointReference, Points
 import numpy as np
@@ -55,7 +55,7 @@ class IndenterParameters:
     )
     position_noise: float = constant(1e-5, 'm', 'standard deviation of white position noise')
     encoder_resolution: float = constant(1e-6, 'm', 'length per count of the position')
-    force_rate: float = constant(5.0, 'N/s', 'highest rate of the force', open_low=True)
+    force_rate: float = positive(5.0, 'N/s', 'highest rate of the force')
 
     def __post_init__(self) -> None:
         check_constants(self)

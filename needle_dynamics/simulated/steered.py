@@ -30,7 +30,7 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import CheckedSettings, positive
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import check_times, joint_values, JointReference, Points
 import numpy as np
@@ -40,15 +40,15 @@ import numpy as np
 class GuideParameters(CheckedSettings):
     """Limits of the robot that moves, tilts and rolls the needle guide."""
 
-    position_limit: float = constant(
-        0.02, 'm', 'largest position of the guide along x and z, either sign', open_low=True
+    position_limit: float = positive(
+        0.02, 'm', 'largest position of the guide along x and z, either sign'
     )
-    tilt_limit: float = constant(0.2, 'rad', 'largest tilt of the guide', open_low=True)
-    roll_limit: float = constant(100.0, 'rad', 'largest roll of the needle', open_low=True)
-    speed_limit: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
-    tilt_speed_limit: float = constant(0.2, 'rad/s', 'highest rate of the tilt', open_low=True)
-    roll_speed_limit: float = constant(10.0, 'rad/s', 'highest rate of the roll', open_low=True)
-    rise_time: float = constant(0.1, 's', 'time to accelerate to the highest speed', open_low=True)
+    tilt_limit: float = positive(0.2, 'rad', 'largest tilt of the guide')
+    roll_limit: float = positive(100.0, 'rad', 'largest roll of the needle')
+    speed_limit: float = positive(0.02, 'm/s', 'highest speed of the guide')
+    tilt_speed_limit: float = positive(0.2, 'rad/s', 'highest rate of the tilt')
+    roll_speed_limit: float = positive(10.0, 'rad/s', 'highest rate of the roll')
+    rise_time: float = positive(0.1, 's', 'time to accelerate to the highest speed')
 
     def motion(self, joint: str, gain: float) -> BaseMotion:
         """Return the motion controller of a guide joint, at rest at zero; ``gain`` is in 1/s."""

@@ -26,7 +26,7 @@ from math import exp, expm1, pi, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import CheckedSettings, constant, positive
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -41,7 +41,7 @@ class TipErrorParameters(CheckedSettings):
     slow_noise: float = constant(
         0.0, 'm', 'standard deviation of the slow noise on each axis, in addition to noise'
     )
-    slow_time: float = constant(3.0, 's', 'correlation time of the slow noise', open_low=True)
+    slow_time: float = positive(3.0, 's', 'correlation time of the slow noise')
     dropout: float = constant(0.0, '1', 'probability that a sample is lost', high=1.0)
     dropout_time: float = constant(
         0.0, 's', 'mean duration of a burst of lost samples; 0: losses are independent'
@@ -49,9 +49,7 @@ class TipErrorParameters(CheckedSettings):
     distortion: float = constant(
         0.0, 'm', 'root mean square of the field distortion on each axis, which is fixed by seed'
     )
-    distortion_length: float = constant(
-        0.05, 'm', 'correlation length of the distortion', open_low=True
-    )
+    distortion_length: float = positive(0.05, 'm', 'correlation length of the distortion')
 
 
 class SlowNoise:

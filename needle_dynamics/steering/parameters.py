@@ -9,7 +9,7 @@ from typing import Any, Final
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values
+from needle_ros.settings import check_constants, constant, from_values, positive
 import numpy as np
 
 #: Ratio of bending to torsional stiffness of a round steel needle: E I / (G J) = 1 + nu.
@@ -54,22 +54,20 @@ class SteeringParameters:
     membrane_strengths: tuple[float, ...] = constant(
         (), 'N', 'axial force that punctures each membrane', open_low=True
     )
-    membrane_stiffness: float = constant(
-        1e3, 'N/m', 'axial stiffness of a membrane until it is punctured', open_low=True
+    membrane_stiffness: float = positive(
+        1e3, 'N/m', 'axial stiffness of a membrane until it is punctured'
     )
     path_noise: float = constant(
         0.0, 'rad^2/m', 'growth of the variance of the path direction per length'
     )
-    path_noise_length: float = constant(
-        5e-3, 'm', 'correlation length of the path noise', open_low=True
-    )
+    path_noise_length: float = positive(5e-3, 'm', 'correlation length of the path noise')
     torsional_friction: float = constant(
         0.0, 'N', 'friction torque on the shaft per inserted length'
     )
-    torsional_stiffness: float = constant(
-        0.0256 / STEEL, 'N m^2', 'torsional stiffness G J of the needle', open_low=True
+    torsional_stiffness: float = positive(
+        0.0256 / STEEL, 'N m^2', 'torsional stiffness G J of the needle'
     )
-    element: float = constant(1e-3, 'm', 'longest element of the beam', open_low=True)
+    element: float = positive(1e-3, 'm', 'longest element of the beam')
 
     def __post_init__(self) -> None:
         check_constants(self)

@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_identification.estimation import ESTIMATORS
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, choice, constant
+from needle_ros.settings import check_constants, choice, positive
 
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
@@ -29,18 +29,12 @@ class FrictionSettings:
     relevant, otherwise ``ordinary``.
     """
 
-    cutoff: float = constant(
-        30.0, 'Hz', 'zero-phase low-pass filter of force and motion', open_low=True
+    cutoff: float = positive(30.0, 'Hz', 'zero-phase low-pass filter of force and motion')
+    moving_speed: float = positive(1e-5, 'm/s', 'speed above which the needle counts as moving')
+    largest_acceleration: float = positive(
+        0.2, 'm/s^2', 'acceleration up to which samples are used without inertia'
     )
-    moving_speed: float = constant(
-        1e-5, 'm/s', 'speed above which the needle counts as moving', open_low=True
-    )
-    largest_acceleration: float = constant(
-        0.2, 'm/s^2', 'acceleration up to which samples are used without inertia', open_low=True
-    )
-    stribeck_speed: float = constant(
-        1e-3, 'm/s', 'speed over which the breakaway friction decays', open_low=True
-    )
+    stribeck_speed: float = positive(1e-3, 'm/s', 'speed over which the breakaway friction decays')
     layers: tuple[float, ...] = field(
         default=(),
         metadata={
