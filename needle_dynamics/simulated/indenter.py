@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from math import hypot, nan
+from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
@@ -23,12 +24,10 @@ JOINTS = ('x', 'z')  #: joints of the indenter trajectories: the axes of the pla
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndenterParameters:
-    """
-    Constants of the tissue under the end-effector and of the robot.
+    """Constants of the tissue under the end-effector (default: Table 2) and of the robot."""
 
-    The stiffness matrix depends on the magnitude of the force: linear between the levels and
-    constant outside. The defaults are the means of Table 2.
-    """
+    # The stiffness matrix depends on the magnitude of the force: linear between levels, constant
+    # outside.
 
     force_levels: tuple[float, ...] = constant(
         (1.1, 1.2, 1.3, 1.4, 1.5), 'N', 'magnitudes of force at which the stiffness is given'
@@ -86,17 +85,12 @@ class IndenterParameters:
         return np.array(rows, dtype=np.float64).T.reshape(-1, 2, 2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Press:
+class Press(NamedTuple):
     """Measurements at the end of one sample interval."""
 
-    #: Measured position of the end-effector x y z [m], zero without force, shape (3,).
-    position: FloatArray
-    #: True force of the end-effector on the tissue along x and z [N], shape (2,).
-    force: FloatArray
-    #: Reading of the sensor: force of the end-effector on the tissue x y z [N], torque [N m],
-    #: shape (6,).
-    wrench: FloatArray
+    position: FloatArray  #: measured, of the end-effector x y z [m], zero without force, (3,)
+    force: FloatArray  #: true force on the tissue along x and z [N], shape (2,)
+    wrench: FloatArray  #: reading of the sensor: force on the tissue [N], torque [N m], (6,)
 
 
 class Indenter(SimulatedPlant):

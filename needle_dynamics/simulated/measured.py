@@ -7,8 +7,11 @@ from typing import Final, NamedTuple, TypeAlias
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.base import BaseMotion
 from needle_dynamics.simulated.force_sensor import ForceSensor
+from needle_dynamics.simulated.integrator import Integrator
 from needle_dynamics.simulated.tip_sensor import TipReading
+from needle_dynamics.steering.insertion import Insertion
 from needle_ros.contract import BASE_WRENCH, GROUND_TRUTH, JOINT_STATES, TIP_DEFLECTION, Topic
 from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
@@ -76,12 +79,9 @@ class SimulatedPlant(ABC):
     def follow(
         self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
-        """
-        Follow a trajectory, linear between its points at times from now on [s].
-
-        Positions [m or rad], or forces at the end of a push [N], are by point and joint.
-        ParameterError if a joint is unknown or cannot follow; then no joint moves.
-        """
+        """Follow a trajectory, linear between its points at times from now on [s]."""
+        # Positions [m or rad], or forces at the end of a push [N], are by point and joint.
+        # ParameterError if a joint is unknown or cannot follow; then no joint moves.
 
     @abstractmethod
     def references(self) -> dict[str, JointReference]:
@@ -100,41 +100,53 @@ class SimulatedPlant(ABC):
 
     @abstractmethod
     def change(self, parameters: NeedleParameters) -> None:
-        """
-        Change the constants of the needle, if there is one, and continue from the present state.
-
-        If the state is not valid for the new constants, the old constants are kept.
-        """
+        """Change the constants of the needle, if any; keep the old ones if they fit no longer."""
 
     @abstractmethod
     def take(self, force: float, torque: float) -> list[Measurement]:
-        """
-        Advance by one interval under force [N] and torque [N m]; return a measurement per topic.
-
-        `joint_states` is last, so that a responding node has all of them. InsertionDepthError if
-        the needle left the tissue.
-        """
+        """Advance an interval under force [N] and torque [N m]; return a measurement per topic."""
+        # `joint_states` is last, so that a responding node has all of them. InsertionDepthError if
+        # the needle left the tissue.
 
     @abstractmethod
     def outline(self) -> MeasuredShape | None:
         """Return the needle shape for display; None without a needle."""
 
 
-def velocity_text(velocity: float) -> str:
-    """Describe the motion of a needle with a velocity [m/s], '' at rest."""
-    if abs(velocity) <= AT_REST:
-        return ''
-    return f'the needle moves at {1e3 * velocity:.3g} mm/s'
+class NeedlePlant(SimulatedPlant):
+    """A plant with a needle, under a commanded force or moved along its axis by a ``base``."""
 
+    def __init__(
+        self,
+        needle: Integrator | Insertion,
+        sensor: ForceSensor,
+        rate: float,
+        base: BaseMotion | None,
+    ) -> None:
+        super().__init__(sensor, rate)
+        self._axis, self.base = needle, base
+        self._wrenches = np.zeros((sensor.samples, 6))
 
-def needle_measurements(
-    wrench: list[float], tip: TipReading | None, truth: list[float], joints: list[float]
-) -> list[Measurement]:
-    """Return the measurements of a plant with a needle; ``tip`` is None without a reading."""
-    reading = [] if tip is None else [(TIP_DEFLECTION.name, tip.age, tip.point)]
-    return [
-        (BASE_WRENCH.name, 0, wrench),
-        *reading,
-        (GROUND_TRUTH.name, 0, truth),
-        (JOINT_STATES.name, 0, joints),
-    ]
+    @property
+    def depth(self) -> float:
+        return self._axis.depth
+
+    def change(self, parameters: NeedleParameters) -> None:
+        self._axis.change(parameters)
+
+    def _motion(self) -> str:
+        velocity = self._axis.velocity
+        return '' if abs(velocity) <= AT_REST else f'the needle moves at {1e3 * velocity:.3g} mm/s'
+
+    @staticmethod
+    def _measurements(
+        wrench: list[float], tip: TipReading | None, truth: list[float], joints: list[float]
+    ) -> list[Measurement]:
+        """Return a measurement for each topic; ``tip`` is None without a reading."""
+        reading = [] if tip is None else [(TIP_DEFLECTION.name, tip.age, tip.point)]
+        return [
+            (BASE_WRENCH.name, 0, wrench),
+            *reading,
+            (GROUND_TRUTH.name, 0, truth),
+            (JOINT_STATES.name, 0, joints),
+        ]

@@ -8,18 +8,10 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.step import Interval
 from needle_dynamics.friction import Friction
-from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, on_grid, PUSHES
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.integrator import Integrator
-from needle_dynamics.simulated.measured import (
-    AT_REST,
-    MeasuredShape,
-    Measurement,
-    needle_measurements,
-    SimulatedPlant,
-    velocity_text,
-)
+from needle_dynamics.simulated.measured import AT_REST, MeasuredShape, Measurement, NeedlePlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.contract import BASE_WRENCH, ground_truth, INSERTION, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import ParameterError
@@ -31,11 +23,8 @@ _POINTS: Final = 21  #: number of points of an outline
 
 
 def _friction_gained(friction: Friction, before: float, after: float) -> float:
-    """
-    Return the difference of friction between the end and the middle of an interval [N].
-
-    The mean friction would be delayed by half an interval with respect to the velocity at the end.
-    """
+    """Return the friction at the end of an interval minus that in its middle [N]."""
+    # The mean friction would be delayed by half an interval.
     if after == 0.0:
         return 0.0
     return friction.force(after, 0.0) - friction.force(0.5 * (before + after), 0.0)
@@ -56,7 +45,7 @@ class PlantSample(NamedTuple):
     tip: TipReading | None  #: present output of the tip sensor
 
 
-class Plant(SimulatedPlant):
+class Plant(NeedlePlant):
     """
     The needle under a commanded wrench, or moved by a base that follows the joint `insertion`.
 
@@ -72,22 +61,16 @@ class Plant(SimulatedPlant):
         base: BaseMotion | None = None,
         tip: TipSensor | None = None,
     ) -> None:
-        super().__init__(sensor, rate)
+        super().__init__(integrator, sensor, rate, base)
         self.integrator = integrator
-        self.base = base
         self._tip = tip or TipSensor(TipParameters(noise=0.0), rate, 0)
         self._loads = np.empty((sensor.samples, 3))
-        self._wrenches = np.zeros((sensor.samples, 6))
         modes = integrator.model.parameters.modes
         #: Generalized forces on q1..qn, which have no command.
         self._free = [0.0] * modes
         self.topics = (
             BASE_WRENCH, TIP_DEFLECTION, ground_truth(modes, commanded=base is None), JOINT_STATES,
         )  # fmt: skip
-
-    @property
-    def depth(self) -> float:
-        return self.integrator.depth
 
     @property
     def report(self) -> PlantStatus:
@@ -104,12 +87,6 @@ class Plant(SimulatedPlant):
     def references(self) -> dict[str, JointReference]:
         return {} if self.base is None else {INSERTION: self.base.reference(self.time)}
 
-    def _motion(self) -> str:
-        return velocity_text(self.integrator.velocity)
-
-    def change(self, parameters: NeedleParameters) -> None:
-        self.integrator.change(parameters)
-
     def take(self, force: float, torque: float) -> list[Measurement]:
         sample = self.advance(force, torque)
         state = sample.state.tolist()
@@ -121,7 +98,7 @@ class Plant(SimulatedPlant):
         if self.base is None:
             # Insertion decreases d.
             state += [-force, torque, *self._free]
-        return needle_measurements(sample.wrench.tolist(), sample.tip, state, joints)
+        return self._measurements(sample.wrench.tolist(), sample.tip, state, joints)
 
     def outline(self) -> MeasuredShape:
         model = self.integrator.model
@@ -136,11 +113,7 @@ class Plant(SimulatedPlant):
         )
 
     def advance(self, force: float = 0.0, torque: float = 0.0) -> PlantSample:
-        """
-        Advance by one interval and return the measurements at its end.
-
-        The force [N] and the torque about x [N m] are ignored if a base moves the needle.
-        """
+        """Advance by one interval; force [N] and torque [N m] are ignored with a base."""
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:

@@ -6,18 +6,10 @@ from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
-from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid, PUSHES
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.measured import (
-    AT_REST,
-    MeasuredShape,
-    Measurement,
-    needle_measurements,
-    SimulatedPlant,
-    velocity_text,
-)
+from needle_dynamics.simulated.measured import AT_REST, MeasuredShape, Measurement, NeedlePlant
 from needle_dynamics.simulated.tip_sensor import TipSensor
 from needle_dynamics.steering.insertion import Insertion
 from needle_ros.contract import (
@@ -65,7 +57,7 @@ class GuideParameters(CheckedSettings):
         return BaseMotion(limits, 0.0, (-reach, reach), joint=joint, unit=unit)
 
 
-class SteeredPlant(SimulatedPlant):
+class SteeredPlant(NeedlePlant):
     """Steered needle with guide and sensors, under a commanded force or moved by a ``base``."""
 
     def __init__(
@@ -78,9 +70,8 @@ class SteeredPlant(SimulatedPlant):
         robot: BaseParameters,
         base: BaseMotion | None = None,
     ) -> None:
-        super().__init__(sensor, rate)
+        super().__init__(insertion, sensor, rate, base)
         self.insertion = insertion
-        self.base = base
         self.topics = (
             BASE_WRENCH, TIP_DEFLECTION, steered_truth(commanded=base is None), steered_states(),
         )  # fmt: skip
@@ -92,7 +83,6 @@ class SteeredPlant(SimulatedPlant):
         #: Joints in motion.
         self._moving: set[str] = set()
         self._resolution = robot.encoder_resolution if base is not None else 0.0
-        self._wrenches = np.zeros((sensor.samples, 6))
         # Fraction of each sensor sample within each push interval, shape (pushes, samples).
         begins = np.arange(sensor.samples) * (PUSHES / sensor.samples)
         pushes, longest = np.arange(PUSHES)[:, np.newaxis], PUSHES / sensor.samples
@@ -101,10 +91,6 @@ class SteeredPlant(SimulatedPlant):
         self._tip = [*insertion.needle.tip.tolist(), insertion.needle.tip_roll]
         #: Load of the guide on the needle, in the order of the guide joints.
         self._load = [0.0] * len(GUIDE_JOINTS)
-
-    @property
-    def depth(self) -> float:
-        return self.insertion.depth
 
     @property
     def report(self) -> PlantStatus:
@@ -137,10 +123,7 @@ class SteeredPlant(SimulatedPlant):
 
     def _motion(self) -> str:
         joints = ', '.join(sorted(self._moving))
-        return velocity_text(self.insertion.velocity) or (joints and f'{joints} moves')
-
-    def change(self, parameters: NeedleParameters) -> None:
-        self.insertion.change(parameters)
+        return super()._motion() or (joints and f'{joints} moves')
 
     def advance(self, force: float = 0.0) -> list[float]:
         """Advance by one interval, under a force [N] without a base; return the wrench."""
@@ -208,7 +191,7 @@ class SteeredPlant(SimulatedPlant):
             velocity, *self._velocity.values(),
             float(self._wrenches[-1, 1]), *self._load,
         ]  # fmt: skip
-        return needle_measurements(wrench, reading, truth, joints)
+        return self._measurements(wrench, reading, truth, joints)
 
     def outline(self) -> MeasuredShape:
         needle = self.insertion.needle

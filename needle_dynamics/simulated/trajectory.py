@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation of one insertion under a given force."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain, count
 from math import inf, nan
 from typing import Final
 
@@ -36,40 +37,21 @@ _TRIES: Final = 3
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory(Displayed):
-    """
-    A simulated run, sampled evenly, with dense output.
+    """A simulated run, sampled evenly, with dense output."""
 
-    Attributes
-    ----------
-    parameters : NeedleParameters
-        Constants.
-    time : ndarray, shape (k + 1,)
-        Time [s].
-    states : ndarray, shape (k + 1, 2 (2 + n))
-        States.
-    forces : ndarray, shape (k,)
-        Force over each interval [N].
-    steps : ndarray, shape (k,)
-        Longest step of the integrator in each interval, or shortest if the steps vary [s].
-    graded : bool
-        As in `Integrator`.
-    error : float
-        Difference of the samples from a run with steps twice as long or of lower order: the larger
-        of the tip deflection error relative to its largest value and the depth error relative to
-        the travel. NaN if the step was given, since there is no comparison.
-    order : int
-        Order of accuracy while the motion is smooth: 2, 4, 6 or 8.
-
-    """
-
-    parameters: NeedleParameters
-    time: FloatArray
-    states: FloatArray
-    forces: FloatArray
+    parameters: NeedleParameters  #: constants
+    time: FloatArray  #: time of the samples [s], shape (k + 1,)
+    states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
+    forces: FloatArray  #: force over each interval [N], shape (k,)
+    #: Longest step of the integrator in each interval, or shortest if the steps vary [s],
+    #: shape (k,).
     steps: FloatArray
-    graded: bool = False
+    graded: bool = False  #: as in `Integrator`
+    #: Difference of the samples from a run with steps twice as long or of lower order: the larger
+    #: of the tip deflection error relative to its largest value and the depth error relative to
+    #: the travel. NaN if the step was given, since there is no comparison.
     error: float = nan
-    order: int = 2
+    order: int = 2  #: order of accuracy while the motion is smooth: 2, 4, 6 or 8
 
     @property
     def depth(self) -> FloatArray:
@@ -245,7 +227,10 @@ def _refined(
     before: tuple[int, FloatArray] | None = None
     best, tries, error = inf, 0, inf
     exact = model.parameters.friction_law == FRICTION_LAWS[COULOMB]
-    for finer, order in _settings(ORDERS[1:] if exact and tolerance < _SMALL else ORDERS[:1]):
+    orders = ORDERS[1:] if exact and tolerance < _SMALL else ORDERS[:1]
+    # Divisions of the steps and order of the runs to compare, by rising cost.
+    rising = ((1, one) for one in orders)
+    for finer, order in chain(rising, ((2**k, orders[-1]) for k in count(1))):
         state = start.copy()
         done, left = run_refined(
             model.compiled, state, forces, interval, finer, order // 2, states, steps
@@ -264,15 +249,6 @@ def _refined(
     if done < len(forces):
         raise not_completed(model, state, left)
     return Trajectory(model.parameters, time, states, forces, steps, error=error, order=order)
-
-
-def _settings(orders: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield the divisions of the steps and the orders of the runs to compare, by rising cost."""
-    yield from ((1, order) for order in orders)
-    finer = 1
-    while True:
-        finer *= 2
-        yield finer, orders[-1]
 
 
 def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
