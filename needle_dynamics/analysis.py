@@ -68,11 +68,8 @@ def controllability(
     transform: ArrayLike | None = None,
     scaled_names: tuple[str, ...] | None = None,
 ) -> Structure:
-    """
-    Find the controllable states of (A, B), shapes (N, N) and (N, M), and the PBH distances.
-
-    The pair is in units of `LinearSystem.scaled`; ``names`` are of the states times ``transform``.
-    """
+    """Find the controllable states of (A, B), (N, N) and (N, M), and the PBH distances."""
+    # In units of `LinearSystem.scaled`; ``names`` are of the states times ``transform``.
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     order = len(names)
     if a.shape != (order, order) or b.ndim != 2 or b.shape[0] != order:

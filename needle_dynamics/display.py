@@ -66,11 +66,8 @@ class Displayed:
         return DataFrame(self.columns())
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
-        """
-        Draw the columns over the first one, by default in a new figure, and return all axes.
-
-        Components share axes, and zeros are left out.
-        """
+        """Draw the columns over the first one, by default in a new figure; return all axes."""
+        # Components share axes, and zeros are left out.
         drawn = ((name, one) for name, one in self.columns().items() if one.dtype.kind in 'fb')
         (name, abscissa), *others = drawn
         panels: dict[str, list[tuple[str, NDArray[Any]]]] = {}

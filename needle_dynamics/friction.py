@@ -92,35 +92,18 @@ def add_friction_law(name: str, law: Callable[[float, float], float]) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Friction:
-    """
-    A friction law with its constants; the defaults are those in (15).
+    """A friction law with its constants; the defaults are those in (15)."""
 
-    Attributes
-    ----------
-    law : str
-        ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
-        break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
-        velocity; a needle at rest creeps. Or the name of an `add_friction_law`.
-    coulomb, viscous : float
-        Coulomb friction mu_s [N]; viscous friction mu_v [N s/m].
-    withdrawal : float
-        Ratio of friction on withdrawal to friction on insertion.
-    breakaway : float
-        Ratio of friction at rest to mu_s (``stribeck``).
-    stribeck_speed : float
-        Speed scale over which friction decreases to mu_s [m/s] (``stribeck``).
-    smoothing_speed : float
-        Speed scale over which friction changes sign [m/s] (``tanh``).
-
-    """
-
+    #: ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
+    #: break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
+    #: velocity; a needle at rest creeps. Or the name of an `add_friction_law`.
     law: str = 'coulomb'
-    coulomb: float
-    viscous: float
-    withdrawal: float = 1.0
-    breakaway: float = 1.0
-    stribeck_speed: float = 1e-3
-    smoothing_speed: float = 1e-4
+    coulomb: float  #: Coulomb friction mu_s [N]
+    viscous: float  #: viscous friction mu_v [N s/m]
+    withdrawal: float = 1.0  #: ratio of friction on withdrawal to friction on insertion
+    breakaway: float = 1.0  #: ratio of friction at rest to mu_s (``stribeck``)
+    stribeck_speed: float = 1e-3  #: speed scale of the decrease to mu_s [m/s] (``stribeck``)
+    smoothing_speed: float = 1e-4  #: speed scale of the change of sign [m/s] (``tanh``)
 
     def __post_init__(self) -> None:
         check_choice('law', self.law, LAW_NUMBERS)
@@ -143,18 +126,11 @@ class Friction:
         )
 
     def force(self, velocity: float, drive: float) -> float:
-        """
-        Return the friction force [N], positive against insertion, at an insertion velocity [m/s].
-
-        At rest it balances ``drive``, the sum of the other forces [N], positive into the tissue.
-        """
+        """Return the friction against insertion [N]; at rest it balances ``drive`` [N]."""
+        # ``drive`` is the sum of the other forces, positive into the tissue.
         return friction_force(self.constants, float(velocity), float(drive))
 
     def slope(self, velocity: float, direction: float) -> float:
-        """
-        Return the derivative of the force with respect to the insertion velocity [N s/m].
-
-        At rest a positive ``direction`` is for insertion, otherwise for withdrawal.
-        """
+        """Return the slope by velocity [N s/m]; at rest, of insertion if ``direction`` > 0."""
         dry = dry_slope(self.constants, float(self.coulomb), abs(float(velocity)))
         return (1.0 if direction > 0.0 else self.withdrawal) * (self.viscous + dry)

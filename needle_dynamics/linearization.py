@@ -53,15 +53,12 @@ class LinearSystem:
         return ('d', 'theta', *bending) * 2
 
     def scaled(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        Return A (N, N), B (N, 2) and C (1, N) in natural (dimensionless) units.
-
-        The unit of time is 1 / omega_1 of the slowest mode of the inserted part. The unit of d and
-        of the tip deflection is the insertion depth s. Angles are in radians. One unit of force or
-        torque moves the needle or the rotor by one unit within the unit of time. The bending is
-        decomposed into its normal modes, displacement and rate in the energy norm: the state of
-        mode 1 is its root mean square deflection over s.
-        """
+        """Return A (N, N), B (N, 2) and C (1, N) in natural (dimensionless) units."""
+        # The unit of time is 1 / omega_1 of the slowest mode of the inserted part. The unit of d
+        # and of the tip deflection is the insertion depth s. Angles are in radians. One unit of
+        # force or torque moves the needle or the rotor by one unit within the unit of time. The
+        # bending is decomposed into its normal modes, displacement and rate in the energy norm:
+        # the state of mode 1 is its root mean square deflection over s.
         slowest = self.frequencies[0]
         back = np.linalg.inv(self.transform)
         return (
@@ -74,11 +71,7 @@ class LinearSystem:
 def operating_point(
     model: NeedleModel, depth: float, tip_deflection: float = 0.0, velocity: float = 0.0
 ) -> FloatArray:
-    """
-    Return the state of a needle that moves without a change of shape, at a velocity [m/s].
-
-    Depth and tip deflection [m] give the shape as in `NeedleModel.state_at`.
-    """
+    """Return the state, as `NeedleModel.state_at`, of a needle that moves at a velocity [m/s]."""
     state = model.state_at(depth, tip_deflection)
     state[model.coordinates] = -velocity
     return model.checked_state(state)

@@ -30,23 +30,12 @@ _TRUNCATION: Final = 1e-17
 
 @dataclass(frozen=True)
 class ModeShapes:
-    """
-    The first modes of a clamped-free beam of a given length, with unit norm on [0, l].
+    """The first modes of a clamped-free beam of a given length, with unit norm on [0, l]."""
 
-    Attributes
-    ----------
-    length : float
-        Needle length l [m].
-    count : int
-        Number of modes n in (10); 2 in the source.
-    reach : float
-        Largest insertion depth over l for which integrals are computed; above 1 the modes are
-        extended beyond the needle length.
-
-    """
-
-    length: float
-    count: int = 2
+    length: float  #: needle length l [m]
+    count: int = 2  #: number of modes n in (10); 2 in the source
+    #: Largest insertion depth over l for which integrals are computed; above 1 the modes are
+    #: extended beyond the needle length.
     reach: float = 1.0
 
     @cached_property
@@ -90,11 +79,8 @@ class ModeShapes:
         return np.asarray(self.scales * shape)
 
     def derivatives(self, y: ArrayLike, order: int) -> FloatArray:
-        """
-        Return derivatives of phi_i in y [m^(-1/2 - order)], shape (..., n).
-
-        There is no cancellation for high modes. Order 2 are the curvatures.
-        """
+        """Return derivatives of phi_i in y [m^(-1/2 - order)], shape (..., n)."""
+        # There is no cancellation for high modes.
         x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
         sine, cosine = np.sin(x), np.cos(x)
         mu = self.ratios

@@ -38,11 +38,8 @@ class NeedlePreset(NamedTuple):
         return self.steering != SteeringParameters()
 
     def changed(self, values: Mapping[str, Any]) -> NeedlePreset:
-        """
-        Return these constants with other values by name; one number may replace a tuple.
-
-        ``outer_diameter`` and ``inner_diameter`` [m] of a tube stand for area and area moment.
-        """
+        """Return these constants with other values by name, also the diameters of a tube [m]."""
+        # One number may replace a tuple.
         values = of_tube(values)
         known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
         for name in values:

@@ -126,11 +126,8 @@ def push(
     duration: float,
     step: float,
 ) -> float:
-    """
-    Advance under a constant force [N] for ``duration`` [s], in steps up to ``step`` [s], in place.
-
-    Returns the time left when the needle leaves the tissue [s], otherwise 0.
-    """
+    """Advance under a force [N] for ``duration`` [s] in steps up to ``step`` [s], in place."""
+    # Returns the time left when the needle leaves the tissue [s], otherwise 0.
     a = boxed.value
     left = duration
     while left > 0.0:
@@ -183,11 +180,8 @@ def carry_on(
     step: float,
     forces: Vector,
 ) -> float:
-    """
-    Advance with a ramp to ``velocity`` [m/s] over ``duration`` [s], at any force, in place.
-
-    ``forces``, shape (parts,), takes the mean force in equal parts [N]. Returns as `push`.
-    """
+    """Advance with a ramp to ``velocity`` [m/s] over ``duration`` [s], at any force, in place."""
+    # ``forces``, shape (parts,), takes the mean force in equal parts [N]. Returns as `push`.
     a = boxed.value
     rate = (velocity - state[VELOCITY]) / duration
     left = duration

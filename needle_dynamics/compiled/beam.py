@@ -190,15 +190,11 @@ def shape(
     found: FloatArray,
     guide_load: FloatArray,
 ) -> None:
-    """
-    Compute deflection and slope of the needle at its nodes, and the load on the guide.
-
-    ``last`` is the row of the node before the tip at the depth ``tip`` [m], ``ei`` the bending
-    stiffness [N m^2], ``free`` the free length between guide and entry point [m]. By plane:
-    ``guide``, shape (2, 2), position [m] and tilt of the guide; ``load``, shape (2,), lateral load
-    on the tip [N]. Outputs: ``found``, shape (last + 1, 2, 2), deflection [m] and slope by node
-    and plane; ``guide_load``, shape (2, 2), force [N] and moment [N m] on the guide by plane.
-    """
+    """Compute deflection and slope of the needle at its nodes, and the load on the guide."""
+    # ``last`` is the row of the node before the tip at the depth ``tip`` [m]. By plane: ``guide``,
+    # shape (2, 2), position [m] and tilt; ``load``, shape (2,), on the tip [N]. Outputs:
+    # ``found``, shape (last + 1, 2, 2), deflection [m] and slope by node and plane;
+    # ``guide_load``, shape (2, 2), force [N] and moment [N m] by plane.
     for plane in range(2):
         b, tilt = guide[plane, 0], guide[plane, 1]
         v, m = load[plane], 0.0

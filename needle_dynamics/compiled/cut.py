@@ -254,17 +254,13 @@ def insert(
     tips: Array3,
     forces: Array3,
 ) -> None:
-    """
-    Insert needles from the skin through sequences of poses; arrays with one row apply to all runs.
-
-    ``constants``, shape (runs, 7), are the fields of `Steered` up to ``length`` and the free
-    length; ``layers``, shape (runs, 3, layers), start, stiffness and bevel load of each layer,
-    with a start of inf for an unused layer; ``cell`` and ``wander``, shape (runs, cells, 2), as in
-    `Steered`; ``poses``, shape (runs, k, 6), the fields of `GuidePose`: the first pose places the
-    tip on the skin. ``runs``, shape (m,), are the indices of the runs to compute; ``c`` is work
-    memory. Outputs: ``tips``, shape (runs, k, 2), deflections of the tip in x and z [m];
-    ``forces`` of the needle on the guide, likewise [N], not computed if empty.
-    """
+    """Insert needles through sequences of poses; arrays with one row apply to all runs."""
+    # ``constants``, shape (runs, 7): the fields of `Steered` up to ``length``, and the free
+    # length; ``layers``, shape (runs, 3, layers): start (inf: unused), stiffness and bevel load;
+    # ``wander``, shape (runs, cells, 2); ``poses``, shape (runs, k, 6): fields of `GuidePose`, the
+    # first on the skin; ``runs``, shape (m,): indices of the runs to compute; ``c``: work memory.
+    # Outputs: ``tips``, shape (runs, k, 2), deflections in x and z [m]; ``forces`` on the guide,
+    # likewise [N], not computed if empty.
     nodes, guide_load = np.empty((len(c.springs.depths), 2, 2)), np.empty((2, 2))
     for run in runs:
         v = constants[run % len(constants)]

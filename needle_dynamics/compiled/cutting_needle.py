@@ -161,12 +161,9 @@ def compute_shape(n: Steered, c: Cut, found: FloatArray, guide_load: FloatArray)
 
 @kernel
 def solve_shape(boxed: Boxed[CuttingNeedle], found: Array3, guide_load: Matrix) -> int:
-    """
-    Compute the shape of a boxed needle and the load on the guide; return the node before the tip.
-
-    ``found``, shape (rows, 2, 2), takes deflections [m] and slopes by node and plane;
-    ``guide_load``, shape (2, 2), force [N] and moment [N m] of the needle on the guide by plane.
-    """
+    """Call `compute_shape` for a boxed needle; return the node before the tip."""
+    # ``found``, shape (rows, 2, 2), takes deflections [m] and slopes by node and plane;
+    # ``guide_load``, shape (2, 2), force [N] and moment [N m] on the guide by plane.
     return compute_shape(boxed.value.constants, boxed.value.state, found, guide_load)
 
 

@@ -28,16 +28,12 @@ def sense(
     zero: Vector,
     reading: Vector,
 ) -> None:
-    """
-    Simulate the k samples of a force sensor since its last reading, and write the last sample.
-
-    ``wrenches``, shape (k, 6), are the true wrenches at the samples [N, N m]; ``drawn``, shape (k
-    + 1, 6), standard normal numbers: noise of each sample, then the step of the offset;
-    ``constants``, shape (4, 6), standard deviations of noise and step, range, and resolution (0
-    for none) of each axis; ``sections``, shape (filters, 6), the cascade in the format of SciPy;
-    ``zero``, shape (6,), the tare. Updated: ``memory`` of the sections, shape (filters, 2, 6), in
-    transposed direct form II, and ``offset``, shape (6,). Output: ``reading``, shape (6,).
-    """
+    """Simulate the k samples of a force sensor since its last reading; write the last sample."""
+    # ``wrenches``, shape (k, 6), true means [N, N m]; ``drawn``, shape (k + 1, 6), standard normal
+    # numbers: noise of each sample, then the step of the offset; ``constants``, shape (4, 6),
+    # deviations of noise and step, range, and resolution (0 for none); ``sections``, shape
+    # (filters, 6), in the format of SciPy; ``zero``, shape (6,), the tare. Updated: ``memory`` of
+    # the sections, shape (filters, 2, 6), transposed direct form II, and ``offset``, shape (6,).
     samples = wrenches.shape[0]
     for i in range(6):
         noise, limit, count = constants[0, i], constants[2, i], constants[3, i]

@@ -44,13 +44,10 @@ class FrictionConstants(NamedTuple):
 
 @kernel
 def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[float, float]:
-    """
-    Return dry friction at a speed [N] and its derivative [N s/m], for every law.
-
-    ``coulomb`` is for the direction of motion [N]. The value at rest is the static friction limit;
-    if it is zero, the law is smooth and the needle never sticks. A law of a user has no
-    derivative here, see `dry_slope`.
-    """
+    """Return dry friction at a speed [N] and its derivative [N s/m], for every law."""
+    # ``coulomb`` is for the direction of motion [N]. The value at rest is the static friction
+    # limit; if it is zero, the law is smooth and the needle never sticks. A law of a user has no
+    # derivative here, see `dry_slope`.
     if f.law == STRIBECK:
         ratio = speed / f.stribeck_speed
         excess = (f.breakaway - 1.0) * exp(-ratio * ratio)
@@ -77,11 +74,8 @@ def dry_slope(f: FrictionConstants, coulomb: float, speed: float) -> float:
 
 @kernel
 def friction_force(f: FrictionConstants, velocity: float, drive: float) -> float:
-    """
-    Return the friction force [N], positive against insertion, of equation (15) with any dry law.
-
-    At rest it balances ``drive``, the sum of the other forces [N], up to static friction.
-    """
+    """Return the force (15) with any dry law [N], positive against insertion."""
+    # At rest it balances ``drive``, the sum of the other forces [N], up to static friction.
     dry, _ = dry_friction(f, f.coulomb, abs(velocity))
     if velocity == 0.0:
         return min(max(drive, -f.withdrawal * dry), dry)
@@ -101,13 +95,9 @@ def slide(
     withdrawal: float = 1.0,
     breakaway: float = 1.0,
 ) -> tuple[float, float]:
-    """
-    Exact flow of the insertion axis under a constant force [N] and friction (15) for a time t [s].
-
-    ``withdrawal`` is the ratio of friction on withdrawal to friction on insertion, ``breakaway``
-    the ratio of static friction to Coulomb friction. Returns velocity [m/s], exactly zero while
-    stuck, and displacement [m].
-    """
+    """Return velocity [m/s] and displacement [m] under a force [N] and friction (15), exactly."""
+    # ``withdrawal`` is the ratio of friction on withdrawal to friction on insertion, ``breakaway``
+    # that of static friction to Coulomb friction. The velocity is exactly zero while stuck.
     distance = 0.0
     if u != 0.0:
         sign = 1.0 if u > 0.0 else -1.0
@@ -137,15 +127,12 @@ def slide(
 def friction_flow(
     f: FrictionConstants, mass: float, u: float, drive: float, h: float
 ) -> tuple[float, float]:
-    """
-    Return velocity [m/s] and displacement [m] of the insertion axis after a step, for every law.
-
-    Coulomb friction is exact. Other laws with static friction use the level of dry friction in the
-    middle of a part of the step, which is of second order; a part is so short that this level is
-    nearly constant. Smooth laws are stiff: they take two implicit
-    stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977), or one stage of
-    first order where the two stages would add energy or overshoot the steady velocity.
-    """
+    """Return velocity [m/s] and displacement [m] of the axis after a step, for every law."""
+    # Coulomb friction is exact. Other laws with static friction use the level of dry friction in
+    # the middle of a part of the step, which is of second order; a part is so short that this
+    # level is nearly constant. Smooth laws are stiff: they take two implicit stages of second
+    # order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977), or one stage of first order
+    # where the two stages would add energy or overshoot the steady velocity.
     if f.law == COULOMB:
         return slide(u, drive, mass, f.coulomb, f.viscous, h, f.withdrawal)
     return _divided_flow(f, mass, u, drive, h)

@@ -35,40 +35,23 @@ class ModeTables(NamedTuple):
 
 
 class ModeIntegrals(NamedTuple):
-    """
-    The modes at the tip and their integrals over the inserted part 0 <= y <= s.
+    """The modes at the tip and their integrals over the inserted part 0 <= y <= s."""
 
-    Attributes
-    ----------
-    gram : ndarray, shape (n, n)
-        G(s), the integral of phi phi^T [1].
-    curvature_gram : ndarray, shape (n, n)
-        H(s), the integral of phi'' phi''^T [m^-4].
-    value, curvature : ndarray, shape (n,)
-        phi(s) [m^-1/2] and phi''(s) [m^-5/2].
-    area, moment : ndarray, shape (n,)
-        Integrals of phi [m^1/2] and of y phi [m^3/2].
-
-    """
-
-    gram: Matrix
-    curvature_gram: Matrix
-    value: Vector
-    curvature: Vector
-    area: Vector
-    moment: Vector
+    gram: Matrix  #: G(s), the integral of phi phi^T [1], shape (n, n)
+    curvature_gram: Matrix  #: H(s), the integral of phi'' phi''^T [m^-4], shape (n, n)
+    value: Vector  #: phi(s) [m^-1/2], shape (n,)
+    curvature: Vector  #: phi''(s) [m^-5/2], shape (n,)
+    area: Vector  #: integral of phi [m^1/2], shape (n,)
+    moment: Vector  #: integral of y phi [m^3/2], shape (n,)
 
 
 @compiled
 def mode_derivatives(
     x: float, ratio: float, rest: float, end: float
 ) -> tuple[float, float, float, float]:
-    """
-    Return phi and its first three derivatives at x = k_i y, divided by c_i k_i^order.
-
-    ``ratio`` is mu_i and ``end`` k_i l; ``rest``, (mu_i - 1) exp(k_i l), is what remains of
-    growing exponentials of (11) that nearly cancel.
-    """
+    """Return phi and its first three derivatives at x = k_i y, divided by c_i k_i^order."""
+    # ``ratio`` is mu_i and ``end`` k_i l; ``rest``, (mu_i - 1) exp(k_i l), is what remains of
+    # growing exponentials of (11) that nearly cancel.
     sine, cosine = sin(x), cos(x)
     grow = 0.5 * rest * exp(x - end)
     fall = 0.5 * (ratio + 1.0) * exp(-x)
@@ -112,11 +95,8 @@ def two_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInteg
 
 @compiled
 def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
-    """
-    Evaluate any number of modes; see `mode_integrals`.
-
-    Pairs of modes use the series where boundary values of the antiderivatives would cancel.
-    """
+    """Evaluate any number of modes; see `mode_integrals`."""
+    # Pairs of modes use the series where boundary values of the antiderivatives would cancel.
     length, modes, table = tables.length, tables.modes, tables.series
     n = modes.shape[1]
     pairs = n * (n + 1) // 2

@@ -57,12 +57,9 @@ def advance_extrapolated(
     duration: float,
     runs: int,
 ) -> float:
-    """
-    Advance a state under constant forces as `advance`, at order 2 ``runs``, in place.
-
-    The order is 2 in a block after which the needle rests, moves in another direction or is in
-    another layer than before. Returns the time left undone [s].
-    """
+    """Advance a state as `advance`, at order 2 ``runs``; return the time left undone [s]."""
+    # The order is 2 in a block after which the needle rests, moves in another direction or is in
+    # another layer than before.
     none = np.empty((0, 3))
     if runs == 1:
         return advance(c, state, time, inputs, longest, graded, duration, none)[0]
@@ -109,13 +106,9 @@ def run(
     runs: int,
     states: Matrix,
 ) -> int:
-    """
-    Advance a state through intervals of constant inputs, in place; return the completed count.
-
-    ``forces`` [N] and ``torques`` [N m] have shape (k,). ``runs`` is as in
-    `advance_extrapolated`. ``states``, shape (k + 1, 2 (2 + n)), takes the states at the ends of
-    the intervals; with a single row it is unused.
-    """
+    """Advance through intervals of constant inputs, in place; return the completed count."""
+    # ``forces`` [N] and ``torques`` [N m] have shape (k,). ``states``, shape (k + 1, 2 (2 + n)),
+    # takes the states at the ends of the intervals; with a single row it is unused.
     keep = states.shape[0] > 1
     if keep:
         for i in range(state.shape[0]):
@@ -144,17 +137,10 @@ def run_refined(
     states: Matrix,
     steps: Vector,
 ) -> tuple[int, float]:
-    """
-    Advance a state through k intervals of constant force, in place.
-
-    ``forces``, shape (k,), are the insertion forces [N], ``interval`` is in s; every step is
-    divided by ``finer``; ``runs`` is as in `advance_extrapolated`. ``states``, shape
-    (k + 1, 2 (2 + n)), takes the states at the ends of the intervals, ``steps``, shape (k,), the
-    shortest step of each interval [s].
-
-    Returns the number of completed intervals and the time left of the next interval as from
-    `advance`, 0 if all were completed.
-    """
+    """Advance through k intervals; return the completed count and the time left as `advance`."""
+    # ``forces``, shape (k,), are the insertion forces [N]; every step is divided by ``finer``.
+    # ``states``, shape (k + 1, 2 (2 + n)), takes the states at the ends of the intervals,
+    # ``steps``, shape (k,), the shortest step of each interval [s].
     n = c.modes.modes.shape[1]
     grids, rows = np.empty((2, n, n)), np.empty((4, n))
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])

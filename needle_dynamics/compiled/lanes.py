@@ -317,16 +317,12 @@ def run(
     kept: Array3,
     completed: Vector,
 ) -> None:
-    """
-    Advance needles through intervals of constant inputs.
-
-    ``needles``, shape (all or 1, 13), are the `Constants` of each run, or of all runs; ``table``,
-    shape (1 + 4 m, 26), the first columns of the series of two modes of length 1; ``runs`` the
-    indices of the runs to compute. ``states``, shape (all, 8), takes the states at the end of the
-    last interval, ``kept``, shape (all, count + 1, 8), the states at the ends of the intervals
-    (unused if it has one row per run), ``completed``, shape (all,), the number of completed
-    intervals.
-    """
+    """Advance needles through intervals of constant inputs."""
+    # ``needles``, shape (all or 1, 13), are `Constants`; ``table``, shape (1 + 4 m, 26), the first
+    # columns of the series of two modes of length 1; ``runs`` the indices of the runs to compute.
+    # Outputs: ``states``, shape (all, 8), at the end; ``kept``, shape (all, count + 1, 8), at the
+    # ends of the intervals (unused if it has one row per run); ``completed``, shape (all,),
+    # intervals.
     w = np.zeros(_ROWS * LANES)
     # Run and interval of each lane.
     which, at = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)

@@ -49,11 +49,8 @@ def backward(factor: FloatArray, x: FloatArray) -> None:
 
 @compiled
 def diagonalize(matrix: FloatArray, vectors: FloatArray) -> None:
-    """
-    Overwrite a positive definite matrix with its eigenvalues, ascending, and its eigenvectors.
-
-    Jacobi rotations keep the relative accuracy of small eigenvalues.
-    """
+    """Overwrite a positive definite matrix with its ascending eigenvalues; fill the vectors."""
+    # Jacobi rotations keep the relative accuracy of small eigenvalues.
     n = matrix.shape[0]
     for i in range(n):
         for j in range(n):

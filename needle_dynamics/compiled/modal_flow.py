@@ -125,12 +125,9 @@ def turn_pair(
     second: tuple[float, float],
     h: float,
 ) -> Turn:
-    """
-    Rotate two normal modes through a step of h [s], between two half steps of damping.
-
-    ``y`` and ``v`` are L^T q and its rate, ``decay`` the factor of half a step of damping,
-    ``first`` and ``second`` sine and cosine of the rotation angle of each mode.
-    """
+    """Rotate two normal modes through a step of h [s], between two half steps of damping."""
+    # ``y`` and ``v`` are L^T q and its rate, ``decay`` the factor of half a step of damping,
+    # ``first`` and ``second`` sine and cosine of the rotation angle of each mode.
     cj, sj, square1, square2 = m.cosine, m.sine, m.square1, m.square2
     a1 = cj * y[0] - sj * y[1]
     a2 = sj * y[0] + cj * y[1]

@@ -41,11 +41,8 @@ def modal_stiffness(
     layer: int,
     out: FloatArray,
 ) -> None:
-    """
-    Compute the modal stiffness E I_y H plus the integral of k phi phi^T [N/m], shape (n, n).
-
-    ``stiffness`` is that of the tissue at the tip [N/m^2], ``growth`` its factor by swelling.
-    """
+    """Compute E I_y H plus the integral of k phi phi^T [N/m], shape (n, n)."""
+    # ``stiffness`` is that of the tissue at the tip [N/m^2], ``growth`` its factor by swelling.
     n = out.shape[0]
     for i in range(n):
         for j in range(n):
@@ -90,10 +87,7 @@ def normal_modes(
 def coupling(
     density: float, bending: float, stiffness: float, bend: float, tip: float, rate: float
 ) -> float:
-    """
-    Return the force of the bent needle against insertion -N_d [N], the row of d of N in (13).
-
-    Half of E I_y w''^2 + k w^2 - rho A (phi q_dot)^2, with ``bend`` = phi''(s) q [1/m], ``tip`` =
-    phi(s) q [m], ``rate`` = phi(s) q_dot [m/s] and the tissue stiffness at the tip [N/m^2].
-    """
+    """Return the force of the bent needle against insertion, -N_d of (13) [N]."""
+    # Half of E I_y w''^2 + k w^2 - rho A (phi q_dot)^2, with ``bend`` = phi''(s) q [1/m], ``tip``
+    # = phi(s) q [m] and ``rate`` = phi(s) q_dot [m/s].
     return 0.5 * (bending * bend * bend + stiffness * tip * tip - density * rate * rate)

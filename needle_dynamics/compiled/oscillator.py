@@ -8,12 +8,8 @@ from needle_dynamics.compiled.cache import compiled, kernel
 
 @compiled
 def swing(damping: float, square: float, t: float) -> tuple[float, float, float, float]:
-    """
-    Solve x_ddot + damping x_dot + square x = 0 for a time t [s], exactly.
-
-    Returns pp, pv [s], vp [1/s], vv: the position after t is pp x + pv v, the velocity vp x + vv
-    v.
-    """
+    """Solve x_ddot + damping x_dot + square x = 0 for a time t [s], exactly."""
+    # Returns pp, pv [s], vp [1/s], vv: after t, x is pp x + pv v, and v is vp x + vv v.
     half = 0.5 * damping
     apart = square - half * half
     if apart >= 0.0:
@@ -32,12 +28,9 @@ def swing(damping: float, square: float, t: float) -> tuple[float, float, float,
 
 @kernel
 def decay_means(x: float) -> tuple[float, float]:
-    """
-    Return the means of an exponential decay with exponent x >= 0, without cancellation at small x.
-
-    The mean of exp(-x r) over r in [0, 1], (1 - exp(-x)) / x, and the integral over r in [0, 1] of
-    the mean over [0, r] times r, (x - 1 + exp(-x)) / x^2.
-    """
+    """Return two means of exp(-x r) for x >= 0, without cancellation at small x."""
+    # The mean over r in [0, 1], (1 - exp(-x)) / x, and the integral over r in [0, 1] of the mean
+    # over [0, r] times r, (x - 1 + exp(-x)) / x^2.
     if x < 1e-4:
         # Taylor: the next terms are below 1e-13.
         return 1.0 - x * (0.5 - x / 6.0), 0.5 - x * (1.0 / 6.0 - x / 24.0)

@@ -241,11 +241,8 @@ def _steps(  # noqa: C901
     longest: float,
     graded: bool,
 ) -> tuple[_Motion, Sums, float]:
-    """
-    Take steps through a span of time; return motion, sums and the time left undone [s].
-
-    ``gain`` is the acceleration of a moved base. The span ends at ``end`` - ``later``.
-    """
+    """Take steps through a span; return motion, sums and the time left undone [s]."""
+    # ``gain`` is the acceleration of a moved base. The span ends at ``end`` - ``later``.
     q, z, q_before, z_before = modal[0], modal[1], modal[2], modal[3]
     layers, two = c.layers, q.shape[0] == 2
     layered = layers.starts.shape[0] > 1
@@ -361,19 +358,14 @@ def advance(
     duration: float,
     loads: Matrix,
 ) -> tuple[float, Interval]:
-    """
-    Advance a state under constant inputs for ``duration`` [s], in place.
-
-    ``state`` is X = [q, q_dot], shape (2 (2 + n),), SI units; ``time`` [s] counts for swelling;
-    ``longest`` is the longest step [s]. With ``graded``, steps grow with the insertion depth above
-    a tenth of the needle length, since the modes slow down. ``loads``, shape (parts, 3) or (0, 3),
-    takes the load on the base in equal parts of the duration, at whose ends steps end: mean forces
-    along y and z [N] and mean moment about x at the base [N m], by balance of momentum.
-
-    Returns the time left undone [s], positive if the insertion depth would leave its range and NaN
-    if the state became non-finite, and the means over the interval: undefined with time left, and
-    zero loads for (0, 3).
-    """
+    """Advance a state under constant inputs for ``duration`` [s], in place."""
+    # ``state`` has shape (2 (2 + n),); ``time`` [s] counts for swelling; ``longest`` is the
+    # longest step [s], growing above a tenth of the needle length if ``graded``, since the modes
+    # slow down. ``loads``, shape (parts, 3) or (0, 3), takes the load on the base in equal parts
+    # of the duration, at whose ends steps end: mean forces along y and z [N] and mean moment about
+    # x at the base [N m], by balance of momentum. Returns the time left undone [s], positive if
+    # the insertion depth would leave its range and NaN if the state became non-finite, and the
+    # means: undefined with time left, zero loads for (0, 3).
     n = c.modes.modes.shape[1]
     # Few arrays: an allocation takes a sixth of the time of a step.
     grids, rows = np.empty((3, n, n)), np.empty((9, n))

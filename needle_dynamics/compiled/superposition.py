@@ -21,21 +21,15 @@ def insert_causes(
     tips: Matrix,
     forces: Matrix,
 ) -> None:
-    """
-    Insert a needle in one plane for m independent causes, with the same k depths for all of them.
-
-    The compliance of the needle and the transfer over an element do not depend on the cause and
-    are computed once. The force on the guide is propagated from node to node: by reciprocity, a
-    load at the end of the needle acts on the guide as the guide acts on that end.
-
-    ``ei`` is the bending stiffness [N m^2], ``skin`` the stiffness of the skin [N/m], ``free`` the
-    free length between guide and skin [m]. ``depths``, shape (k,), are the insertion depths from 0
-    [m]: an increase cuts an element, a repeated depth is at rest; ``stiffness``, shape (k,), is
-    the tissue stiffness along the element that ends at each depth [N/m^2]. By cause: ``tilts`` of
-    the guide, shape (m,); ``guides`` and ``loads``, shape (k, m), position of the guide [m] and
-    lateral load on the tip [N] at each depth. Outputs, shape (k, m): ``tips``, deflection of the
-    tip [m], and ``forces`` of the needle on the guide [N].
-    """
+    """Insert a needle in one plane for m independent causes, with the same k depths for all."""
+    # The compliance of the needle and the transfer over an element do not depend on the cause and
+    # are computed once. The force on the guide is propagated from node to node: by reciprocity, a
+    # load at the end of the needle acts on the guide as the guide acts on that end. ``depths``,
+    # shape (k,), begin at 0 [m]: an increase cuts an element, a repeated depth is at rest;
+    # ``stiffness``, shape (k,), is that of the tissue along the element that ends at each depth
+    # [N/m^2]. By cause: ``tilts``, shape (m,); ``guides`` and ``loads``, shape (k, m), position of
+    # the guide [m] and lateral load on the tip [N]. Outputs, shape (k, m): ``tips``, deflection
+    # [m], and ``forces`` on the guide [N].
     count = len(tilts)
     s = SpringSupports(
         np.empty(1), np.empty(1), np.empty((1, 3)),

@@ -75,13 +75,10 @@ class BaseMotion:
         depths: Sequence[float | None],
         forces: Sequence[float | None] = (),
     ) -> None:
-        """
-        Start a new trajectory at a time and depth, linear in time between its points.
-
-        A point without a depth (None) ends a push, during which the force changes linearly from
-        that of the previous point, zero if that was no push. A motion after a push starts at the
-        actual position of the base, a new trajectory with the force of the active push.
-        """
+        """Start a new trajectory at a time and depth, linear in time between its points."""
+        # A point without a depth (None) ends a push, during which the force changes linearly from
+        # that of the previous point, zero if that was no push. A motion after a push starts at the
+        # actual position of the base, a new trajectory with the force of the active push.
         check_times(times)
         low, high = self._range
         ends = [force for at, force in zip_longest(depths, forces) if at is None]

@@ -78,12 +78,8 @@ class Commands:
     def offer(
         self, stamp: int, frame: str, force: float, torque: float, now: int
     ) -> tuple[bool, str]:
-        """
-        Process a command; return whether it is accepted, and the error message or ''.
-
-        ``stamp`` and ``now`` in ns (stamp 0: now), ``force`` in N, ``torque`` in N m. An invalid
-        command is accepted as zero force.
-        """
+        """Process a command; return whether it is accepted, and the error message or ''."""
+        # ``stamp`` and ``now`` in ns (stamp 0: now). An invalid command is accepted as zero force.
         answers = stamp in self._samples
         stamp = stamp or now
         age = now - stamp
@@ -144,11 +140,8 @@ class Commands:
         self.newest = AppliedForces(self.newest.stamp)
 
     def count_commanders(self, number: int) -> bool:
-        """
-        Update the number of command publishers; return whether a conflict has begun or ended.
-
-        Then no force acts until the next command.
-        """
+        """Update the number of publishers; return whether a conflict has begun or ended."""
+        # Then no force acts until the next command.
         duplicates = max(0, number - 1)
         if number != self._number:
             self._number, self._answers = number, False
@@ -159,12 +152,8 @@ class Commands:
         return True
 
     def hold(self, stamp: int, distance: float = 0.0) -> None:
-        """
-        Hold the newest command until the next sample, unless it exceeds the timeout.
-
-        ``stamp`` is the time of the present sample [ns], ``distance`` the displacement of the
-        needle under the previous command [m], for the supplied energy.
-        """
+        """Hold the newest command from a stamp [ns] on, unless it exceeds the timeout."""
+        # ``distance`` is the displacement under the previous command [m], for the supplied energy.
         samples, before, newest = self._samples, self.acting.force, self.newest
         samples[stamp] = None
         while (first := next(iter(samples))) < stamp - self._timeout or first > stamp:

@@ -62,11 +62,8 @@ class SensorFault:
         self._waiting: deque[tuple[int, Reading]] = deque()
 
     def apply(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
-        """
-        Process a measurement (stamp in ns) and return the measurements to publish now.
-
-        ``biased`` are the indices of the values changed by a bias or saturation.
-        """
+        """Process a measurement (stamp in ns) and return the measurements to publish now."""
+        # ``biased`` are the indices of the values changed by a bias or saturation.
         self._calls += 1
         hit = self._random.random() < self._parameters.probability
         now = self._affected(stamp, list(values), biased) if hit else [(stamp, list(values))]

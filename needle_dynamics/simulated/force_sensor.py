@@ -141,13 +141,10 @@ class ForceSensor:
     def measure(
         self, wrench: FloatArray, *, start: FloatArray | None = None, moving: bool = False
     ) -> FloatArray:
-        """
-        Return the next reading, shape (6,): force [N] and torque [N m], x y z each.
-
-        ``wrench`` has the mean of each internal sample, shape (samples, 6), or the last sample,
-        shape (6,), with a linear change from the previous reading, or from ``start`` after a jump.
-        A reading of a ``moving`` needle is not used for the tare.
-        """
+        """Return the next reading, shape (6,): force [N] and torque [N m], x y z each."""
+        # ``wrench`` has the mean of each internal sample, shape (samples, 6), or the last sample,
+        # shape (6,), with a linear change from the previous reading, or from ``start`` after a
+        # jump. A reading of a ``moving`` needle is not used for the tare.
         wrenches = np.array(wrench, dtype=np.float64)
         if wrenches.ndim == 2 and len(wrenches) != self.samples:
             raise ShapeError(
@@ -183,11 +180,7 @@ class ForceSensor:
         return reading
 
     def tare(self) -> None:
-        """
-        Zero the sensor on the mean of the readings of the last tenth of a second.
-
-        JobError if there are not as many readings at rest since the last motion or tare.
-        """
+        """Zero on the mean of the last tenth of a second; JobError without readings at rest."""
         found, needed = len(self._resting), self._resting.maxlen
         if found != needed:
             raise JobError(f'{found} of {needed} readings at rest so far')

@@ -78,11 +78,7 @@ class Integrator:
         self.change(parameters)
 
     def change(self, parameters: NeedleParameters) -> None:
-        """
-        Change the constants and continue from the present state.
-
-        If the state is not valid for the new constants, the old constants are kept.
-        """
+        """Change the constants; the old ones are kept if the state is not valid for the new."""
         from needle_dynamics.compiled.boxed import Boxed
 
         model = NeedleModel(parameters)
@@ -132,20 +128,14 @@ class Integrator:
         return self._run(duration, Inputs(float(force), float(torque), 0.0, False), loads)
 
     def advance_moved(self, duration: float, velocity: float) -> Interval:
-        """
-        Advance for a duration [s] with a linear change of the base velocity to ``velocity`` [m/s].
-
-        The axial force is the force required by the motion, without a limit. At rest, friction
-        takes the value within its bounds that minimizes this force.
-        """
+        """Advance for a duration [s] with a linear change of the base velocity [m/s]."""
+        # The axial force is the force required by the motion, without a limit. At rest, friction
+        # takes the value within its bounds that minimizes this force.
         return self._run(duration, Inputs(0.0, 0.0, float(velocity), True), self._load)
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
-        """
-        Advance for a duration [s] under a constant base force [N], up to a speed [m/s].
-
-        At the limit the axial force is the force required by the motion.
-        """
+        """Advance for a duration [s] under a base force [N], up to a speed [m/s]."""
+        # At the limit the axial force is the force required by the motion.
         before, clock, depth = self._state.copy(), self.time, self.depth
         direction = force
         try:

@@ -120,11 +120,7 @@ class TipErrors:
         self._distorted, self._is_slow = p.distortion > 0.0, p.slow_noise > 0.0
 
     def shifted(self, x: float, y: float, z: float, interval: float) -> tuple[float, float, float]:
-        """
-        Return a tip position x, y, z [m] with slow noise and distortion.
-
-        It is in the frame of the sensor; the interval is the time since the previous sample [s].
-        """
+        """Return a position [m] with slow noise and distortion, an interval [s] after the last."""
         if not (self._distorted or self._is_slow):
             return x, y, z
         self._slow.advance(interval)

@@ -91,12 +91,9 @@ def steered(
 
 
 def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int) -> FloatArray:
-    """
-    Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2).
-
-    A load F turns the path of a long needle by F lambda / (E I) per length. Loads correlated over
-    a length turn it at random: the variance of its direction grows with its length.
-    """
+    """Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2)."""
+    # A load F turns the path of a long needle by F lambda / (E I) per length. Loads correlated
+    # over a length turn it at random: the variance of its direction grows with its length.
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')
     if steering.path_noise == 0.0:
