@@ -95,7 +95,7 @@ def element(ei: float, k: float, h: float) -> Element:
 
 
 @inlined
-def _load_transfer(
+def load_transfer(
     e: Element, c00: float, c01: float, c11: float
 ) -> tuple[float, float, float, float, float]:
     """Return W = Phi_fx C + Phi_ff, from loads at the start to loads at the end, and 1 / det W."""
@@ -110,7 +110,7 @@ def _load_transfer(
 def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
     """Return the transfer over an element; c00, c01 and c11 are the compliance at its start."""
     a = e.k / e.ei
-    w00, w01, w10, w11, inverse = _load_transfer(e, c00, c01, c11)
+    w00, w01, w10, w11, inverse = load_transfer(e, c00, c01, c11)
     # The transfer is symplectic: deflections transform with the transpose of the inverse of W.
     t00, t01, t10, t11 = w11 * inverse, -w10 * inverse, -w01 * inverse, w00 * inverse
     # Phi_xx C + Phi_xf, times the inverse of W.
@@ -176,51 +176,3 @@ def follow(s: SpringSupports, i: int, plane: int, c: Crossing) -> None:
     p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
     for k in range(2):
         s.rest[i + 1, plane, k] += p * c.value[k] + d * c.slope[k] + b * c.bend[k]
-
-
-@compiled
-def shape(
-    s: SpringSupports,
-    last: int,
-    tip: float,
-    ei: float,
-    free: float,
-    guide: FloatArray,
-    load: FloatArray,
-    found: FloatArray,
-    guide_load: FloatArray,
-) -> None:
-    """Compute deflection and slope of the needle at its nodes, and the load on the guide."""
-    # ``last`` is the row of the node before the tip at the depth ``tip`` [m]. By plane: ``guide``,
-    # shape (2, 2), position [m] and tilt; ``load``, shape (2,), on the tip [N]. Outputs:
-    # ``found``, shape (last + 1, 2, 2), deflection [m] and slope by node and plane;
-    # ``guide_load``, shape (2, 2), force [N] and moment [N m] by plane.
-    for plane in range(2):
-        b, tilt = guide[plane, 0], guide[plane, 1]
-        v, m = load[plane], 0.0
-        end = tip
-        for i in range(last, -1, -1):
-            c00, c01, c11 = s.compliance[i, 0], s.compliance[i, 1], s.compliance[i, 2]
-            w0 = s.rest[i, plane, 0] + s.response[i, 0, 0] * b + s.response[i, 0, 1] * tilt
-            t0 = s.rest[i, plane, 1] + s.response[i, 1, 0] * b + s.response[i, 1, 1] * tilt
-            # Loads at the start of the element, from the loads at its end.
-            k = s.stiffness[i]
-            e = element(ei, k, end - s.depths[i])
-            p, d, c = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
-            v -= k * (e.p1 * (w0 - p) + e.p2 * (t0 - d) - e.p3 * c)
-            m += k * (e.p2 * (w0 - p) + e.p3 * (t0 - d) - e.p4 * c)
-            w00, w01, w10, w11, inverse = _load_transfer(e, c00, c01, c11)
-            v, m = (w11 * v - w01 * m) * inverse, (w00 * m - w10 * v) * inverse
-            found[i, plane, 0] = c00 * v + c01 * m + w0
-            found[i, plane, 1] = c01 * v + c11 * m + t0
-            end = s.depths[i]
-        guide_load[plane, 0], guide_load[plane, 1] = v, m
-        if free > 0.0:
-            # The force jumps at the skin; the free length is loaded at its ends only.
-            away = found[0, plane, 0] - b - tilt * free
-            turn = found[0, plane, 1] - tilt
-            shear = 6.0 * ei / free**3 * (2.0 * away - free * turn)
-            guide_load[plane, 0] = shear
-            guide_load[plane, 1] = (
-                2.0 * ei / free * (2.0 * turn - 3.0 * away / free) + shear * free
-            )

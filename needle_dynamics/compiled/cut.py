@@ -78,21 +78,20 @@ def start(n: Steered, c: Cut, to: GuidePose, free: float) -> None:
 @inlined
 def move(n: Steered, c: Cut, to: GuidePose) -> None:
     """Move the needle to a pose in its rows, in place; guide and roll change with the depth."""
-    begun, deepest = c.pose[DEPTH], c.pose[DEEPEST]
-    x, tilt_x, z, tilt_z = c.guide[0, 0], c.guide[0, 1], c.guide[1, 0], c.guide[1, 1]
-    roll = c.pose[ROLL]
+    begun, deepest, g = c.pose[DEPTH], c.pose[DEEPEST], c.guide
+    before = GuidePose(begun, g[0, 0], g[0, 1], g[1, 0], g[1, 1], c.pose[ROLL])
     if to.depth > deepest:
         far = to.depth - begun
         if begun < deepest:
             part = (deepest - begun) / far
-            _set(n, c, to, x, tilt_x, z, tilt_z, roll, part, deepest)
+            _set(n, c, before, to, part, deepest)
             place(n, c)
         _resume(n, c)
         while True:
             last = c.counts[LAST]
             end = _next_node(n, c.springs.depths[last])
             depth = min(end, to.depth)
-            _set(n, c, to, x, tilt_x, z, tilt_z, roll, (depth - begun) / far, depth)
+            _set(n, c, before, to, (depth - begun) / far, depth)
             _cut(n, c)
             if depth == end:
                 _keep(c)
@@ -104,7 +103,7 @@ def move(n: Steered, c: Cut, to: GuidePose) -> None:
             if depth == to.depth:
                 break
     else:
-        _set(n, c, to, x, tilt_x, z, tilt_z, roll, 1.0, to.depth)
+        _set(n, c, before, to, 1.0, to.depth)
         place(n, c)
 
 
@@ -114,25 +113,14 @@ def move_boxed(boxed: Boxed[CuttingNeedle], to: GuidePose) -> None:
 
 
 @inlined
-def _set(
-    n: Steered,
-    c: Cut,
-    to: GuidePose,
-    x: float,
-    tilt_x: float,
-    z: float,
-    tilt_z: float,
-    roll: float,
-    part: float,
-    depth: float,
-) -> None:
-    """Set depth [m], and guide and roll at a fraction of the motion to the pose."""
+def _set(n: Steered, c: Cut, a: GuidePose, b: GuidePose, part: float, depth: float) -> None:
+    """Set depth [m], and guide and roll at a fraction of the motion from pose a to pose b."""
     c.pose[DEPTH] = depth
-    c.guide[0, 0] = x + part * (to.x - x)
-    c.guide[0, 1] = tilt_x + part * (to.tilt_x - tilt_x)
-    c.guide[1, 0] = z + part * (to.z - z)
-    c.guide[1, 1] = tilt_z + part * (to.tilt_z - tilt_z)
-    c.pose[ROLL] = roll + part * (to.roll - roll)
+    c.guide[0, 0] = a.x + part * (b.x - a.x)
+    c.guide[0, 1] = a.tilt_x + part * (b.tilt_x - a.tilt_x)
+    c.guide[1, 0] = a.z + part * (b.z - a.z)
+    c.guide[1, 1] = a.tilt_z + part * (b.tilt_z - a.tilt_z)
+    c.pose[ROLL] = a.roll + part * (b.roll - a.roll)
     # Friction torque holds the tip within the windup; exact at constant depth.
     torque = n.turning * depth
     windup = torque * n.twist * max(0.0, n.length - 0.5 * depth)
@@ -165,12 +153,9 @@ def _resume(n: Steered, c: Cut) -> None:
     """Restart the path at the tip if the tip was shifted since the last cut."""
     s, last = c.springs, c.counts[LAST]
     part = c.pose[DEPTH] - s.depths[last]
-    shift = 0.0
+    cut, shift = part if part > _NOTHING else 0.0, 0.0
     for plane in range(2):
-        if part > _NOTHING:
-            shift = max(shift, abs(c.tip[plane, 0] - _path_end(s, last, plane, part)))
-        else:
-            shift = max(shift, abs(c.tip[plane, 0] - s.path[last, plane, 0]))
+        shift = max(shift, abs(c.tip[plane, 0] - _path_end(s, last, plane, cut)))
     if shift <= SHIFT:
         return
     if part > _NOTHING:

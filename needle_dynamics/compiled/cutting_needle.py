@@ -14,7 +14,7 @@ from needle_dynamics.compiled.beam import (
     Crossing,
     element,
     follow,
-    shape,
+    load_transfer,
     SpringSupports,
 )
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
@@ -150,20 +150,44 @@ def guide_response(n: Steered, c: Cut, found: Matrix) -> None:
         found[1, k] = e.t10 * w + e.t11 * turn
 
 
-@inlined
+@compiled
 def compute_shape(n: Steered, c: Cut, found: FloatArray, guide_load: FloatArray) -> int:
-    """Compute the shape of the needle and the load on the guide; return the last node."""
-    depth = c.pose[DEPTH]
-    last = node_before(c.springs, c.counts[LAST], depth)
-    shape(c.springs, last, depth, n.ei, c.pose[FREE], c.guide, c.load, found, guide_load)
+    """Compute the shape and the load on the guide; return the node before the tip."""
+    # ``found``, shape (rows, 2, 2), takes deflections [m] and slopes by node and plane;
+    # ``guide_load``, shape (2, 2), force [N] and moment [N m] on the guide by plane.
+    s, free = c.springs, c.pose[FREE]
+    last = node_before(s, c.counts[LAST], c.pose[DEPTH])
+    for plane in range(2):
+        v, m, end = c.load[plane], 0.0, c.pose[DEPTH]
+        for i in range(last, -1, -1):
+            c00, c01, c11 = s.compliance[i, 0], s.compliance[i, 1], s.compliance[i, 2]
+            w0, t0 = unloaded_end(c, i, plane, 0), unloaded_end(c, i, plane, 1)
+            # Loads at the start of the element, from the loads at its end.
+            k = s.stiffness[i]
+            e = element(n.ei, k, end - s.depths[i])
+            p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
+            v -= k * (e.p1 * (w0 - p) + e.p2 * (t0 - d) - e.p3 * b)
+            m += k * (e.p2 * (w0 - p) + e.p3 * (t0 - d) - e.p4 * b)
+            w00, w01, w10, w11, inverse = load_transfer(e, c00, c01, c11)
+            v, m = (w11 * v - w01 * m) * inverse, (w00 * m - w10 * v) * inverse
+            found[i, plane, 0] = c00 * v + c01 * m + w0
+            found[i, plane, 1] = c01 * v + c11 * m + t0
+            end = s.depths[i]
+        guide_load[plane, 0], guide_load[plane, 1] = v, m
+        if free > 0.0:
+            # The force jumps at the skin; the free length is loaded at its ends only.
+            tilt = c.guide[plane, 1]
+            away = found[0, plane, 0] - c.guide[plane, 0] - tilt * free
+            turn = found[0, plane, 1] - tilt
+            shear = 6.0 * n.ei / free**3 * (2.0 * away - free * turn)
+            bend = 2.0 * n.ei / free * (2.0 * turn - 3.0 * away / free)
+            guide_load[plane, 0], guide_load[plane, 1] = shear, bend + shear * free
     return last
 
 
 @kernel
 def solve_shape(boxed: Boxed[CuttingNeedle], found: Array3, guide_load: Matrix) -> int:
-    """Call `compute_shape` for a boxed needle; return the node before the tip."""
-    # ``found``, shape (rows, 2, 2), takes deflections [m] and slopes by node and plane;
-    # ``guide_load``, shape (2, 2), force [N] and moment [N m] on the guide by plane.
+    """Call `compute_shape` for a boxed needle."""
     return compute_shape(boxed.value.constants, boxed.value.state, found, guide_load)
 
 

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Call of a friction law that a user has compiled, by its address."""
 
-from typing import Any, cast, Final, Protocol
-
-
-class _OwnLevel(Protocol):
-    def __call__(self, address: int, coulomb: float, speed: float, /) -> float:
-        """Return the dry friction at a speed [N], of the law at an address."""
+from collections.abc import Callable
+from typing import Any, cast, Final
 
 
 class _Call:
@@ -39,4 +35,5 @@ def _call_type() -> Any:
     return cpu_target.typing_context.resolve_value_type(made)
 
 
-own_level: Final = cast(_OwnLevel, _Call())
+#: Dry friction [N] of the law at an address, from Coulomb friction [N] and speed [m/s].
+own_level: Final = cast(Callable[[int, float, float], float], _Call())
