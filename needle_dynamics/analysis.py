@@ -11,6 +11,7 @@ uncontrollability.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Final
 
 from needle_dynamics.arrays import ComplexArray, FloatArray
@@ -96,12 +97,8 @@ def controllability(
     return Structure(
         order=order,
         rank=kept.shape[1],
-        lost=tuple(name for name, whole in zip(names, reached, strict=True) if not whole),
-        combined=tuple(
-            name
-            for name, whole, mixed in zip(names, reached, involved, strict=True)
-            if whole and mixed
-        ),
+        lost=tuple(compress(names, ~reached)),
+        combined=tuple(compress(names, reached & involved)),
         eigenvalues=eigenvalues,
         distances=distances,
         margin=float(inner[least]) if kept.size else 0.0,

@@ -104,11 +104,8 @@ class Bag:
             yield batch
 
     def messages(self, wanted: Callable[[BagTopic], bool]) -> Iterator[Recorded]:
-        """
-        Yield messages of the selected topics in the order of receive time.
-
-        A message stored more than 4 MB after its place in this order is yielded when it is read.
-        """
+        """Yield messages of the selected topics in the order of receive time."""
+        # A message stored more than 4 MB after its place in this order is yielded when it is read.
         waiting: list[tuple[int, int, BagTopic, bytes]] = []
         size = order = 0
         piece: tuple[Path, int] | None = None

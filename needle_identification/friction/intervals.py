@@ -6,11 +6,10 @@ The interval of a coefficient is its standard error from `score_covariance` time
 Student's t. Ratios have intervals by the delta method.
 """
 
-from dataclasses import replace
 from math import hypot, sqrt
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
+from needle_identification.estimation.estimate import estimated, ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of
@@ -27,14 +26,9 @@ def parameter_estimates(
     intervals = fit.interval()
     found = []
     for k, column in enumerate(columns):
-        parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
-        if fit.determined[k]:
-            value, error = float(fit.values[k]), float(fit.errors[k])
-            low, high = intervals[k].tolist()
-            parameter = replace(
-                parameter, value=value, error=error, interval=(low, high), determined=True
-            )
-        found.append(parameter)
+        value, error = float(fit.values[k]), float(fit.errors[k])
+        ends = (float(intervals[k, 0]), float(intervals[k, 1]))
+        found.append(estimated(column.name, column.symbol, column.unit, value, error, ends))
     if 'moving_mass' in at and 'viscous_friction' in at:
         mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
         if mass.determined and viscous.determined:

@@ -99,11 +99,8 @@ class RecursiveFriction:
         self._since_change = 0
 
     def update(self, time: float, velocity: float, force: float) -> None:
-        """
-        Add a sample: time [s], insertion velocity [m/s] and force on the needle [N].
-
-        After a gap, a backward step or a sample that is not finite, the filter restarts.
-        """
+        """Add a sample: time [s], insertion velocity [m/s] and force on the needle [N]."""
+        # After a gap, a backward step or a sample that is not finite, the filter restarts.
         if not abs(velocity) + abs(force) < inf:
             self._time = -inf
             return

@@ -14,21 +14,8 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import (
-    first_names,
-    MOTIONS,
-    read_indentation_recording,
-)
+from needle_identification.recordings import reading, tables
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
-from needle_identification.recordings.tables import (
-    friction_recording,
-    guessed,
-    is_table,
-    read_table,
-    ROLES,
-    Table,
-    with_unit,
-)
 from needle_identification.steering.columns import (
     check_depth,
     is_inverted,
@@ -108,23 +95,21 @@ def inspect_recording(path: Path | str) -> Inspection:
     'needle identify friction bags/friction_01'
 
     """
-    return _table(Path(path)) if is_table(path) else _bag(Path(path))
+    return _table(Path(path)) if tables.is_table(path) else _bag(Path(path))
 
 
 def _table(path: Path) -> Inspection:
-    table = read_table(path)
+    table = tables.read_table(path)
     roles = {
-        role: with_unit(role, spec, table.columns.get(spec, np.empty(0)))
-        for role, spec in guessed(table.columns).items()
+        role: tables.with_unit(role, spec, table.columns.get(spec, np.empty(0)))
+        for role, spec in tables.guessed(table.columns).items()
     }
     columns = tuple(_column(name, values) for name, values in table.columns.items())
     count = len(next(iter(table.columns.values())))
     content = Content(name=path.name, type_name='table', count=count, columns=columns)
     words = [f'{role} by name or unit: {spec}' for role, spec in roles.items()]
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
-    lacking = [role for role in ('time', 'force') if role not in roles]
-    if not {'depth', 'speed'} & set(roles):
-        lacking.append('depth or speed')
+    lacking = tables.missing_roles(roles)
     kind, unknown, columns_of = 'friction', '', roles
     steered = steering_columns(table)
     if lacking and {*STEERING_ROLES} - {*steered} <= {'roll'}:
@@ -136,7 +121,7 @@ def _table(path: Path) -> Inspection:
             unknown = str(error).removeprefix(f'{path}: ')
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
-        columns_of = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
+        columns_of = {role: roles.get(role, 'NAME') for role in tables.ROLES if role != 'speed'}
     elif _is_reversed(table, roles):
         columns_of = {
             role: f'-{spec}' if role in ('depth', 'speed') else spec
@@ -152,10 +137,10 @@ def _table(path: Path) -> Inspection:
     )  # fmt: skip
 
 
-def _is_reversed(table: Table, roles: Mapping[str, str]) -> bool:
+def _is_reversed(table: tables.Table, roles: Mapping[str, str]) -> bool:
     """Return whether the force opposes the motion of the base."""
     try:
-        read = friction_recording(table, roles)
+        read = tables.friction_recording(table, roles)
     except RecordingError:
         return False
     # Without its mean, which is the zero of the sensor.
@@ -182,13 +167,13 @@ class _Signal(NamedTuple):
 
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
-    topics = [topic for topic in bag.topics() if topic.type_name in (*MOTIONS, *_FORCE)]
+    topics = [topic for topic in bag.topics() if topic.type_name in (*reading.MOTIONS, *_FORCE)]
     read: dict[BagTopic, list[str]] = {}
     gathered: dict[BagTopic, Gathering] = {}
     for topic in topics:
         axes, source = list(AXES), source_of(topic.type_name, AXES)
         if topic.type_name == wire.JOINT_STATE:
-            names = dict.fromkeys(chain.from_iterable(first_names(bag, topic)))
+            names = dict.fromkeys(chain.from_iterable(reading.first_names(bag, topic)))
             axes = list(names)[:_MAX_JOINTS]
             source = EachJoint(*axes)
         if axes:
@@ -223,7 +208,7 @@ def _bag(path: Path) -> Inspection:
         words, command = _suggestion(path, signals)
     if not command:
         with suppress(NeedleError):
-            identify_stiffness(read_indentation_recording(path))
+            identify_stiffness(reading.read_indentation_recording(path))
             words = ['presses at several places and forces: stiffness can be identified']
             command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
     return Inspection(
@@ -235,7 +220,7 @@ def _bag(path: Path) -> Inspection:
 def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Return words and command for an insertion with a moved guide or a rotated needle."""
     joints = {one.axis: one for one in signals if one.topic.type_name == wire.JOINT_STATE}
-    found = {role: name for role, name in guessed(joints, USUAL).items() if role in JOINTS}
+    found = {role: name for role, name in tables.guessed(joints, USUAL).items() if role in JOINTS}
     moved = [
         role for role, least in _STEERED.items()
         if role in found and np.ptp(joints[found[role]].values) > least
@@ -261,7 +246,7 @@ def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     """Find the pair of force and motion that is most similar to friction."""
     forces = [one for one in signals if one.topic.type_name in _FORCE]
-    motions = [one for one in signals if one.topic.type_name in MOTIONS]
+    motions = [one for one in signals if one.topic.type_name in reading.MOTIONS]
     pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
     best = max(pairs, key=lambda pair: pair[0], default=None)
     if best is None or best[0] < _EXPLAINED:

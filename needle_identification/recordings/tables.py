@@ -9,7 +9,7 @@ two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
@@ -152,10 +152,7 @@ def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
     """Return force and motion of a table, as `read_friction_table`."""
     path = table.path
     specs = {**guessed(table.columns), **columns}
-    missing = [role for role in ('time', 'force') if role not in specs]
-    if not {'depth', 'speed'} & set(specs):
-        missing.append('depth or speed')
-    if missing:
+    if missing := missing_roles(specs):
         raise RecordingError(
             f'{path}: which column is {" and ".join(missing)}? It has '
             f'{", ".join(table.columns)}: use --columns {missing[0].split()[0]}=NAME,...'
@@ -182,14 +179,17 @@ def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
     )
 
 
+def missing_roles(specs: Collection[str]) -> list[str]:
+    """Return what friction needs in addition to the roles in ``specs``."""
+    either = [] if {'depth', 'speed'} & {*specs} else ['depth or speed']
+    return [role for role in ('time', 'force') if role not in specs] + either
+
+
 def guessed(
     names: Iterable[str], usual_names: Mapping[str, Sequence[str]] = _USUAL
 ) -> dict[str, str]:
-    """
-    Find names by role from usual names, in order of preference, lower case without signs.
-
-    Roles of friction are also found by unit: the only column with a unit of force is the force.
-    """
+    """Find names by role from usual names, in order of preference, lower case without signs."""
+    # Roles of friction are also found by unit: the only column with a unit of force is the force.
     plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():

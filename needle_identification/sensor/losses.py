@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fraction of lost samples and duration of bursts, from the gaps between samples."""
 
-from dataclasses import replace
 from math import exp, inf, log, log1p, nan, sqrt
 from typing import Final
 
@@ -57,9 +56,7 @@ def fit_losses(time: FloatArray) -> tuple[ParameterEstimate, ParameterEstimate]:
     by_end = -begin / whole / (1.0 - fraction) + 1.0 / (kept * log(kept))
     log_error = sqrt(by_begin**2 * variance[0] + by_end**2 * variance[1])
     ends = duration * exp(-1.96 * log_error), duration * exp(1.96 * log_error)
-    burst = replace(
-        _NO_BURSTS, value=duration, error=duration * log_error, interval=ends, determined=True
-    )
+    burst = estimated('dropout_time', 'T', 's', duration, duration * log_error, ends)
     return _dropout(fraction, error, (low, high)), burst
 
 

@@ -46,14 +46,11 @@ def read_sensor_recording(
     columns: Mapping[str, str] | None = None,
     truth_columns: Mapping[str, str] | None = None,
 ) -> SensorRecording:
-    """
-    Read a bag or a table of a tip sensor, and the true position, which may be constant [m].
-
-    ``columns`` and ``truth_columns`` are by role, of `SENSOR_ROLES`: columns of a table, see
-    `tables`; for a bag, the axes x, y or z, or joints, with a prefix ``-`` for the opposite sign.
-    The true position may be a JointState. Topics are by default the only ones of their types, or
-    end with tip_deflection. Otherwise as `read_friction_recording`.
-    """
+    """Read a bag or a table of a tip sensor, and the true position, which may be constant [m]."""
+    # ``columns`` and ``truth_columns`` are by role, of `SENSOR_ROLES`: columns of a table, see
+    # `tables`; for a bag, the axes x, y or z, or joints, with a prefix ``-`` for the opposite
+    # sign. The true position may be a JointState. Topics are by default the only ones of their
+    # types, or end with tip_deflection. Otherwise as `read_friction_recording`.
     axes = tuple(axes)
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
         raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
