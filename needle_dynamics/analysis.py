@@ -237,13 +237,14 @@ def controllability_map(
     results = np.empty((5, depths.size, deflections.size))
     for i, depth in enumerate(depths):
         for j, deflection in enumerate(deflections):
-            state = operating_point(model, depth, deflection, velocity)
-            found = analyze(linearize(model, state, force, sliding=sliding))
+            point = operating_point(model, depth, deflection, velocity)
+            found = analyze(linearize(model, point, force, sliding=sliding))
+            state, seen = found.state, found.observed
             results[:, i, j] = (
-                found.state.rank,
-                found.state.distance,
-                found.observed.rank,
-                found.observed.margin,
+                state.rank,
+                state.distance,
+                seen.rank,
+                seen.margin,
                 found.output_gain,
             )
         if progress is not None:

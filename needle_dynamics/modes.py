@@ -85,12 +85,8 @@ class ModeShapes:
         sine, cosine = np.sin(x), np.cos(x)
         mu = self.ratios
         # d/dx maps sin to cos, cos to -sin, exp(x) to itself and exp(-x) to -exp(-x).
-        turned = (
-            sine - mu * cosine,
-            cosine + mu * sine,
-            -sine + mu * cosine,
-            -cosine - mu * sine,
-        )[order % 4]
+        even, odd = sine - mu * cosine, cosine + mu * sine
+        turned = (even, odd, -even, -odd)[order % 4]
         grow = 0.5 * self._rests * np.exp(x - self.arguments)
         fall = 0.5 * (mu + 1.0) * np.exp(-x) * (-1.0) ** order
         return np.asarray(self.scales * self.wavenumbers**order * (turned + grow + fall))

@@ -13,10 +13,7 @@ from needle_dynamics.compiled.friction import slide
 if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
-#: Indices of the axis state.
-DEPTH: Final = 0
-VELOCITY: Final = 1
-DEEPEST: Final = 2
+DEPTH, VELOCITY, DEEPEST = range(3)  #: Indices of the axis state.
 
 _HALVINGS: Final = 60  #: bisections of an event time: to the last digit of a step
 

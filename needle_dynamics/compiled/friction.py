@@ -18,9 +18,7 @@ from needle_dynamics.compiled.own_law import own_level
 #: Names of the laws; the index is the number of the law.
 FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
 
-COULOMB: Final = 0
-STRIBECK: Final = 1
-TANH: Final = 2
+COULOMB, STRIBECK, TANH = range(3)
 
 #: Largest change of dry friction in a part of a step, relative to static friction, and relative to
 #: Coulomb friction under a smooth law.

@@ -192,15 +192,10 @@ def _rotate(w: FloatArray, n: int) -> None:
         g11 = fifth * _powers(w, 0, i, xi)
         g12 = fifth * _powers(w, 3, i, xi)
         g22 = fifth * _powers(w, 6, i, xi)
-        m = normal_pair(
-            rho,
-            g11,
-            g12,
-            g22,
-            ei * (xi * _powers(w, 9, i, xi)) + ka * g11,
-            ei * (xi * _powers(w, 12, i, xi)) + ka * g12,
-            ei * (xi * _powers(w, 15, i, xi)) + ka * g22,
-        )
+        k11 = ei * (xi * _powers(w, 9, i, xi)) + ka * g11
+        k12 = ei * (xi * _powers(w, 12, i, xi)) + ka * g12
+        k22 = ei * (xi * _powers(w, 15, i, xi)) + ka * g22
+        m = normal_pair(rho, g11, g12, g22, k11, k12, k22)
         v1 = w[_Z1 + i] * m.i11
         v2 = (w[_Z2 + i] - m.l21 * v1) * m.i22
         x = 0.5 * h * w[_DAMPING + i] / rho

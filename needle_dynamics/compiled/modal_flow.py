@@ -194,15 +194,10 @@ def rotate_two(
     growth = e.growth
     q1, q2, z1, z2 = q[0], q[1], z[0], z[1]
     gram, curved = at.gram, at.curvature_gram
-    m = normal_pair(
-        rho,
-        gram[0, 0],
-        gram[0, 1],
-        gram[1, 1],
-        ei * curved[0, 0] + ka * gram[0, 0] + growth * layers.gram[layer, 0, 0],
-        ei * curved[0, 1] + ka * gram[0, 1] + growth * layers.gram[layer, 0, 1],
-        ei * curved[1, 1] + ka * gram[1, 1] + growth * layers.gram[layer, 1, 1],
-    )
+    k11 = ei * curved[0, 0] + ka * gram[0, 0] + growth * layers.gram[layer, 0, 0]
+    k12 = ei * curved[0, 1] + ka * gram[0, 1] + growth * layers.gram[layer, 0, 1]
+    k22 = ei * curved[1, 1] + ka * gram[1, 1] + growth * layers.gram[layer, 1, 1]
+    m = normal_pair(rho, gram[0, 0], gram[0, 1], gram[1, 1], k11, k12, k22)
     if e.as_printed:
         v1 = m.l11 * z1 + m.l21 * z2
         v2 = m.l22 * z2

@@ -132,13 +132,9 @@ class Store:
         return str(writable_folder())
 
     def enable(self) -> None:
-        """Do nothing: always enabled."""
+        """Do nothing: always enabled, and entries do not become invalid."""
 
-    def disable(self) -> None:
-        """Do nothing: always enabled."""
-
-    def flush(self) -> None:
-        """Do nothing: entries do not become invalid."""
+    disable = flush = enable
 
     def has(self, signature: Any, target_context: Any) -> bool:
         """Return whether a folder contains an entry for a signature on a target."""

@@ -9,14 +9,11 @@ from needle_dynamics.compiled.cache import compiled, inlined
 
 
 class Layers(NamedTuple):
-    """
-    Tissue layers, and the contributions of the layers above to the integrals of the modes.
+    """Tissue layers, and the contributions of the layers above to the integrals of the modes."""
 
-    With the tip in layer m, the integrals of k phi phi^T, k phi and k y phi are its stiffness
-    times the integrals without k, plus row m of ``gram``, ``area`` and ``moment``, all times the
-    swelling.
-    """
-
+    # With the tip in layer m, the integrals of k phi phi^T, k phi and k y phi are its stiffness
+    # times the integrals without k, plus row m of ``gram``, ``area`` and ``moment``, all times
+    # the swelling.
     starts: Vector  #: depths at which the layers begin [m], the first 0, shape (m,)
     stiffnesses: Vector  #: stiffness of each layer per length [N/m^2], shape (m,)
     gram: Array3  #: addition to the integral of k phi phi^T [N/m^2], shape (m, n, n)
