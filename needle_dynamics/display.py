@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 _SHOWN: Final = {'m': ('mm', 1e3), 'm/s': ('mm/s', 1e3), 'rad': ('deg', 180.0 / np.pi)}
 
 _MOST_ROWS: Final = 20  #: largest number of rows of a table that is shown completely
-_AXIS: Final = re.compile(
-    r'([._][xyzw]|_measured|_fitted|\[?\d+\]?)$'
-)  # end of the name of a component
+#: End of the name of a component.
+_AXIS: Final = re.compile(r'([._][xyzw]|_measured|_fitted|\[?\d+\]?)$')
 
 
 class Displayed:

@@ -28,12 +28,10 @@ class StuckError(NeedleError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinearSystem:
-    """
-    Linear system (19) at one operating point, SI units.
+    """Linear system (19) at one operating point, SI units, of order N = 2 (2 + n)."""
 
-    With the deviations x of the state, u = [f_y, tau] of the inputs and y of the tip deflection,
-    x_dot = drift + A x + B u and y = C x + D u. The order N is 2 (2 + n).
-    """
+    # With the deviations x of the state, u = [f_y, tau] of the inputs and y of the tip deflection,
+    # x_dot = drift + A x + B u and y = C x + D u.
 
     A: FloatArray  #: state matrix, shape (N, N)
     B: FloatArray  #: input matrix, shape (N, 2)

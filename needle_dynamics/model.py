@@ -56,11 +56,6 @@ class NeedleModel:
     is the insertion force f_y at the base [N], positive into the tissue, ``torque`` is tau about x
     [N m]. The methods raise ShapeError or InsertionDepthError if a state is not valid.
 
-    Attributes
-    ----------
-    parameters : NeedleParameters
-        Constants, SI units.
-
     Examples
     --------
     A needle at rest at an insertion depth of 5 cm with a tip deflection of 1 mm:
@@ -75,7 +70,7 @@ class NeedleModel:
 
     """
 
-    parameters: NeedleParameters
+    parameters: NeedleParameters  #: constants, SI units
 
     @cached_property
     def modes(self) -> ModeShapes:

@@ -63,12 +63,6 @@ class PlayerNode(BaseNode):
     plays the next message. With ``publish_clock`` the recorded time is published on /clock, and a
     recorded /clock is not played. ``system_state`` and ``emergency_stop`` are played only if
     ``topics`` names them: a recorded request must not move or stop a needle.
-
-    Attributes
-    ----------
-    at_end : callable
-        Called after the last message; ``main`` ends the process.
-
     """
 
     LIVE = frozenset({'rate'})
@@ -82,6 +76,7 @@ class PlayerNode(BaseNode):
         self.declare_text('paused', False, 'start paused')
         self.declare_text('publish_clock', False, 'publish the recorded time on /clock')
         self.declare_text('exit_at_end', True, 'end the process when all is played')
+        #: Called after the last message; ``main`` ends the process.
         self.at_end: Callable[[], None] = lambda: None
         self._outputs: dict[str, Publisher] = {}
         self._clock_publisher: Publisher | None = None

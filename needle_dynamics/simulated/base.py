@@ -39,11 +39,7 @@ def on_grid(value: float, resolution: float) -> float:
 
 
 class BaseMotion:
-    """
-    Tracking of trajectories of a joint, or pushing with a force, within limits.
-
-    ``depth`` [m] is held until a trajectory arrives; ``joint`` and ``unit`` are for messages.
-    """
+    """Tracking of trajectories of a joint, or pushing with a force, within limits."""
 
     def __init__(
         self,
@@ -54,6 +50,7 @@ class BaseMotion:
         joint: str = 'trajectory',
         unit: str = 'm',
     ) -> None:
+        # ``depth`` is held until a trajectory arrives; ``joint`` and ``unit`` are for messages.
         self.limits = parameters
         self._joint, self._unit = joint, unit
         self._range = reach

@@ -17,21 +17,13 @@ class AppliedForces(NamedTuple):
 
 
 class Commands:
-    """
-    Zero-order hold of force commands with timeout, limits and detection of several sources.
+    """Zero-order hold of force commands with timeout, limits and detection of several sources."""
 
-    The newest command at a sample acts until the next sample. A command is accepted if its stamp
-    is within the timeout of the present time and not older than the newest stamp. It counts as
-    zero force if it is invalid, when it exceeds the timeout, while several nodes publish commands,
-    and while commands have supplied too much energy. A force may end at once, but its growth rate
-    is limited.
-
-    The stamp is the only identification of the sender: a command with the stamp of a sample
-    responds to this sample. After such a response, a force with any other stamp is from another
-    node, however short its lifetime, and is rejected until the number of nodes changes.
-
-    Arguments are in s, N, N m, N/s and W; force and torque limits apply to either sign.
-    """
+    # The newest command at a sample acts until the next sample. A command is accepted if its stamp
+    # is within the timeout of the present time and not older than the newest stamp. It counts as
+    # zero force if it is invalid, when it exceeds the timeout, while several nodes publish
+    # commands, and while commands have supplied too much energy. A force may end at once, but its
+    # growth rate is limited. Arguments are in s, N, N m, N/s and W; limits apply to either sign.
 
     def __init__(
         self,
@@ -80,6 +72,9 @@ class Commands:
     ) -> tuple[bool, str]:
         """Process a command; return whether it is accepted, and the error message or ''."""
         # ``stamp`` and ``now`` in ns (stamp 0: now). An invalid command is accepted as zero force.
+        # The stamp is the only identification of the sender: a command with the stamp of a sample
+        # responds to this sample. After such a response, a force with any other stamp is from
+        # another node, however short its lifetime, and is rejected until their number changes.
         answers = stamp in self._samples
         stamp = stamp or now
         age = now - stamp

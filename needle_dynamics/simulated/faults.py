@@ -35,19 +35,15 @@ class FaultParameters(CheckedSettings):
     )  # fmt: skip
 
 
-#: Kinds of faults, see `SensorFault`.
+#: Kinds of faults: ``drop`` discards measurements, ``delay`` publishes them later, ``duplicate``
+#: publishes them twice, ``reorder`` after the next one, ``freeze`` repeats the values of the first
+#: affected measurement with new stamps, ``bias`` adds to the values, ``nan`` replaces them by NaN,
+#: and ``saturate`` limits them.
 FAULTS: Final = ('drop', 'delay', 'duplicate', 'reorder', 'freeze', 'bias', 'nan', 'saturate')
 
 
 class SensorFault:
-    """
-    A fault of one measurement stream, with ``rate`` measurements per second [Hz].
-
-    Kinds: ``drop`` discards measurements, ``delay`` publishes them later, ``duplicate`` publishes
-    them twice, ``reorder`` after the next one, ``freeze`` repeats the values of the first affected
-    measurement with new stamps, ``bias`` adds to the values, ``nan`` replaces them by NaN, and
-    ``saturate`` limits them.
-    """
+    """A fault of one measurement stream, with ``rate`` measurements per second [Hz]."""
 
     def __init__(self, kind: str, parameters: FaultParameters, rate: float, seed: int) -> None:
         if kind not in FAULTS:

@@ -102,13 +102,11 @@ class ForceSensorParameters:
 
 
 class ForceSensor:
-    """
-    Force-torque sensor at the needle base: converts true wrenches to readings.
+    """Force-torque sensor at the needle base: converts true wrenches to readings."""
 
-    The internal sample rate is a multiple of the reading rate [Hz]. Offset and noise, of a seed,
-    are added to each sample, which then saturates and passes a cascade of second-order Butterworth
-    filters. A reading is the last sample, minus the tare value, rounded to counts.
-    """
+    # Offset and noise, of a seed, are added to each internal sample, which then saturates and
+    # passes a cascade of second-order Butterworth filters. A reading is the last sample, minus
+    # the tare value, rounded to counts.
 
     _DRAWN = 16384  #: size of a block of random numbers
 

@@ -94,12 +94,7 @@ class Press(NamedTuple):
 
 
 class Indenter(SimulatedPlant):
-    """
-    Indent the tissue with a commanded force in the plane, one sample at a time.
-
-    A trajectory has efforts of the joints `x` and `z` [N] and no positions; it is linear in time
-    from the present force. The force limit is for each axis [N], the rate is in Hz.
-    """
+    """Indent the tissue with a commanded force in the plane, one sample at a time."""
 
     depth = 0.0  #: insertion depth; there is no needle
 
@@ -119,7 +114,7 @@ class Indenter(SimulatedPlant):
         self._entries = parameters.matrices.reshape(-1, 4).T
         # Independent of the random sequence of the force sensor.
         self._rng = np.random.default_rng([seed, 1])
-        self._force_limit = force_limit
+        self._force_limit = force_limit  # of each axis [N]
         self._force = np.zeros(2)
         self._moving = False
         self._times = np.array([0.0])
@@ -133,6 +128,7 @@ class Indenter(SimulatedPlant):
     def follow(
         self, joints: Sequence[str], times: Sequence[float], positions: Points, efforts: Points
     ) -> None:
+        # Efforts [N] without positions; linear in time from the present force.
         check_times(times)
         if any(len(point) for point in positions):
             raise ParameterError('the indenter takes efforts, not positions')

@@ -44,13 +44,6 @@ class Integrator:
         Let the step grow with the insertion depth once it exceeds a tenth of the needle length:
         the modal frequencies decrease with its square.
 
-    Attributes
-    ----------
-    model : NeedleModel
-        The needle.
-    time : float
-        Time [s], initially 0; used for swelling tissue.
-
     Examples
     --------
     >>> from needle_dynamics import Integrator, NeedleModel, NeedleParameters
@@ -72,7 +65,7 @@ class Integrator:
     ) -> None:
         self.step = checked_step(step)
         self.graded = graded
-        self.time = 0.0
+        self.time = 0.0  #: time [s], used for swelling tissue
         self._state = np.array(state)
         self._load = np.empty((1, 3))
         self.change(parameters)
@@ -83,7 +76,7 @@ class Integrator:
 
         model = NeedleModel(parameters)
         self._state = model.checked_state(self._state)
-        self.model = model
+        self.model = model  #: the needle
         self._needle, self._boxed = model.compiled, Boxed(model.compiled)
         self._middle = model.coordinates
 

@@ -46,15 +46,12 @@ class Asked(NamedTuple):
 
 
 class JointCommands:
-    """
-    Parser of successive `joint_commands` messages, for a period and a command timeout [s].
-
-    The hardware interface sends all interfaces at its own rate: a value not yet set is NaN and has
-    no effect, but a number must remain a number. A position is the end of a linear motion since
-    the last message. A velocity without a position lasts for the timeout.
-    """
+    """Parser of successive `joint_commands` messages, for a period and a command timeout [s]."""
 
     def __init__(self, mode: str, *, steered: bool, shortest: float, longest: float) -> None:
+        # The hardware interface sends all interfaces at its own rate: a value not yet set is NaN
+        # and has no effect, but a number must remain a number. A position is the end of a linear
+        # motion since the last message. A velocity without a position lasts for the timeout.
         moved, pushed = moved_joints(mode, steered=steered), tuple[str, ...]()
         if mode == 'simulation':
             pushed = (INSERTION,) if steered else (INSERTION, ROTATION)

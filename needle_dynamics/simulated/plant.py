@@ -46,12 +46,7 @@ class PlantSample(NamedTuple):
 
 
 class Plant(NeedlePlant):
-    """
-    The needle under a commanded wrench, or moved by a base that follows the joint `insertion`.
-
-    The rate is in Hz; without a ``base`` the commanded wrench acts, without a ``tip`` sensor the
-    tip deflection is exact.
-    """
+    """The needle under a commanded wrench, or moved by a base with the joint `insertion`."""
 
     def __init__(
         self,
@@ -63,6 +58,7 @@ class Plant(NeedlePlant):
     ) -> None:
         super().__init__(integrator, sensor, rate, base)
         self.integrator = integrator
+        # Without a sensor, the tip deflection is exact.
         self._tip = tip or TipSensor(TipParameters(noise=0.0), rate, 0)
         self._loads = np.empty((sensor.samples, 3))
         modes = integrator.model.parameters.modes

@@ -62,10 +62,10 @@ class SlowNoise:
     def advance(self, interval: float) -> None:
         """Advance by an interval [s]."""
         step = interval / self._time
-        new = (
-            sqrt(-expm1(-2.0 * step)) * self._size * self._random.standard_normal(self.value.shape)
+        size = sqrt(-expm1(-2.0 * step)) * self._size
+        self.value = exp(-step) * self.value + size * self._random.standard_normal(
+            self.value.shape
         )
-        self.value = exp(-step) * self.value + new
 
 
 class BurstLosses:
@@ -100,11 +100,7 @@ class Distortion:
 
 
 class TipErrors:
-    """
-    Errors of a tip sensor in time and space, independent of its white noise.
-
-    ``random`` is for slow noise and distortion, ``losses`` for lost samples, one number each.
-    """
+    """Errors of a tip sensor in time and space, independent of its white noise."""
 
     def __init__(
         self,
@@ -113,10 +109,11 @@ class TipErrors:
         losses: np.random.Generator,
     ) -> None:
         p = parameters
+        # ``losses`` gives one number for each sample, lost or not.
         # First, so that the field depends on its own constants and the seed only.
         self._field = Distortion(p.distortion, p.distortion_length, random)
         self._slow = SlowNoise(p.slow_noise, p.slow_time, random, 3)
-        self._losses = BurstLosses(p.dropout, p.dropout_time, losses)
+        self.lost = BurstLosses(p.dropout, p.dropout_time, losses).lost
         self._distorted, self._is_slow = p.distortion > 0.0, p.slow_noise > 0.0
 
     def shifted(self, x: float, y: float, z: float, interval: float) -> tuple[float, float, float]:
@@ -129,7 +126,3 @@ class TipErrors:
             shifted += self._field.error((x, y, z))
         x, y, z = shifted.tolist()
         return x, y, z
-
-    def lost(self, interval: float) -> bool:
-        """Return whether the sample is lost, an interval [s] after the previous sample."""
-        return self._losses.lost(interval)

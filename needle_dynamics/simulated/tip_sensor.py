@@ -27,9 +27,10 @@ class TipParameters(TipErrorParameters):
         0.0, 'rad', 'rotation of the measured x and z about y', low=-pi, high=pi
     )
     slice: float = constant(
-        0.0, 'm', 'half the thickness of the y-z slice of an imager, which reports x = 0. '
-        '0: tracker',
-    )  # fmt: skip
+        0.0,
+        'm',
+        'half the thickness of the y-z slice of an imager, which reports x = 0. 0: tracker',
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -52,16 +53,13 @@ class TipReading(NamedTuple):
 
 
 class TipSensor:
-    """
-    Convert mean tip deflections to delayed, noisy measurements.
-
-    A ``spatial`` sensor measures three coordinates with noise and averages the depth, another only
-    the deflection in the plane of the source's needle.
-    """
+    """Convert mean tip deflections to delayed, noisy measurements."""
 
     def __init__(
         self, parameters: TipParameters, rate: float, seed: int, *, spatial: bool = False
     ) -> None:
+        # A ``spatial`` sensor measures three coordinates with noise and averages the depth,
+        # another only the deflection in the plane of the source's needle.
         self._parameters, self._spatial = parameters, spatial
         #: Plant samples per sensor sample; a sensor sample ends at the nearest plant sample.
         self._every = rate / parameters.rate if parameters.rate else 1.0

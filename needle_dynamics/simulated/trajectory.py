@@ -43,9 +43,7 @@ class Trajectory(Displayed):
     time: FloatArray  #: time of the samples [s], shape (k + 1,)
     states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
     forces: FloatArray  #: force over each interval [N], shape (k,)
-    #: Longest step of the integrator in each interval, or shortest if the steps vary [s],
-    #: shape (k,).
-    steps: FloatArray
+    steps: FloatArray  #: longest step in each interval, or shortest if they vary [s], shape (k,)
     graded: bool = False  #: as in `Integrator`
     #: Difference of the samples from a run with steps twice as long or of lower order: the larger
     #: of the tip deflection error relative to its largest value and the depth error relative to

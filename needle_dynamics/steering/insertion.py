@@ -71,15 +71,6 @@ class Insertion(Displayed):
     seed : int
         Seed of the path noise.
 
-    Attributes
-    ----------
-    needle : SteeredNeedle
-        Lateral model of the needle.
-    axis : AxisConstants
-        Constants along the axis.
-    time : float
-        Time [s], initially 0.
-
     Examples
     --------
     >>> from needle_dynamics import Insertion, NeedleParameters, SteeringParameters
@@ -104,10 +95,11 @@ class Insertion(Displayed):
     ) -> None:
         if isinstance(step, bool) or not isinstance(step, (int, float)) or not 0.0 < step < inf:
             raise ParameterError(f'step must be positive and finite, got {step!r} s')
+        #: Lateral model of the needle.
         self.needle = SteeredNeedle(needle, steering, seed=seed)
         self.change(needle)
         self.needle.move(depth=depth)
-        self.time = 0.0
+        self.time = 0.0  #: time [s]
         self._step = float(step)
         self._state = np.array([depth, 0.0, depth])
         self._punctured = np.asarray(self.axis.membranes < depth)
@@ -139,6 +131,7 @@ class Insertion(Displayed):
         """Change the constants along the axis, such as friction, but not the lateral model."""
         from needle_dynamics.compiled.boxed import Boxed
 
+        #: Constants along the axis.
         self.axis = axis_of(needle, self.needle.steering)
         self._boxed = Boxed(self.axis)
 
@@ -233,12 +226,9 @@ class Insertion(Displayed):
 
     @property
     def wrench(self) -> FloatArray:
-        """
-        Lateral wrench of the base: force x, z [N] and torque x, y, z [N m]; shape (5,).
-
-        The torque about y is the windup torque, with the stiffness of a needle that is fixed at
-        the mean position of the friction of its inserted part.
-        """
+        """Lateral wrench of the base: force x, z [N] and torque x, y, z [N m]; shape (5,)."""
+        # The torque about y is the windup torque, with the stiffness of a needle that is fixed at
+        # the mean position of the friction of its inserted part.
         across = self.needle
         (force_x, force_z), (moment_x, moment_z) = across.guide_load.tolist()
         shaft = across.needle.length - 0.5 * across.depth

@@ -48,15 +48,6 @@ class Bag:
         A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not, possibly
         truncated; or a ``.bag`` file of ROS 1.
 
-    Attributes
-    ----------
-    path : Path
-        Path of the recording.
-    counts : dict
-        Number of messages by topic, up to the present position of `batches`.
-    losses : list of str
-        Missing or damaged parts, up to the present position of `batches`.
-
     Examples
     --------
     >>> bag = Bag('bags/friction_01')
@@ -74,6 +65,8 @@ class Bag:
             self._files, self._missing = files_of(self.path)
         except OSError as error:
             raise RecordingError(f'cannot read {path}: {error.strerror or error}') from error
+        #: Number of messages by topic, and missing or damaged parts, up to the present position
+        #: of `batches`.
         self.counts: dict[BagTopic, int] = {}
         self.losses = list(self._missing)
 

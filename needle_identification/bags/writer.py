@@ -40,15 +40,6 @@ class BagWriter:
     compression : str
         One of `COMPRESSIONS`.
 
-    Attributes
-    ----------
-    path : Path
-        Folder of the bag.
-    counts : dict
-        Number of written messages by topic.
-    lost : Counter
-        Number of lost messages by topic, counted by the caller; written to the metadata.
-
     Raises
     ------
     RecordingError
@@ -88,6 +79,7 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict[str, Any]] = {}
+        #: Number of written messages by topic, and of lost ones, counted by the caller.
         self.counts: dict[str, int] = {}
         self.lost: Counter[str] = Counter()
         self._start, self._end = 2**63 - 1, 0
