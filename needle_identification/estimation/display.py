@@ -33,17 +33,12 @@ class DisplayedEstimate(Displayed):
         raise NotImplementedError
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        rows = list(self.rows())
-        found = [one for _, one in rows]
-        return {
-            'of': np.array([of for of, _ in rows]),
-            'parameter': np.array([one.name for one in found]),
-            'unit': np.array([one.unit for one in found]),
-            'value': np.array([_value(one) for one in found]),
-            'standard error': np.array([one.error for one in found]),
-            'low': np.array([one.interval[0] for one in found]),
-            'high': np.array([one.interval[1] for one in found]),
-        }
+        heads = 'of', 'parameter', 'unit', 'value', 'standard error', 'low', 'high'
+        rows = [
+            (of, one.name, one.unit, _value(one), one.error, *one.interval)
+            for of, one in self.rows()
+        ]
+        return {head: np.array([row[k] for row in rows]) for k, head in enumerate(heads)}
 
     def __repr__(self) -> str:
         rows = list(self.rows())

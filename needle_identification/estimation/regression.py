@@ -280,9 +280,8 @@ def _group_weights(
     pooled = float(left @ left) / len(left)
     weights = used.astype(np.float64)
     if pooled > 0.0:
-        variance = (np.bincount(members, left**2) + _PRIOR * span * pooled) / (
-            count + _PRIOR * span
-        )
+        prior = _PRIOR * span
+        variance = (np.bincount(members, left**2) + prior * pooled) / (count + prior)
         weights[used] = pooled / variance[members]
     return weights
 

@@ -27,8 +27,8 @@ class CandidateFit:
     """Comparison of an alternative set of terms with the chosen set."""
 
     terms: tuple[str, ...]  #: alternative set: one term more or less, or two more
-    criterion: str = 'BIC'  #: with the effective number of samples
-    difference: float = nan  #: BIC minus BIC of the chosen set; nan: not determined
+    #: BIC minus BIC of the chosen set, with the effective number of samples; nan: not determined.
+    difference: float = nan
     #: Of the Wald test that the differing terms are zero, for the number of terms tried (Holm).
     p_value: float = 1.0
     supported: bool = False  #: by the data; an additional term must also predict better

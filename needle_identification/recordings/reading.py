@@ -17,9 +17,8 @@ from typing import Final, NamedTuple
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings import samples, TIMES
+from needle_identification.recordings import samples, tables, TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.tables import is_table, read_friction_table, TABLES
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
@@ -104,7 +103,7 @@ def read_friction_recording(
     ()
 
     """
-    if is_table(path):
+    if tables.is_table(path):
         others = {
             '--wrench-topic': wrench_topic,
             '--motion-topic': motion_topic,
@@ -115,9 +114,11 @@ def read_friction_recording(
         for option, given in others.items():
             if given is not None:
                 raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
-        return read_friction_table(Path(path), columns or {})
+        return tables.friction_recording(tables.read_table(Path(path)), columns or {})
     if columns:
-        raise RecordingError(f'{path} is a bag: --columns is for tables ({", ".join(TABLES)})')
+        raise RecordingError(
+            f'{path} is a bag: --columns is for tables ({", ".join(tables.TABLES)})'
+        )
     sign, axis = signed_axis(force_axis, 'force axis')
     bag = Bag(path)
     topics = bag.topics()

@@ -6,7 +6,7 @@ from collections.abc import Sequence, Set
 from math import inf
 from typing import Final, NamedTuple, NoReturn
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.batch import MessageBatch
 from needle_identification.bags.topics import BagTopic
@@ -17,7 +17,6 @@ from needle_ros import wire
 from needle_ros.axes import AXES
 from needle_ros.contract import INSERTION
 import numpy as np
-from numpy.typing import NDArray
 
 _LARGEST: Final = 1e100  # upper limit of a plausible measurement [SI]
 _MAX_NAMES: Final = 100  # largest number of joint names kept for error messages
@@ -185,9 +184,9 @@ class Samples(NamedTuple):
     """Samples of a topic."""
 
     topic: str
-    stamps: NDArray[np.int64]  # (n,), strictly increasing [ns]
+    stamps: IntArray  # (n,), strictly increasing [ns]
     values: FloatArray  # (n, k)
-    latency: NDArray[np.int64]  # some receive times minus stamps [ns]
+    latency: IntArray  # some receive times minus stamps [ns]
 
 
 class Gathering:
@@ -198,7 +197,7 @@ class Gathering:
         self._source = source
         self._by_header = by_header
         self._series = Series(source.width)
-        self._latencies: list[NDArray[np.int64]] = []
+        self._latencies: list[IntArray] = []
         self._unstamped = self._invalid = self._unusable = self._unwanted = self._messages = 0
         self._fault = ''
 
@@ -262,7 +261,7 @@ class Gathering:
         raise RecordingError('; '.join([what, *bag.losses]))
 
 
-def are_gaps(steps: NDArray[np.int64] | NDArray[np.float64]) -> BoolArray:
+def are_gaps(steps: IntArray | FloatArray) -> BoolArray:
     """Return which steps between samples, (n,), are gaps, without interpolation."""
     return np.asarray(steps > _GAP * np.median(steps))
 

@@ -3,9 +3,8 @@
 
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, IntArray
 import numpy as np
-from numpy.typing import NDArray
 
 FINEST: Final = 2_500_000  #: finest bin [ns]: 400 Hz, above the cutoff of the friction filter
 LARGEST: Final = 2**20  #: largest number of samples that are kept
@@ -23,11 +22,11 @@ class Series:
         self.values: FloatArray = np.empty((0, columns))
         self.late = self.repeated = self.width = 0
         self._weights: FloatArray = np.empty(0)
-        self._gathered: list[tuple[NDArray[np.int64], FloatArray]] = []
+        self._gathered: list[tuple[IntArray, FloatArray]] = []
         self._count = 0
         self._last = -(2**63)
 
-    def add(self, stamps: NDArray[np.int64], values: FloatArray) -> None:
+    def add(self, stamps: IntArray, values: FloatArray) -> None:
         """Add samples in order of reception: stamps [ns], (n,), and values, (n, columns)."""
         if len(stamps) == 0:
             return
@@ -64,8 +63,8 @@ class Series:
 
 
 def _binned(
-    stamps: NDArray[np.int64], values: FloatArray, weights: FloatArray, width: int
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    stamps: IntArray, values: FloatArray, weights: FloatArray, width: int
+) -> tuple[IntArray, FloatArray, FloatArray]:
     """Average the samples of each bin; keep a single sample of a bin unchanged."""
     bins = stamps // width
     first = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))

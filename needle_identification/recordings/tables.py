@@ -45,14 +45,8 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'depth': _LENGTHS,
     'speed': {'m/s': 1.0, 'mm/s': 1e-3, 'cm/s': 1e-2, 'um/s': 1e-6, 'µm/s': 1e-6},
     'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
-    'guide_x': _LENGTHS,
-    'guide_z': _LENGTHS,
-    'roll': _ANGLES,
-    'tilt_x': _ANGLES,
-    'tilt_z': _ANGLES,
-    'tip_x': _LENGTHS,
-    'tip_y': _LENGTHS,
-    'tip_z': _LENGTHS,
+    **dict.fromkeys(('guide_x', 'guide_z', 'tip_x', 'tip_y', 'tip_z'), _LENGTHS),
+    **dict.fromkeys(('roll', 'tilt_x', 'tilt_z'), _ANGLES),
 }
 
 ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
@@ -143,13 +137,8 @@ def read_table(path: Path) -> Table:
     return table
 
 
-def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
-    """Read force and motion from a file; roles missing in `columns` are found by usual names."""
-    return friction_recording(read_table(path), columns)
-
-
 def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
-    """Return force and motion of a table, as `read_friction_table`."""
+    """Return force and motion of a table; roles missing in `columns` are found by usual names."""
     path = table.path
     specs = {**guessed(table.columns), **columns}
     if missing := missing_roles(specs):

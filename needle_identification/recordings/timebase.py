@@ -11,12 +11,11 @@ stamps stay unchanged.
 
 from typing import Final
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.samples import are_gaps, Samples
 import numpy as np
-from numpy.typing import NDArray
 
 #: Largest plausible difference of the latencies of two topics [s]. Optical trackers and imagers
 #: have up to 0.2 s; unsynchronized clocks differ by more.
@@ -24,6 +23,11 @@ LARGEST_LATENCY: Final = 0.25
 
 _NOTABLE_LATENCY: Final = 0.05  # smallest difference of latencies that is reported [s]
 _CERTAINTY: Final = 3.0  # smallest clock offset, as a multiple of the variation of the latencies
+
+
+def span_of(stamps: IntArray) -> str:
+    """Describe the time from the first to the last stamp [ns]."""
+    return f'from {stamps[0] * 1e-9:.3f} to {stamps[-1] * 1e-9:.3f} s'
 
 
 def merge(
@@ -34,13 +38,9 @@ def merge(
     stamps = force.stamps - offset
     covered = _covered(stamps, motion.stamps)
     if np.count_nonzero(covered) < 2:
-        spans = ' and '.join(
-            f'from {span[0] * 1e-9:.3f} to {span[-1] * 1e-9:.3f} s'
-            for span in (stamps, motion.stamps)
-        )
         raise RecordingError(
             f'{bag.path}: {force.topic} and {motion.topic} do not overlap in time; they last '
-            f'{spans}'
+            f'{span_of(stamps)} and {span_of(motion.stamps)}'
         )
     if not covered.all():
         bag.losses.append(
@@ -76,7 +76,7 @@ def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:
     return 0
 
 
-def _covered(stamps: NDArray[np.int64], motion: NDArray[np.int64]) -> BoolArray:
+def _covered(stamps: IntArray, motion: IntArray) -> BoolArray:
     steps = np.diff(motion)
     after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
     inside = (motion[0] <= stamps) & (stamps <= motion[-1])

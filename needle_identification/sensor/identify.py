@@ -16,6 +16,7 @@ from typing import Final
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import estimated, ParameterEstimate
+from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN
 from needle_identification.recordings.samples import are_gaps
 from needle_identification.sensor.estimate import SensorEstimate
 from needle_identification.sensor.losses import binomial_interval, fit_losses
@@ -29,7 +30,6 @@ _LEAST: Final = 50  # smallest number of samples
 _EXACT: Final = 1e-9  # largest change of errors that are rounding [m]
 _WINDOW: Final = 11  # samples of a running median
 _FAR: Final = 6.0  # deviation of an outlier [robust standard deviations]
-_ROBUST: Final = 1.4826  # standard deviation of normal values over their median deviation
 _DELAYS: Final = (-0.2, 1.0)  # range of the delay [s]
 _GRID: Final = 0.01  # step of the search for the delay [s], short relative to motions
 _ALIGNED: Final = 5000  # largest number of samples of this search
@@ -182,7 +182,7 @@ def _outliers(errors: FloatArray) -> BoolArray:
     # The middle sample may be the median itself.
     scale = np.array([np.median(column[column > 0.0]) if column.any() else inf
                       for column in apart.T])  # fmt: skip
-    return np.asarray((apart > _FAR * _ROBUST * scale).any(axis=1))
+    return np.asarray((apart > _FAR * DEVIATION_OVER_MEDIAN * scale).any(axis=1))
 
 
 def _fit(

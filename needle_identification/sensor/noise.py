@@ -89,16 +89,9 @@ class NoiseLikelihood:
         squares = max(float(np.trace(errors) - right @ constants), 1e-300)
         variance = squares / freedom
         deviance = freedom * log(variance) + k * logarithm + np.linalg.slogdet(normal)[1]
-        return NoiseFit(
-            constants,
-            variance * inverse,
-            0.5 * log(variance),
-            log_ratio,
-            log_time,
-            float(deviance),
-            freedom,
-            float(one * (1.0 + exp(log_ratio))),
-        )
+        covariance, information = variance * inverse, float(one * (1.0 + exp(log_ratio)))
+        logarithms = 0.5 * log(variance), log_ratio, log_time
+        return NoiseFit(constants, covariance, *logarithms, float(deviance), freedom, information)
 
     def best(self) -> NoiseFit:
         """Return the most probable noise; white unless slow noise is significant."""

@@ -11,6 +11,7 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings import Roles, tables
 from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
+from needle_identification.recordings.timebase import span_of
 from needle_identification.sensor.recording import SensorRecording
 from needle_ros import wire
 from needle_ros.axes import AXES, signed, signed_axis
@@ -62,13 +63,9 @@ def read_sensor_recording(
         )
         losses += [f'true position: {loss}' for loss in others]
         if stamps[-1] < true_stamps[0] or true_stamps[-1] < stamps[0]:
-            spans = (
-                f'from {part[0] / NANOSECONDS:.3f} to {part[-1] / NANOSECONDS:.3f} s'
-                for part in (stamps, true_stamps)
-            )
             raise RecordingError(
                 f'{path} and the true position in {truth} do not overlap in time; they last '
-                f'{" and ".join(spans)}'
+                f'{span_of(stamps)} and {span_of(true_stamps)}'
             )
     else:
         if len(truth) != len(AXES) or not np.isfinite(truth).all():
