@@ -63,7 +63,8 @@ class Admittance:
         return self.position
 
     def give_way(self) -> float | None:
-        """Stop the base at the last measured depth, so that it no longer pushes; see `hold`."""
+        """Stop the base where it no longer pushes; see `hold`."""
         if self.position is not None:
-            self.position = self.measured
+            # Of a withdrawing needle the measured depth is the deeper one.
+            self.position = min(self.measured, self.position)
         return self.hold()

@@ -39,8 +39,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     Every event is a method: it takes the present time [ns] of the clock that stamps the messages,
     and returns a command. None leaves the last command unchanged. `events` contains lines for the
-    log; `fault` is the reason why no force is commanded, apart from a stop. Forces are zero
-    without a target, during a fault, and from a stop to its clearance. `steady`: see `EventLog`.
+    log; `fault` is why no force is commanded, apart from a stop. `steady`: see `EventLog`.
     """
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
@@ -135,7 +134,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._waiting = WaitingRequests(self.requests)
         self._time = now
         self.safety.begin(now)
-        self._depth = None
+        self._depth, self._origin = None, -1
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
@@ -341,9 +340,10 @@ class Supervisor(StateMachine[ForceCommand]):
         self._timing.add(stamp, now)
         self._execute_request(stamp)
         try:
-            robot = self._robot
-            convert = Measurement.from_reading if robot is None else robot.measurement
-            measured = convert(reading)
+            convert = Measurement.from_reading if self._robot is None else self._robot.measurement
+            # A float has too few digits for Unix time.
+            self._origin = stamp if self._origin < 0 else self._origin
+            measured = convert(reading._replace(stamp=stamp - self._origin))
         except ParameterError as error:
             return self._release_for(str(error), stamp)
         if measured.is_finite():
@@ -395,9 +395,10 @@ class Supervisor(StateMachine[ForceCommand]):
                 self._waiting.end(command.notice)
         aim = command.setpoint
         error = aim.position - measured.depth, aim.velocity - measured.velocity
-        following, depth, load = self._following, measured.depth, self.bending.load
-        forces, steps = (self._last.force, measured.force), controller.guide.steps
-        lost = following.update(stamp, depth, aim.velocity, *forces, load, steps)
+        forces = self._last.force, measured.force, self.bending.load
+        following, depth = self._following, measured.depth
+        step = error[0] if controller.guide.steps else None
+        lost = following.update(stamp, depth, aim.velocity, *forces, step)
         fault = safety.guard.tracking(error[0]) or following.fault
         if (stopped := self._stop_for(fault, stamp)) is not None:
             return stopped

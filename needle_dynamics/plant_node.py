@@ -152,6 +152,7 @@ class PlantNode(ModelNode):
         self._late = 0
 
         self._authority, self._mode = Authority(), Mode.RUNNING
+        self._retracted = 0  #: Time of the last retraction [ns].
         self._system = SystemStateTopics(self, self._authority, self._on_request, self._obey)
 
     # Transitions.
@@ -299,8 +300,11 @@ class PlantNode(ModelNode):
     def _obey(self) -> None:
         """End every force and motion of a stop, withdraw the needle, or hold it in a pause."""
         mode, before, reason = self._authority.mode, self._mode, self._authority.reason
+        time, retracted = self._authority.state.motion.time, self._retracted
         self._mode = mode
-        if self._run is None or mode is before:
+        again = mode is Mode.RETRACTING and time != retracted
+        self._retracted = time if again else retracted
+        if self._run is None or (mode is before and not again):
             return
         self._trajectories.stopped = f'stopped: {reason}' if reason else ''
         if mode is Mode.STOPPED:
@@ -315,6 +319,7 @@ class PlantNode(ModelNode):
         if before is Mode.PAUSED:
             self._trajectories.resume()
         self._run.commands.stopped = mode is Mode.STOPPED
+        self._run.held = mode in (Mode.PAUSED, Mode.RETRACTING)
         self.publish_diagnostics()
 
     # Services.

@@ -2,6 +2,7 @@
 """System state of a node: its topic, the services of a user, and the emergency topic."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
@@ -35,7 +36,10 @@ class SystemStateTopics:
         authority.node = node.get_fully_qualified_name()
         self._publisher = node.publisher(contract.SYSTEM_STATE, always=True)
         node.subscribe(contract.SYSTEM_STATE, self._on_state)
-        node.subscribe(contract.EMERGENCY_STOP, self._on_emergency)
+        # A reliable subscription receives nothing from a best-effort publisher, the other one may
+        # lose messages of a reliable publisher.
+        for qos in (contract.COMMAND, contract.SENSOR):
+            node.subscribe(replace(contract.EMERGENCY_STOP, qos=qos), self._on_emergency)
         for word in REQUESTS:
             if word not in (PAUSE, RESUME):
                 node.create_service(Trigger, f'~/{word}', partial(self._answer, word))

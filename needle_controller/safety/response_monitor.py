@@ -43,7 +43,7 @@ class StallMonitor:
     """
 
     def __init__(self, axis: Axis, most: float, longest: float) -> None:
-        self.axis, self._most, self._longest = axis, most, longest
+        self.axis, self.most, self._longest = axis, most, longest
         self.forget()
 
     def forget(self) -> None:
@@ -73,7 +73,7 @@ class StallMonitor:
         if self._mark is not None:
             self._impulse += impulse
             moved, elapsed = depth - self._mark.depth, stamp - self._mark.stamp
-            if abs(moved) > _NOTHING * self._most:
+            if abs(moved) > _NOTHING * self.most:
                 axis, sign = self.axis, copysign(1.0, moved)
                 nominal = axis.coulomb * elapsed / NANOSECONDS + axis.viscous * abs(moved)
                 nominal *= 1.0 if moved > 0.0 else axis.withdrawal
@@ -99,7 +99,7 @@ class StallMonitor:
         if rate != 0.0:
             self.relaxed, self._holding = False, 0.0
         elif self.relaxed:
-            self.relaxed = abs(moved) <= _NOTHING * self._most
+            self.relaxed = abs(moved) <= _NOTHING * self.most
             return None
         factor, axis = _STRONGER, self.axis
         if rate == 0.0:
@@ -120,10 +120,10 @@ class StallMonitor:
         speed = max(speed / (1.0 + elapsed / axis.inertia * factor * axis.viscous), 0.0)
         self._velocity = speed
         self._expected += (speed if force > 0.0 else -speed) * elapsed
-        if abs(self._expected) <= self._most:
+        if abs(self._expected) <= self.most:
             return None
         self._expected = 0.0
-        if abs(moved) > _NOTHING * self._most:
+        if abs(moved) > _NOTHING * self.most:
             self._depth = depth
             return None
         if rate == 0.0:
@@ -136,7 +136,7 @@ class StallMonitor:
             return None
         return (
             f'the encoders do not move: {1e3 * abs(moved):.3g} mm measured, more than '
-            f'{1e3 * self._most:.3g} mm expected at {force:.3g} N; they are frozen, or the needle '
+            f'{1e3 * self.most:.3g} mm expected at {force:.3g} N; they are frozen, or the needle '
             'is blocked'
         )
 
@@ -179,22 +179,22 @@ class ResponseMonitor:
         commanded: float,
         reported: float,
         load: float = 0.0,
-        steps: bool = False,
+        step: float | None = None,
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
         commanded and the reported force [N], NaN if there is none, the known load against the
-        force [N], and whether the reference is a step: it rests while the needle moves, and is no
-        stall.
+        force [N], and the distance [m] to a reference that steps: it rests while the needle moves.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
-        if steps:
+        if step is not None and abs(step) <= self._stall.most:
             self._stall.forget()
         else:
-            self.fault = self._stall.update(stamp, depth, rate, applied, load)
+            # Far from a step, the needle must move as behind a moving reference.
+            self.fault = self._stall.update(stamp, depth, step or rate, applied, load)
         self.lost = self._is_lost(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:

@@ -75,6 +75,7 @@ class PlantRun:
         self._measured: list[Measurement] = []
         #: Joints that the latest `joint_commands` have moved.
         self.commanded: set[str] = set()
+        self.held = False  #: Whether `joint_commands` move nothing: a pause or a retraction.
 
     # Commands.
 
@@ -90,7 +91,7 @@ class PlantRun:
         try:
             asked = self._joint_commands.read(reading, self._positions(), now)
             counts, refusal = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
-            if counts and not refusal and commands.may_move(now):
+            if counts and not refusal and commands.may_move(now) and not self.held:
                 for goals, within in asked.motions:
                     content = {
                         'joints': list(goals),

@@ -107,6 +107,19 @@ def test_hold_and_give_way_stop_the_base() -> None:
     assert base.give_way() == 0.02
 
 
+@given(st.floats(-20.0, 20.0), st.floats(-1e-3, 1e-3))
+def test_base_gives_way_out_of_the_tissue_only(force: float, lag: float) -> None:
+    """A withdrawing robot is deeper than its command, one that advances less deep."""
+    base = base_of(lead=1e-3)
+    for k in range(20):
+        base.step(force, 0.02 + lag, k * STEP)
+    position = base.position
+    assert position is not None
+    found = base.give_way()
+    assert found is not None
+    assert found <= min(position, 0.02 + lag)
+
+
 def follow(
     law: str, rate: float, lag: float, dead: float = 0.0, seconds: float = 8.0
 ) -> tuple[float, float, float]:

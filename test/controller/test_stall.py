@@ -99,6 +99,18 @@ def test_encoders_frozen_at_any_moment_end_the_motion(law: str, begin: float) ->
     assert last < 1e-6
 
 
+@pytest.mark.requirement('S-285')
+@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('begin', [0.02, 0.1, 1.0])
+def test_encoders_frozen_during_a_step_stop_the_needle(law: str, begin: float) -> None:
+    """The reference rests 9 mm ahead; near the step the needle moves by less than 1 mm."""
+    loop = Loop(law, 200.0, reference='step')
+    moved, _ = freeze(loop, 0.029, begin, 4.0, Frozen(effort=True))
+    assert moved < MOST
+    # After 1 s the needle has nearly arrived.
+    assert ('encoders do not move' in loop.supervisor.authority.reason) == (begin < 1.0)
+
+
 @pytest.mark.requirement('S-263')
 @pytest.mark.parametrize('law', LAWS)
 def test_motion_after_encoders_froze_at_rest_is_stopped(law: str) -> None:
