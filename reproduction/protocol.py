@@ -72,13 +72,8 @@ class ExperimentProtocol:
 
 
 def _friction_points() -> tuple[TrajectoryPoint, ...]:
-    """
-    Return the protocol of section 3.2.2.2, with the tip past the tissue.
-
-    A force that rises from zero pushes the base until the needle has moved. Then the base moves
-    back, and makes one stroke in and one out at each of `SPEEDS`, with rests. Strokes begin and
-    end with an acceleration within the limits of the base.
-    """
+    """Return the protocol of section 3.2.2.2, with the tip past the tissue: a push, strokes."""
+    # Strokes begin and end with an acceleration within the limits of the base.
     points = [
         TrajectoryPoint(REST_TIME, effort=(0.0,)),
         TrajectoryPoint(REST_TIME + PUSH_TIME, effort=(PUSH,)),
@@ -107,11 +102,7 @@ def _travel(time: float, speed: float) -> float:
 
 
 def _stiffness_points() -> tuple[TrajectoryPoint, ...]:
-    """
-    Return the protocol of section 3.2.2.3: at each force level one press in each direction.
-
-    A press is a force in the plane (x, z) that rises, is held, falls to zero and stays there.
-    """
+    """Return the protocol of section 3.2.2.3: at each force level one press in each direction."""
     points = [TrajectoryPoint(RELEASED_TIME, effort=(0.0, 0.0))]
     for level in FORCE_LEVELS:
         for k in range(DIRECTIONS):

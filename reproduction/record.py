@@ -114,8 +114,7 @@ class Rig:
 
         `speed` is a multiple of real time. If samples are lost, the run is repeated at half the
         speed, and so on down to real time: a bag lacks no sample, and is the same on any machine.
-        `progress` receives the completed fraction. Raises `ExperimentError` if samples are lost in
-        real time too.
+        `ExperimentError` if samples are lost in real time, too.
         """
         factor = speed
         while True:

@@ -84,14 +84,9 @@ def needle(reading: str, formulation: str, *, hub_stop: bool = True) -> NeedleMo
 
 @cache
 def open_loop(reading: str, formulation: str, deflection: float = DEFLECTION) -> LoopRun:
-    """
-    Run the open loop of figures 4 and 5: 3 N from the start, up to the hub and beyond.
-
-    ``deflection`` is the initial tip deflection [m]. The run has at least 3500 samples; some modes
-    are faster.
-    """
+    """Run the open loop of figures 4 and 5: 3 N from a tip deflection [m] to beyond the hub."""
     model = needle(reading, formulation)
-    duration = OPEN_LOOP[reading]
+    duration = OPEN_LOOP[reading]  # at least 3500 samples
     run = simulate(
         model.parameters,
         model.state_at(DEPTH, deflection),

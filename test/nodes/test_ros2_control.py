@@ -35,7 +35,7 @@ import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from support.generated_messages import importable
 from support.installed import ROOT
 from support.ros_graph import RosGraph
@@ -294,6 +294,34 @@ def test_position_controller_is_followed(ros_graph: RosGraph, tmp_path: Path) ->
     assert driver.at() == pytest.approx(0.04, abs=2e-6)
     said = driver.said()
     assert 'joint_commands: trajectory must stay in [0.001, 0.2] m, got [0.3] m' in said
+
+
+@pytest.mark.requirement('S-286')
+def test_pause_and_retraction_hold_joint_commands(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The commands continue to move 10 mm ahead of the needle."""
+    driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
+
+    def lead() -> None:
+        driver.set['insertion', 'position'] = driver.at() + 0.01
+
+    def call(kind: type, name: str, request: Any) -> None:
+        client = driver.node.create_client(kind, f'plant/{name}')
+        driver.until(client.service_is_ready, 'the service')
+        answer = client.call_async(request)
+        driver.until(answer.done, 'the answer')
+        assert answer.result().success
+
+    driver.update = lead
+    driver.until(lambda: driver.at() > 0.032, 'the motion')
+    call(SetBool, 'pause', SetBool.Request(data=True))
+    driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
+    rest = driver.at()
+    driver.further(0.5)
+    assert driver.at() == rest
+    call(Trigger, 'retract', Trigger.Request())
+    driver.until(lambda: driver.at() < 0.0105, 'the retraction')
+    driver.further(0.5)
+    assert driver.at() < 0.0105
 
 
 def test_duplicate_position_commanders_are_not_followed(

@@ -193,3 +193,15 @@ def test_stop_and_retraction_supersede_earlier_trajectories(
     end = bench.time + SECOND
     bench.until(lambda: bench.time > end, 'a second')
     assert bench.depth < DEPTH + 1e-4
+
+
+@pytest.mark.requirement('S-287')
+def test_repeated_retraction_of_the_plant_withdraws_again(ros_graph: RosGraph) -> None:
+    """A needle that was moved since the first one, without a controller."""
+    bench = Bench(ros_graph, 'robot')
+    bench.call('retract')
+    bench.until(lambda: bench.depth < 0.0105, 'the retraction')
+    bench.send(0, (4.0, 0.02))
+    bench.until(lambda: bench.depth > 0.0195, 'the path')
+    bench.call('retract')
+    bench.until(lambda: bench.depth < 0.0105, 'the second retraction')
