@@ -568,4 +568,5 @@ def test_killed_node_resumes_its_insertion(ros_graph: RosGraph) -> None:
 
     ros_graph.spin_until(ended, 'the end', 180.0)
     assert kill.at('insertion') == pytest.approx(TARGET[1], abs=5e-4)
-    assert said('mm from the target')
+    # Another subscription than that of the phase.
+    ros_graph.spin_until(lambda: said('mm from the target'), 'the result')
