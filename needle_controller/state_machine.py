@@ -52,11 +52,9 @@ class StateMachine(ABC, Generic[_Command]):
     def obey(self, now: int) -> _Command | None:
         """Follow the state of the system; return the command to publish."""
         mode, before = self.authority.mode, self._obeyed
-        time, retracted = self.authority.state.motion.time, self._retracted
+        new, self._retracted = self.authority.compare(before, self._retracted)
         self._obeyed = mode
-        if mode is Mode.RETRACTING:
-            self._retracted = time
-        if mode is before and (mode is not Mode.RETRACTING or time == retracted):
+        if not new:
             return None
         self.events.add(Severity.INFO)
         return self._change_mode(mode, before, now)

@@ -300,11 +300,9 @@ class PlantNode(ModelNode):
     def _obey(self) -> None:
         """End every force and motion of a stop, withdraw the needle, or hold it in a pause."""
         mode, before, reason = self._authority.mode, self._mode, self._authority.reason
-        time, retracted = self._authority.state.motion.time, self._retracted
+        new, self._retracted = self._authority.compare(before, self._retracted)
         self._mode = mode
-        again = mode is Mode.RETRACTING and time != retracted
-        self._retracted = time if again else retracted
-        if self._run is None or (mode is before and not again):
+        if self._run is None or not new:
             return
         self._trajectories.stopped = f'stopped: {reason}' if reason else ''
         if mode is Mode.STOPPED:

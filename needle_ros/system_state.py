@@ -183,6 +183,17 @@ class Authority:
         cleared = {node: stop.time for node, stop in self.state.stops.items()}
         self._merge(SystemState(cleared=cleared, motion=_Motion(self._next())))
 
+    def compare(self, mode: Mode, retracted: int) -> tuple[bool, int]:
+        """
+        Return whether a node in a mode must act, and the time of the last retraction [ns].
+
+        A second retraction is new although its mode is not; ``retracted`` is the last time.
+        """
+        if self.mode is not Mode.RETRACTING:
+            return self.mode is not mode, retracted
+        time = self.state.motion.time
+        return self.mode is not mode or time != retracted, time
+
     def run(self) -> None:
         """End a retraction, for another motion that a user has requested."""
         if self.state.motion.retracts:

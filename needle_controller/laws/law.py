@@ -140,7 +140,7 @@ class SampledLoop:
         self._take_over = False
 
     def stop(self, acts: float = 0.0) -> None:
-        """Discard pending commands for a force that acts [N], and the modeled motion only."""
+        """Replace pending commands by a force that acts [N]; discard the modeled motion."""
         for i in range(len(self.pending)):
             self.pending[i] = acts
         self.memory[FOLLOWS] = self.memory[MEASURED] = 0.0

@@ -10,11 +10,11 @@ from needle_controller.reference.setpoint import Setpoint
 
 #: Longest gap in the measurements, and largest age of one, before the law restarts [s].
 _GAP, _PERIODS = 0.01, 2.5
-_ROUNDING: Final = 1.0 + 1e-6
+_ROUNDING: Final = 1.0 + 1e-6  #: Tolerance of an age of exactly one period.
 #: Least response, as a fraction of the commanded force or of the velocity of the reference.
 _NOTHING: Final = 0.1
-#: Relative difference of a reported force that is the commanded one, and of one that is held;
-#: number of commanded ones in a row before a held one counts, and longest time for that [s].
+#: Relative tolerance of a reported force: equal to a command, and constant; number of reports in a
+#: row that equal a command before a constant force is a loss of commands; its longest time [s].
 _EQUAL, _SAME, _TRUSTED, _LOST = 0.05, 0.01, 20, 0.2
 
 

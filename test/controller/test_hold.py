@@ -135,7 +135,7 @@ def test_lost_commands_do_not_make_the_needle_faster(law: str) -> None:
     # During the acceleration, when the force changes most.
     lost = [Stall('commands', 0.06, 0.03), Stall('commands', 0.3, 0.09)]
     found = insert(law, 'target', lost)
-    # At 1 kHz; PID as without lost commands.
+    # 5 % in the benchmark at 1 kHz, PID as without lost commands.
     assert found.inward <= LIMIT * (1.0 + (OVERSHOOT if law == 'pid' else 0.1))
     assert abs(found.depth - TARGET) < AT_REST
 
@@ -160,8 +160,9 @@ def test_other_reported_forces_do_not_delay_the_reference(
         command = controller.command(measured)
         aims.append(command.setpoint)
         depth, last = command.setpoint.position, command.force
-    # One second at the limit, less the acceleration.
-    assert aims[-1].position - 0.02 == pytest.approx(LIMIT * 0.95, rel=0.06)
+    # One second at 10 mm/s less the acceleration in 0.1 s, and two periods. A hold lasts 10 ms or
+    # more, which is 1 % of the path.
+    assert aims[-1].position - 0.02 == pytest.approx(LIMIT * 0.95, rel=5e-3)
 
 
 @pytest.mark.requirement('S-283')
@@ -180,6 +181,7 @@ def test_needle_continues_at_its_velocity_after_a_gap(law: str) -> None:
         loop.step()
     depths = np.array([depth for _, depth in loop.track[-100:]])
     steps = np.diff(depths) / PERIOD
+    # A law that assumes no force lets the needle slow down to a third of this.
     assert steps.min() > 0.9 * LIMIT
     assert steps.max() < 1.1 * LIMIT
 

@@ -274,7 +274,7 @@ def test_reference_waits_while_plant_does_not_follow() -> None:
     robot.runs(1000, obeys=False)
     force = supervisor._last.force
     robot.runs(4000, obeys=False)
-    # Rounding of the time that the motion waits.
+    # The time that the motion waits is a sum of 4000 periods, each rounded by 2e-16 of it.
     assert robot.aim == pytest.approx(waits, rel=1e-12)
     assert supervisor.safety.stop is None
     # A tenth of a second at the velocity of the reference, and its braking distance.
