@@ -173,8 +173,9 @@ class MotionControl:
     def _braked(self) -> FloatArray:
         """Return the positions at which needle and guide come to rest [m, rad]."""
         end, limit = self.at.copy(), self._settings.guide_limit
-        # A needle that rests, or whose positions are implausible, is not moved into the tissue.
-        moving = min(max(self.velocity, 0.0), self._settings.speed)
+        # A needle that rests, or whose positions are implausible, is not moved into the tissue,
+        # nor one that is withdrawn: it brakes on its way.
+        moving = min(max(self.velocity, -self._settings.speed), self._settings.speed)
         end[0] = min(end[0] + 0.5 * BRAKING * moving, max(self.origin[0], self.goal[0]))
         end[0] = max(end[0], min(self.origin[0], 0.0))
         end[1:3] = np.clip(end[1:3], -limit, limit)

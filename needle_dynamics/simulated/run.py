@@ -145,8 +145,18 @@ class PlantRun:
             self._follow(PRESS_JOINTS, _HALT, [], [0.0] * len(PRESS_JOINTS))
         # Before the first sample, all joints rest.
         elif joints and self._measured:
-            at = self._positions()
-            self._follow(joints, _HALT, [at[name] for name in joints], [])
+            ends = self._positions()
+            if INSERTION in joints:
+                ends[INSERTION] = self._braked(*self._measured_joints()[INSERTION][:2])
+            self._follow(joints, 0.0, [ends[name] for name in joints], [])
+
+    def _braked(self, depth: float, velocity: float) -> float:
+        """Return where the needle holds: if it is withdrawn, where the base comes to rest [m]."""
+        # A return to the present depth would insert it.
+        outward, constants = min(velocity, 0.0), self.constants
+        distance = outward**2 / (2.0 * constants.base.acceleration_limit)
+        lowest = min(depth, constants.model.minimum_depth)
+        return max(depth - distance + outward / constants.own.rate, lowest)
 
     def withdraw(self) -> None:
         """Withdraw the needle by its own base, if it has one."""

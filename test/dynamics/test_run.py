@@ -22,6 +22,7 @@ from needle_dynamics.simulated.run import (
     TRAJECTORY,
 )
 from needle_ros.errors import JobError
+import numpy as np
 import pytest
 
 #: A stamp with more digits than a float can hold to the nanosecond.
@@ -161,3 +162,33 @@ def test_invalid_parameters_are_rejected(values: dict[str, Any], complaint: str)
     with pytest.raises(ParameterError) as caught:
         PlantConstants.of(values)
     assert str(caught.value).startswith(complaint)
+
+
+@pytest.mark.requirement('S-288')
+@pytest.mark.parametrize('steered', [False, True])
+@pytest.mark.parametrize('velocity', [0.01, 0.05])
+@pytest.mark.parametrize('moment', [0.3, 0.5, 0.9])
+def test_stop_of_a_withdrawal_does_not_insert(
+    steered: bool, velocity: float, moment: float
+) -> None:
+    """A needle that is withdrawn rests within its braking distance, and never moves inward."""
+    plant = PlantRun({**VALUES, 'mode': 'robot', 'steered': steered, 'depth': 0.08})
+    plant.take(stamp(1))
+    time = 0.04 / velocity
+    motion = {'joints': ['insertion'], 'times': [time], 'positions': [[0.04]], 'efforts': [[]]}
+    plant.perform(Event(TRAJECTORY, motion))
+    stopped = 2 + round(moment * time * 300.0)
+    depths = []
+    # The position error decays with 20 1/s.
+    for k in range(2, stopped + 180):
+        if k == stopped:
+            plant.halt()
+        plant.take(stamp(k))
+        depths.append(plant.plant.depth)
+    after = np.array(depths[stopped - 3 :])
+    # Counts of the encoders when the stop is requested.
+    assert np.diff(after).max() <= 1e-6
+    # The base brakes with 0.5 m/s^2, after the two periods since the first of these samples, and
+    # with another period for the end of its motion.
+    assert after[0] - after[-1] <= velocity**2 + velocity * 3.0 / 300.0 + 1e-6
+    assert np.ptp(after[-20:]) <= 1e-6

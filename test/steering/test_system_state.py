@@ -427,16 +427,20 @@ def test_insertion_after_a_retraction_hits_its_target() -> None:
     assert robot.miss < 6e-4
 
 
-@pytest.mark.requirement('S-011')
+@pytest.mark.requirement('S-011', 'S-288')
 def test_stop_of_a_retraction_ends_it() -> None:
     robot = inserted(False, 0.04)
     assert robot.request(RETRACT)
     robot.tick(50)
     begin = robot.at.copy()
     assert robot.request(STOP)
-    robot.tick(100)
+    path = positions(robot, 100)
     held = robot.at.copy()
     assert held == pytest.approx(begin, abs=BRAKED)
+    # It brakes on its way: a robot that cannot stop at once would return into the tissue.
+    velocity = (begin[0] - robot.tracked[-102][0]) / 1e-2
+    assert np.diff(path[:, 0]).max() <= 1e-9
+    assert begin[0] - held[0] == pytest.approx(0.1 * abs(velocity), abs=2e-5)
     robot.tick(300)
     assert_allclose(robot.at, held, atol=1e-9)
     assert robot.loop.phase is Phase.STOPPED
