@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read lines from a terminal or a script, and write lines to it."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import FileIO
-from queue import SimpleQueue
 import readline
 import sys
 import termios
@@ -23,7 +23,7 @@ class Screen:
     def __init__(self) -> None:
         self._terminal = bool(sys.stdout and sys.stdout.isatty())
         self.typed = self._terminal and bool(sys.stdin and sys.stdin.isatty())
-        self._lines: SimpleQueue[str | Exception | None] = SimpleQueue()
+        self._lines: deque[str | Exception | None] = deque()
         self._wanted = Semaphore(0)
         self._asked = self._shown = False
 
@@ -55,7 +55,7 @@ class Screen:
 
     def _read(self) -> None:
         while self._wanted.acquire():
-            self._lines.put(self._line())
+            self._lines.append(self._line())
 
     def _line(self) -> str | Exception | None:
         try:
@@ -71,17 +71,25 @@ class Screen:
             return error
 
     def ask(self) -> None:
+        """Read the next line, unless it is read already."""
+        if self._asked:
+            return
         self._clear()
         self._asked = True
         self._wanted.release()
 
     @property
     def answered(self) -> bool:
-        return not self._lines.empty()
+        return bool(self._lines)
+
+    @property
+    def next_words(self) -> list[str]:
+        """Words of the next line, if it is read."""
+        return str(self._lines[0]).split() if self._lines else []
 
     def take(self) -> str | None:
         """Return the line, or None at the end; raise `ParameterError` if it is not text."""
-        line = self._lines.get()
+        line = self._lines.popleft()
         if isinstance(line, Exception):
             raise ParameterError(f'the standard input is not readable as text: {line}')
         self._asked = False
@@ -95,15 +103,19 @@ class Screen:
     def say(self, line: str) -> None:
         """Write one or several lines above the prompt."""
         self._clear()
-        sys.stdout.write(f'{line}\n')
-        if self._asked and self.typed:
-            sys.stdout.write(f'{_PROMPT}{readline.get_line_buffer()}')
+        sys.stdout.write(f'{line}\n{self._typed_part}')
         sys.stdout.flush()
+
+    @property
+    def _typed_part(self) -> str:
+        """Prompt, and the characters that a person has typed."""
+        return f'{_PROMPT}{readline.get_line_buffer()}' if self._asked and self.typed else ''
 
     def show(self, line: str) -> None:
         """Show a line that the next line replaces; no effect in a file or pipe."""
         if self._terminal:
-            sys.stdout.write(f'{CLEAR}{line}')
+            typed = self._typed_part
+            sys.stdout.write(f'{CLEAR}{line}{typed and "  "}{typed}')
             sys.stdout.flush()
             self._shown = True
 

@@ -50,6 +50,7 @@ _NEEDED: Final = (
     (STEERING, TIP_DEFLECTION.name),
 )
 
+_PATIENCE: Final = 0.3  #: Time after which the next line can be typed during a command [s].
 _AGAIN: Final = 30.0  #: Shortest time between two prints of the same warning [s].
 
 _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
@@ -61,7 +62,10 @@ _AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE, SteeringPhase.STOPPED
 #: Arguments and description of each command.
 WORDS: Final = {
     'target': ('DEPTH | X,Y,Z', f'insert to a depth, 50mm, or steer the tip to {TARGET_HELP}'),
-    'wait': ('[TIME]', 'wait until the needle is at its target, at most 20s'),
+    'wait': (
+        '[TIME]',
+        'wait until the needle is at its target, at most 20s; the next line ends it',
+    ),
     'pause': ('', 'brake to rest and hold'),
     'resume': ('', 'continue after a pause'),
     'retract': ('', 'withdraw to retract_depth'),
@@ -194,6 +198,21 @@ class Terminal(Cmd):
 
         self._graph.spin_until(holds, what, timeout)
 
+    def _await(self, condition: Callable[[], Any], what: str, *, brief: bool = True) -> None:
+        """Wait while a person can type: a stop ends the wait, or any line if it is not `brief`."""
+        begin = monotonic()
+
+        def holds() -> Any:
+            if self._screen.typed and monotonic() - begin > _PATIENCE:
+                self._screen.ask()
+                if self._screen.answered and (
+                    not brief or self._screen.next_words[:1] == ['stop']
+                ):
+                    raise JobError(f'{what} is not awaited any more: the next line is typed')
+            return condition()
+
+        self._spin_until(holds, what, inf)
+
     def _print_warnings(self) -> None:
         """Print new warnings and errors of the nodes; raise `GraphError` without a recording."""
         self._warnings.show(self._operator.states)
@@ -223,7 +242,7 @@ class Terminal(Cmd):
                 raise JobError(f'{aims}: no status for {_SILENT:g} s')
             return pending.done
 
-        self._spin_until(answered, f'the answer of {aims}', inf)
+        self._await(answered, f'the answer of {aims}')
         accepted, line = pending.outcome
         if not accepted:
             raise JobError(line)
@@ -256,7 +275,7 @@ class Terminal(Cmd):
             return now > arrived + _SETTLING
 
         # The timeout is above, with the position of the needle in its error.
-        self._spin_until(done, 'the needle', inf)
+        self._await(done, 'the needle', brief=False)
         self._say(self._readings.line())
         if self._steers:
             self._say(f'{STEERING}: {self._state(STEERING).message}')
@@ -298,7 +317,7 @@ class Terminal(Cmd):
 
     def _answered(self, future: Future, what: str) -> None:
         # A call without an answer is done, too.
-        self._spin_until(future.done, f'the answer to {what}', inf)
+        self._await(future.done, f'the answer to {what}')
         outcome: RequestOutcome = future.result()
         if not outcome.success:
             raise JobError(f'{what}: {outcome.message}')

@@ -375,6 +375,30 @@ def test_typed_commands_are_completed_and_errors_are_not_fatal(
         assert list(read_topic(tmp_path / 'run' / 'bag', '/target'))
 
 
+@pytest.mark.requirement('S-289')
+def test_stop_is_typed_while_the_session_waits(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """It is executed at once, not after the motion."""
+    with Typed(ros_graph, tmp_path / 'run') as typed:
+        typed.expect('needle> ')
+        typed.type('target 90mm\n')
+        typed.expect('controller: on its way')
+        typed.type('wait\n')
+        # The prompt behind the line that is updated.
+        typed.expect(r'\r\x1b\[Kdepth[^\n]*needle> ')
+        typed.type('stop\n')
+        typed.expect('error: the needle is not awaited any more')
+        typed.expect('stopped; ~/clear_stop releases')
+        typed.type('status\n')
+        typed.expect(r'depth (\S+) mm')
+        typed.expect(r'controller +ERROR +requested by a user')
+        typed.expect('needle> ')
+        typed.type('quit\n')
+        typed.expect('recorded to')
+        assert typed.process.wait(60.0) == 0
+    *_, (_, last) = read_topic(tmp_path / 'run' / 'bag', '/joint_states')
+    assert last.position[0] < 0.5 * 0.09
+
+
 @pytest.mark.parametrize('closed', [False, True])
 def test_ctrl_c_ends_the_session_with_a_complete_recording(
     ros_graph: RosGraph, tmp_path: Path, *, closed: bool
