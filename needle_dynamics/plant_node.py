@@ -183,7 +183,7 @@ class PlantNode(ModelNode):
             self._display.offer_transform(constants.mode)
         # `cleanup` destroys its action: nothing after it may fail.
         self._trajectories = PlantTrajectories(
-            self, plant_run, lambda: self._time.simulated(self.now())
+            self, plant_run, lambda: self._time.simulated(self.now()), self._end_retraction
         )
         self._run = plant_run
         if publishes:
@@ -319,6 +319,12 @@ class PlantNode(ModelNode):
         self._run.commands.stopped = mode is Mode.STOPPED
         self._run.held = mode in (Mode.PAUSED, Mode.RETRACTING)
         self.publish_diagnostics()
+
+    def _end_retraction(self) -> None:
+        """Continue after a retraction: a user moves the needle."""
+        if self._mode is Mode.RETRACTING:
+            self._authority.run()
+            self._obey()
 
     # Services.
 

@@ -13,11 +13,12 @@ from needle_ros.base_node import BaseNode
 from needle_ros.errors import printable
 from needle_ros.requests import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
-from needle_ros.trajectories import JointPath
+from needle_ros.trajectories import joint_values, JointPath
 from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.waiting_requests import WaitingRequest, WaitingRequests
 from trajectory_msgs.msg import JointTrajectory
 
+_DEEPER: Final = 1e-4  #: Smallest motion of a resting needle that inserts it [m].
 _INACTIVE: Final = 'the plant is not active'
 
 
@@ -37,11 +38,19 @@ class PlantTrajectories:
     if it arrives later. Without a stamp, it starts on arrival, or with the activation of a plant
     that is not active, which rejects those with a stamp. While `stopped` is not empty, none is
     executed. A pause holds the joints that move; the remaining paths are followed after it, as
-    are the requests that await their start. `simulated` returns the simulated time [ns].
+    are the requests that await their start. `simulated` returns the simulated time [ns]; `inserts`
+    is called before a path moves a resting needle deeper.
     """
 
-    def __init__(self, node: BaseNode, plant_run: PlantRun, simulated: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        node: BaseNode,
+        plant_run: PlantRun,
+        simulated: Callable[[], int],
+        inserts: Callable[[], None],
+    ) -> None:
         self._node, self._run, self._simulated = node, plant_run, simulated
+        self._inserts = inserts
         constants, topic = plant_run.constants, contract.JOINT_TRAJECTORY
         # In mode `simulation`, `insertion` is the reference of a controller.
         is_indenter = constants.mode == 'indenter'
@@ -141,10 +150,20 @@ class PlantTrajectories:
         self, path: JointPath, moved: tuple[str, ...], plant_run: PlantRun, elapsed: float
     ) -> None:
         """Follow a path with some joints, at a time after its start [s]."""
+        if self._is_inserted(path, moved):
+            self._inserts()
         follow(path, moved, plant_run, elapsed)
         self._forget(moved)
         begun = self._sampled - round(elapsed * NANOSECONDS)
         self._executions.append(_Execution(path, frozenset(moved), begun))
+
+    def _is_inserted(self, path: JointPath, moved: Collection[str]) -> bool:
+        """Whether a path moves a resting needle deeper; it still moves if `steering` brakes it."""
+        name, plant = contract.INSERTION, self._run.plant
+        if path.stops or name not in moved or not plant.references()[name].arrived:
+            return False
+        *_, end = joint_values(name, path.joints, path.positions)
+        return end is None or end > plant.depth + _DEEPER
 
     def _hold(self, joints: Collection[str]) -> None:
         self._forget(joints)

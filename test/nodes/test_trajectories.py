@@ -205,3 +205,18 @@ def test_repeated_retraction_of_the_plant_withdraws_again(ros_graph: RosGraph) -
     bench.until(lambda: bench.depth > 0.0195, 'the path')
     bench.call('retract')
     bench.until(lambda: bench.depth < 0.0105, 'the second retraction')
+
+
+@pytest.mark.requirement('S-290')
+def test_path_after_a_retraction_of_the_plant_ends_it(ros_graph: RosGraph) -> None:
+    """A pause and its end do not withdraw the needle: they continue the path."""
+    bench = Bench(ros_graph, 'robot')
+    bench.call('retract')
+    bench.until(lambda: bench.depth < 0.0105, 'the retraction')
+    bench.rests(1e-3, 1)
+    bench.send(0, (2.0, 0.02))
+    bench.until(lambda: bench.depth > 0.012, 'the path')
+    bench.call('pause', SetBool, data=True)
+    bench.rests(2e-3, 1)
+    bench.call('pause', SetBool, data=False)
+    bench.until(lambda: bench.depth > 0.0195, 'the end of the path')
