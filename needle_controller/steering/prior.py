@@ -35,8 +35,9 @@ class SteeringPrior:
         4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
     )
     drift: float = constant(
-        5e-4, 'm', 'standard deviation of a slow error of the tip sensor, if it has one'
-    )
+        5e-4, 'm', 'standard deviation of a slow error of the tip sensor; 0, one and three times '
+        'as much is considered',
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_constants(self)

@@ -66,6 +66,9 @@ _LEADS: Final = (0.0, 0.025)
 _WINDUPS: Final = (0.0, 4.0, 8.0)
 
 _PATHS: Final = (1.0, 10.0, 100.0)  #: Hypotheses of path noise, relative to the least one.
+#: Slow errors of the sensor relative to `SteeringPrior.drift`, and logarithm of their weights.
+#: With equal weights, the first measurements of a precise sensor would be doubted.
+_DRIFTS: Final = {0.0: 0.0, 1.0: 0.0, 3.0: -2.0}
 _DRIFT_LENGTH: Final = 0.05  #: Correlation length of the slow error of the sensor [m].
 _BEYOND: Final = 1.1  #: Half width of the grid over the spread.
 _ELEMENT: Final = 1.25e-3  #: Longest element [m]: good to a few micrometers.
@@ -169,7 +172,11 @@ class SteeringModel:
         later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
         #: Responses at the g points of the grid; hypothesis i has point i modulo g.
         self.responses = HypothesisResponses(*[*arrays, between, lags, *later])
-        kinds = np.array([(q * b.path_noise, d) for d in sorted({0.0, b.drift}) for q in _PATHS])
+        drifts = _DRIFTS if b.drift else {0.0: 0.0}
+        kinds = np.array([
+            (q * b.path_noise, d * b.drift, log) for d, log in drifts.items() for q in _PATHS
+        ])  # fmt: skip
+        self.logs = np.repeat(kinds[:, 2], points)  #: logarithm of the prior weights, shape (h,)
         #: Whether a hypothesis is kinematic, of a needle that is turned; shape (h,).
         self.rolled = np.tile(np.arange(points) >= beams, len(kinds))
         #: Bending length by hypothesis, relative to the nominal one, and stiffness of the skin

@@ -33,11 +33,12 @@ MODELS = {
 
 
 def prior_covariances(model: SteeringModel) -> FloatArray:
-    """Return the prior of all causes by path noise and slow error, shape (6, 8 + n, 8 + n)."""
+    """Return the prior of all causes by path noise and slow error, shape (9, 8 + n, 8 + n)."""
     prior, cell = model.prior, 1.0 / sqrt(12.0)
     deviations = [prior.offset, prior.frame, prior.tilt, prior.bevel]
     deviations += [0.0] * (model.steps + 1) + [cell, cell, 0.0]
-    kinds = [(path, drift) for drift in (0.0, prior.drift) for path in (1.0, 10.0, 100.0)]
+    drifts = 0.0, prior.drift, 3.0 * prior.drift
+    kinds = [(path, drift) for drift in drifts for path in (1.0, 10.0, 100.0)]
     found = np.tile(np.diag(np.square(deviations)), (len(kinds), 1, 1))
     apart = np.abs(np.subtract.outer(model.depths, model.depths)) / prior.path_noise_length
     for covariance, (path, drift) in zip(found, kinds, strict=True):
@@ -72,7 +73,8 @@ class Plain:
                 for name, one in model.responses._asdict().items()
             }
         )
-        self.logs, self.errors, self.used = np.where(model.rolled, -3.0, 0.0), 0.0, 0
+        large = np.repeat([0.0, 0.0, -2.0], h // 3)
+        self.logs, self.errors, self.used = large - 3.0 * model.rolled, 0.0, 0
 
     @property
     def weights(self) -> FloatArray:

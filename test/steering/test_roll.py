@@ -57,7 +57,7 @@ def test_arcs_follow_the_load_of_each_layer() -> None:
 def test_known_needle_and_trocar_have_no_kinematic_hypotheses() -> None:
     exact = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(spread=0.0))
     trocar = SteeringModel(NEEDLE, _STEERING, DEPTHS)
-    assert MODEL.rolled.sum() == 36
+    assert MODEL.rolled.sum() == 54
     assert not exact.rolled.any()
     assert not trocar.rolled.any()
 
@@ -67,7 +67,7 @@ def test_needle_that_is_not_turned_is_steered_by_the_guide() -> None:
     fixed = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), SteeringLimits())
     assert_array_equal(fixed.weights > 0.0, ~MODEL.rolled)
     turned = MultiHypothesisLaw(MODEL, (2e-3, 1e-3), SteeringLimits(turns=3))
-    relative = np.where(MODEL.rolled, np.exp(-3.0), 1.0)
+    relative = np.exp(MODEL.logs - 3.0 * MODEL.rolled)
     assert_allclose(turned.weights, relative / relative.sum())
 
 

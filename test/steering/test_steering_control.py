@@ -183,7 +183,8 @@ def test_bending_length_is_identified() -> None:
     """The remaining hypotheses are near the truth, and weights are a distribution."""
     model = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringPrior(skin=0.0))
     controller = MultiHypothesisLaw(model, (3e-3, -2e-3), LIMITS)
-    assert_allclose(controller.weights, 1.0 / len(model.lengths))
+    prior = np.exp(model.logs)
+    assert_allclose(controller.weights, prior / prior.sum())
     steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
     weights = controller.weights
     assert weights.sum() == pytest.approx(1.0, rel=1e-12)
@@ -311,6 +312,29 @@ def test_repeated_gross_errors_are_discounted(seed: int) -> None:
     controller, one = faulty({1 + seed % 3 + 3 * k: error for k, error in enumerate(errors)})
     # As with a jump, or a tip that is lost for 30 mm.
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
+
+
+def test_large_slow_error_of_the_sensor_widens_the_intervals() -> None:
+    """Of three times the prior: the measurements of an insertion show it in part."""
+    size, decay, held, misses = 3.0 * SteeringPrior().drift, np.exp(-0.1), [], []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        error = size * rng.standard_normal(2)
+
+        def measure(tip: FloatArray) -> FloatArray:
+            nonlocal error
+            error = decay * error + size * np.sqrt(1.0 - decay**2) * rng.standard_normal(2)
+            return np.asarray(tip + error + 4e-5 * rng.standard_normal(2))
+
+        controller = MultiHypothesisLaw(MODEL, (2e-3, -1e-3), LIMITS)
+        plant = SteeringPlant(SteeredNeedle(*other(rng.uniform(0.8, 1.2))), DEPTHS)
+        simulate_steering(controller, plant, measure)
+        held.append(controller.expected().contains(plant.tip))
+        misses.append(np.hypot(*(plant.tip - controller.target)))
+    # 67 % hold, and 17 % without this hypothesis; the standard error is 6 %.
+    assert np.mean(held) >= 0.5
+    # The tip cannot be nearer to its target than to its measured position.
+    assert np.median(misses) < 2.0 * size
 
 
 @pytest.mark.requirement('S-143', 'S-144', 'S-146', 'S-148', 'S-251')

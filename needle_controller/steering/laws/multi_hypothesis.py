@@ -136,7 +136,7 @@ class MultiHypothesisLaw(SteeringLaw):
             mean=mean,
             shared=np.empty((count, tips, size), dtype=np.complex128),
             learned=np.zeros((count, tips)),
-            logs=np.where(model.rolled, _ROLLED if turns else -np.inf, 0.0),
+            logs=model.logs + np.where(model.rolled, _ROLLED if turns else -np.inf, 0.0),
             guide=np.zeros(model.steps, dtype=np.complex128),
             turned=np.full((points, model.steps + 1), complex(cos(roll), -sin(roll))),
             roll=np.full(points + 1, roll),
