@@ -4,23 +4,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from math import inf
 from typing import Any, Final, TypeAlias
 
 from benchmarks.steering_graph import GraphFault
-from benchmarks.steering_nodes import COMMAND, CONTROLLER, Posted, ROBOT, STEERING
+from benchmarks.steering_nodes import (
+    CALLS,
+    COMMAND,
+    COMMANDED,
+    CONTRACT,
+    CONTROLLER,
+    DIRECT,
+    GOAL,
+    GOAL_ANSWER,
+    HARDWARE,
+    NODES,
+    Posted,
+    RESPONSE,
+    ROBOT,
+    ROUTES,
+    SERVERS,
+    STEERING,
+)
 from needle_controller.steering.motion import JointMotion
 from needle_ros.contract import (
     BASE_WRENCH,
     DIAGNOSTICS,
+    EMERGENCY_STOP,
     GUIDE_X,
     GUIDE_Z,
     INSERTION,
+    JOINT_COMMANDS,
     JOINT_STATES,
     JOINT_TRAJECTORY,
     SYSTEM_STATE,
     TARGET,
     TIP_DEFLECTION,
 )
+from needle_ros.requests import REPEAT_AFTER, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
@@ -30,7 +52,7 @@ ASIDE: Final = 'x biased by 2 mm'
 OFFSET: Final = 2e-3
 
 #: Delays of messages [s].
-DELAYS: Final = {'late': 0.1, 'very late': 0.6}
+DELAYS: Final = {'late': 0.1, 'very late': 0.6, 'late by 1 s': 1.0}
 
 #: Maps the number of a message since the start of the fault, the message, and the first message
 #: of the fault to the received messages, each with its delay [s].
@@ -113,6 +135,52 @@ _OLD: Final[Alter] = lambda _k, _content, first: ((0.0, first),)  # noqa: E731
 _AXES: Final = _permuted((2, 1, 0), (1.0, 1.0, -1.0))
 _MILLIMETERS: Final[dict[str, Alter]] = {'in mm': _scaled(1e3), 'in km': _scaled(1e-3)}
 
+_TRAJECTORY: Final[dict[str, Alter]] = {
+    **_ANY,
+    'depth biased by 2 mm': _trajectory(lambda p, name: p + 2e-3 * (name == INSERTION)),
+    'guide biased by 1 mm': _trajectory(lambda p, name: p + 1e-3 * (name == GUIDE_X)),
+    'in mm': _trajectory(lambda p, _name: 1e3 * p),
+    'in km': _trajectory(lambda p, _name: 1e-3 * p),
+    'opposite direction': _trajectory(lambda p, _name: -p),
+    'guide axes exchanged': _change(_exchanged),
+}
+
+_LATER: Final[Alter] = lambda _k, content, _first: ((DELAYS['late by 1 s'], content),)  # noqa: E731
+_ONCE: Final[Alter] = lambda k, content, _first: ((0.0, content),) if k else ()  # noqa: E731
+
+
+def _again(delay: float) -> Alter:
+    """Transmit a message again after a delay [s]."""
+    return lambda _k, content, _first: ((0.0, content), (delay, content))
+
+
+#: Faults of a stop on the emergency topic; frozen: a device repeats it ten times a second.
+_EMERGENCY: Final[dict[str, Alter]] = {
+    **_LOST,
+    'late by 1 s': _LATER,
+    'doubled': _ANY['doubled'],
+    'doubled after 1 s': _again(1.0),
+    'frozen': lambda _k, content, _first: tuple((0.1 * n, content) for n in range(10)),
+    'false': _change(lambda _content: False),
+}
+
+#: Faults of the request to a service.
+_REQUEST: Final[dict[str, Alter]] = {
+    'lost': _LOST['lost'],
+    'first lost': _ONCE,
+    'late': _LOST['late'],
+    'very late': _LOST['very late'],
+    'late by 1 s': _LATER,
+    'doubled': _ANY['doubled'],
+    'doubled after 1 s': _again(1.0),
+}
+
+#: Faults of the response of a service.
+_RESPONSE: Final[dict[str, Alter]] = {'lost': _LOST['lost'], 'first lost': _ONCE}
+
+#: Time from a request to its arrival, if it is not immediate [s]; infinite: it never arrives.
+ARRIVALS: Final = {**DELAYS, 'lost': inf, 'false': inf, 'first lost': REPEAT_AFTER}
+
 #: Faults by message, or by message and receiver.
 MESSAGES: Final[dict[str, dict[str, Alter]]] = {
     JOINT_STATES.name: {
@@ -154,17 +222,22 @@ MESSAGES: Final[dict[str, dict[str, Alter]]] = {
         'opposite direction': _scaled(-1.0),
         'other frame': _FRAME,
     },
-    JOINT_TRAJECTORY.name: {
+    JOINT_COMMANDS.name: {
         **_ANY,
-        'depth biased by 2 mm': _trajectory(lambda p, name: p + 2e-3 * (name == INSERTION)),
-        'guide biased by 1 mm': _trajectory(lambda p, name: p + 1e-3 * (name == GUIDE_X)),
-        'in mm': _trajectory(lambda p, _name: 1e3 * p),
-        'in km': _trajectory(lambda p, _name: 1e-3 * p),
-        'opposite direction': _trajectory(lambda p, _name: -p),
-        'guide axes exchanged': _change(_exchanged),
+        'depth biased by 2 mm': _shifted(0, 2e-3),
+        'guide biased by 1 mm': _shifted(1, 1e-3),
+        **_MILLIMETERS,
+        'opposite direction': _scaled(-1.0),
+        'guide axes exchanged': _permuted((0, 2, 1), (1.0, 1.0, 1.0)),
     },
-    f'{JOINT_TRAJECTORY.name} to {CONTROLLER}': _LOST,
-    f'{JOINT_TRAJECTORY.name} to {ROBOT}': _LOST,
+    JOINT_TRAJECTORY.name: _TRAJECTORY,
+    f'{JOINT_TRAJECTORY.name} to {CONTROLLER}': _TRAJECTORY,
+    f'{JOINT_TRAJECTORY.name} to {ROBOT}': _TRAJECTORY,
+    GOAL: _TRAJECTORY,
+    GOAL_ANSWER: {
+        **_ANY,
+        'rejected': _change(lambda answer: replace(answer, verdict=Verdict.REJECTED)),
+    },
     DIAGNOSTICS.name: _ANY,
     SYSTEM_STATE.name: _ANY,
     TARGET.name: {
@@ -177,7 +250,36 @@ MESSAGES: Final[dict[str, dict[str, Alter]]] = {
             lambda aim: (*aim[:2], (aim[2][1], aim[2][0], aim[2][2]))
         ),
     },
+    EMERGENCY_STOP.name: _EMERGENCY,
+    **{f'{EMERGENCY_STOP.name} to {node}': _LOST for node in SERVERS},
+    **dict.fromkeys(CALLS, _REQUEST),
+    **{f'{RESPONSE}{topic}': _RESPONSE for topic in CALLS},
 }
+
+
+#: Topics that exist with some robots only.
+_OF_ROBOTS: Final = {
+    CONTRACT: {COMMAND, JOINT_TRAJECTORY.name},
+    HARDWARE: {COMMAND, JOINT_TRAJECTORY.name},
+    DIRECT: {JOINT_TRAJECTORY.name},
+    COMMANDED: {GOAL, GOAL_ANSWER, JOINT_COMMANDS.name},
+}
+
+
+def places(robot: str) -> list[str]:
+    """Return the messages, or messages to one of several receivers, that a robot has."""
+    return [place for place in MESSAGES if _exists(place, robot)]
+
+
+def _exists(place: str, robot: str) -> bool:
+    topic, _, receiver = place.partition(' to ')
+    if topic in set().union(*_OF_ROBOTS.values()) - _OF_ROBOTS[robot]:
+        return False
+    call = CALLS.get(topic.removeprefix(RESPONSE))
+    if call is not None:
+        return call[1] in NODES[robot]
+    receivers = [name for name in ROUTES[topic] if name in NODES[robot]]
+    return receiver in receivers and len(receivers) > 1 if receiver else bool(receivers)
 
 
 class TopicFault(GraphFault):

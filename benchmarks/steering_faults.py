@@ -17,17 +17,27 @@ import os
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
-from benchmarks.message_faults import ASIDE, DELAYS, MESSAGES, OFFSET, TopicFault
+from benchmarks.message_faults import ARRIVALS, ASIDE, DELAYS, MESSAGES, OFFSET, places, TopicFault
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
-from benchmarks.steering_nodes import COMMAND, GraphNode, HARDWARE, NODES, RATE, ROBOTS, SPEED
+from benchmarks.steering_nodes import (
+    CALLS,
+    COMMAND,
+    GraphNode,
+    HARDWARE,
+    NODES,
+    RATE,
+    RESPONSE,
+    ROBOTS,
+    SPEED,
+)
 from needle_controller.steering.motion_control import BRAKING
-from needle_dynamics.arrays import FloatArray
-from needle_ros.contract import TARGET, TIP_DEFLECTION
+from needle_ros.contract import EMERGENCY_STOP, TARGET, TIP_DEFLECTION
 from needle_ros.event_log import Severity
 from needle_ros.process_pool import processes
+from needle_ros.requests import REPEATS
 from needle_ros.status import SteeringPhase as Phase
-from needle_ros.system_state import STOP
+from needle_ros.system_state import CLEAR_STOP, Mode, PAUSE, RESUME, RETRACT, RETRACT_DEPTH, STOP
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -58,8 +68,14 @@ _HIT: Final = 1e-3
 BRAKING_DISTANCE: Final = SPEED * (0.5 * BRAKING + 2.0 / RATE)
 
 #: Outcomes of an insertion.
-OUTCOMES: Final = ('hit', 'warning', 'stopped', 'ended')
-MISSED, RESTLESS = 'miss without a warning', 'no rest'
+OUTCOMES: Final = ('hit', 'warning', 'stopped', 'paused', 'retracted', 'ended')
+MISSED, RESTLESS, IGNORED = 'miss without a warning', 'no rest', 'request not executed'
+
+#: Largest motion into the tissue after a clearance: nothing moves [m].
+_NOTHING: Final = 1e-4
+
+#: Tolerances of the end of a retraction: depth and guide [m].
+_WITHDRAWN: Final = 5e-4
 
 #: Faults of nodes, with their duration [s].
 NODE_FAULTS: Final = {
@@ -121,22 +137,42 @@ def cells() -> list[SteeringCell]:
     """Return all cells."""
     found = []
     for robot, continuous, phase in product(ROBOTS, (False, True), PHASES):
-        for place, faults in MESSAGES.items():
+        for place in places(robot):
+            faults = MESSAGES[place]
             found += [SteeringCell(robot, continuous, place, fault, phase) for fault in faults]
-            if phase == INSERTING:
+            if phase == INSERTING and word_of(place) is None:
                 found += [
                     SteeringCell(robot, continuous, place, fault, phase, _BRIEF)
                     for fault in faults
                 ]
         found += [
             SteeringCell(robot, continuous, place, fault, phase, lasts)
-            for place, (fault, lasts) in product(NODES, NODE_FAULTS.items())
+            for place, (fault, lasts) in product(NODES[robot], NODE_FAULTS.items())
         ]
     return found
 
 
+def word_of(place: str) -> str | None:
+    """Return the request of a user that a message transmits, None without one."""
+    if place.startswith(EMERGENCY_STOP.name):
+        return STOP
+    return CALLS.get(place.removeprefix(RESPONSE), (None,))[0]
+
+
+def arrives(cell: SteeringCell) -> float:
+    """Return the time until a request of a user arrives at the first node [s]."""
+    some = cell.place.startswith(RESPONSE) or ' to ' in cell.place
+    return 0.0 if some else ARRIVALS.get(cell.fault, 0.0)
+
+
 def allowed(cell: SteeringCell) -> float:
-    """Return the largest motion into the tissue after a stop [m]; commands may be late."""
+    """Return the largest motion into the tissue after a stop or request [m]; both may be late."""
+    word = word_of(cell.place)
+    if word is not None:
+        if word == CLEAR_STOP and cell.phase != BRAKED:
+            return _NOTHING
+        late = word != CLEAR_STOP and (cell.phase != BRAKED)
+        return BRAKING_DISTANCE + (SPEED * arrives(cell) if late else 0.0)
     if cell.place != COMMAND:
         return BRAKING_DISTANCE
     if cell.robot == HARDWARE and cell.fault in _MISREAD:
@@ -223,7 +259,7 @@ class _Observer:
 
 
 def _begin_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
-    """Begin the fault, and the request of the user in its phase."""
+    """Begin the fault, and the request of the user in its phase or message."""
     if cell.place in MESSAGES:
         graph.fault = TopicFault(cell.place, MESSAGES[cell.place][cell.fault])
     else:
@@ -234,7 +270,14 @@ def _begin_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
             node.paused = True
         else:
             node.runs = False
-    if cell.phase == BRAKED:
+    word = word_of(cell.place)
+    if cell.phase == REST and word is not None:
+        graph.target()
+    if cell.place.startswith(EMERGENCY_STOP.name):
+        graph.post(EMERGENCY_STOP.name, True)
+    elif word is not None:
+        graph.call(cell.place.removeprefix(RESPONSE))
+    elif cell.phase == BRAKED:
         running = [one for one in reversed(graph.nodes.values()) if one.runs and not one.paused]
         running[0].request(STOP, graph.now)
     elif cell.phase == REST or cell.place == TARGET.name:
@@ -250,14 +293,27 @@ def _end_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
         node.start()
 
 
+def _prepare(graph: SteeringGraph, cell: SteeringCell) -> None:
+    """Reach the phase of a fault, and the state that a request of a user ends."""
+    _reach(graph, cell.phase)
+    before = {CLEAR_STOP: STOP, RESUME: PAUSE}.get(word_of(cell.place) or '')
+    if before is None and cell.phase == BRAKED and word_of(cell.place):
+        before = STOP
+    if before is not None:
+        graph.steering.request(before, graph.now)
+        for _ in range(0 if cell.phase == BRAKED else round(_WATCHED * RATE)):
+            graph.step()
+
+
 def measure(cell: SteeringCell) -> SteeringResult:
     """Simulate an insertion with a fault."""
     guide = _ASIDE if cell.continuous and cell.phase == GUIDING else 0.0
     graph = SteeringGraph(cell.robot, continuous=cell.continuous, guide=guide)
-    _reach(graph, cell.phase)
+    _prepare(graph, cell)
     seen = _Observer(graph)
     _begin_fault(graph, cell)
-    if cell.phase == BRAKED:
+    word = word_of(cell.place)
+    if (cell.phase == BRAKED or word is not None) and word != RESUME:
         seen.stop()
     ended = False
     while seen.elapsed < _LONGEST:
@@ -269,40 +325,61 @@ def measure(cell: SteeringCell) -> SteeringResult:
         if graph.reason:
             seen.stop()
         least = _WATCHED + (cell.lasts if isfinite(cell.lasts) else 0.0)
+        if word is not None and isfinite(arrives(cell)):
+            least += 1.0
         if seen.rests and seen.elapsed > least and not _is_busy(graph):
             break
-    return _result(graph, seen, np.array([OFFSET, 0.0, 0.0]) * registers(cell))
+    return _result(graph, seen, cell)
 
 
 def _is_busy(graph: SteeringGraph) -> bool:
-    """Whether an insertion is under way, or a target waits for its answer."""
-    loop, phase = graph.steering.loop, graph.phase
+    """Whether an insertion or retraction is under way, or a request waits for its answer."""
+    loop, phase, called = graph.steering.loop, graph.phase, graph.called
     waits = graph.pending is not None and not graph.pending.done
-    return waits or (phase is not None and (loop.steers or loop.busy))
+    if called is not None and called.success is None and called.repeats < REPEATS:
+        waits = True
+    if phase is None or graph.mode is Mode.PAUSED:
+        return waits
+    return waits or loop.steers or loop.busy or phase is Phase.RETRACTING
 
 
-def _result(graph: SteeringGraph, seen: _Observer, offset: FloatArray) -> SteeringResult:
-    """Return the result; ``offset`` is the position of the world in the frame of the target."""
+def _result(graph: SteeringGraph, seen: _Observer, cell: SteeringCell) -> SteeringResult:
     loop = graph.steering.loop
     aim = AIM
     if loop.law is not None:
         x, z = np.asarray(loop.law.target).tolist()
         aim = x, AIM[1], z
+    # Position of the world in the frame of the target.
+    offset = np.array([OFFSET, 0.0, 0.0]) * registers(cell)
     miss = float(np.linalg.norm(np.subtract(graph.world.tip, aim) + offset))
+    outcome = _outcome(graph, cell, miss)
     if not seen.rests or _is_busy(graph):
         outcome = RESTLESS
-    elif graph.reason:
-        outcome = 'stopped'
-    elif graph.phase is not Phase.DONE:
-        outcome = 'ended'
-    elif graph.severity() is not Severity.INFO:
-        outcome = 'warning'
-    else:
-        outcome = 'hit' if miss <= _HIT else MISSED
     return SteeringResult(
         outcome, miss, seen.advance, seen.deepest, seen.travel, seen.load,
         0.0 if outcome in ('hit', 'warning') else inf if outcome == RESTLESS else seen.safe,
     )  # fmt: skip
+
+
+def _outcome(graph: SteeringGraph, cell: SteeringCell, miss: float) -> str:
+    wanted = {STOP: Mode.STOPPED, PAUSE: Mode.PAUSED, RETRACT: Mode.RETRACTING}
+    mode = wanted.get(word_of(cell.place) or '')
+    if graph.reason:
+        return 'stopped'
+    if mode not in (None, graph.mode) and isfinite(arrives(cell)):
+        return IGNORED
+    if graph.mode is Mode.PAUSED:
+        return 'paused'
+    if graph.mode is Mode.RETRACTING:
+        failed = graph.severity() is not Severity.INFO
+        deep = graph.world.depth > RETRACT_DEPTH + _WITHDRAWN
+        aside = np.abs(graph.world.guide).max() > _WITHDRAWN
+        return IGNORED if (deep or aside) and not failed else 'retracted'
+    if graph.phase is not Phase.DONE:
+        return 'ended'
+    if graph.severity() is not Severity.INFO:
+        return 'warning'
+    return 'hit' if miss <= _HIT else MISSED
 
 
 # Page.
@@ -326,6 +403,11 @@ def compare(tick: Tick, fault: str = '') -> Answer:
         Bar(
             'steered: misses of more than 1 mm without a warning',
             float(sum(one.outcome == MISSED for one in found)),
+            0.0,
+        ),
+        Bar(
+            'steered: requests of a user that are not executed',
+            float(sum(one.outcome == IGNORED for one in found)),
             0.0,
         ),
         Bar('steered: cells without rest', float(sum(o.outcome == RESTLESS for o in found)), 0.0),
@@ -363,7 +445,7 @@ def _section(
                 f'{max(one.safe for one in own):.2f}',
             )
         )
-    kind = 'node ' if place in NODES else ''
+    kind = 'node ' if place not in MESSAGES else ''
     notes = ''
     if place == TIP_DEFLECTION.name:
         notes = (

@@ -8,31 +8,37 @@ Every message passes `SteeringGraph.post`, where a fault may drop, delay, repeat
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from heapq import heappop, heappush
 from math import hypot
 from typing import Any, Final, NamedTuple
 
 from benchmarks.steering_nodes import (
+    COMMANDER,
     CONTROLLER,
     EPOCH,
+    GraphNode,
     NodeNetwork,
+    NODES,
     PERIOD,
     Posted,
     RATE,
+    RESPONSE,
     ROBOT,
-    RobotNode,
     ROUTES,
     SimulatedController,
     SimulatedSteering,
     STEERING,
     USER,
 )
+from benchmarks.steering_robots import CommanderNode, RobotNode
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.simulated.run import Event, TRAJECTORY
 from needle_ros.contract import ENTRY, GUIDE_X, TARGET
 from needle_ros.event_log import Severity
-from needle_ros.requests import PendingRequest
+from needle_ros.requests import PendingRequest, REPEAT_AFTER, REPEATS
 from needle_ros.status import SteeringPhase as Phase
+from needle_ros.system_state import Mode
 
 #: Target of the tip, x, y, z [m].
 AIM: Final = (5e-4, 0.031, -4e-4)
@@ -45,6 +51,23 @@ class World(NamedTuple):
     guide: tuple[float, float]  #: position of the guide [m]
     load: float  #: lateral force of the guide on the needle [N]
     tip: tuple[float, float, float]  #: position of the tip [m]
+
+
+@dataclass(slots=True)
+class ServiceCall:
+    """Call of a service by a user, repeated without a response, as `Calls` does."""
+
+    topic: str
+    begun: float
+    repeats: int = 0
+    success: bool | None = None  #: response; None without one
+
+    def repeat(self, now: float) -> bool:
+        """Return whether the call must be sent again."""
+        elapsed = now - self.begun
+        due = self.repeats < min(REPEATS, int(elapsed / REPEAT_AFTER)) and self.success is None
+        self.repeats += due
+        return due
 
 
 class GraphFault:
@@ -86,17 +109,24 @@ class SteeringGraph(NodeNetwork):
         self.fault = GraphFault()
         self.pending: PendingRequest | None = None
         self._target: tuple[int, str, tuple[float, float, float]] = 0, '', AIM
-        self._robot = RobotNode(self, ROBOT)
-        self.controller = SimulatedController(self, CONTROLLER)
+        self.called: ServiceCall | None = None
+        self.axis = RobotNode(self, ROBOT)
         self.steering = SimulatedSteering(self, STEERING)
-        self.nodes = {one.name: one for one in (self._robot, self.controller, self.steering)}
+        others: dict[str, type[GraphNode]] = {
+            CONTROLLER: SimulatedController, COMMANDER: CommanderNode,
+        }  # fmt: skip
+        for name in NODES[robot]:
+            own = {ROBOT: self.axis, STEERING: self.steering}.get(name)
+            self.nodes[name] = own or others[name](self, name)
         if guide:
             start = {'joints': [GUIDE_X], 'times': [0.1], 'positions': [[guide]], 'efforts': [[]]}
             self.run.perform(Event(TRAJECTORY, start))
+            if isinstance(commander := self.nodes.get(COMMANDER), CommanderNode):
+                commander.place(GUIDE_X, guide)
 
     def post(self, topic: str, content: Any, sender: str = USER) -> None:
         for receiver in ROUTES[topic]:
-            if receiver != sender:
+            if receiver != sender and (receiver == USER or receiver in self.nodes):
                 for one in self.fault.received(receiver, Posted(topic, content)):
                     self._order += 1
                     heappush(self._waiting, (self.now + one.late, self._order, receiver, one))
@@ -106,6 +136,11 @@ class SteeringGraph(NodeNetwork):
         self._target = self.now, ENTRY, point
         self.pending = PendingRequest(TARGET, self.now, STEERING, self.steady)
         self.post(TARGET.name, self._target)
+
+    def call(self, topic: str) -> None:
+        """Call a service, and repeat the call until it has a response."""
+        self.called = ServiceCall(topic, self.steady())
+        self.post(topic, None)
 
     def step(self) -> None:
         """Advance by a period: sample, transmit, check."""
@@ -123,20 +158,25 @@ class SteeringGraph(NodeNetwork):
                 node.publish(again=number % round(RATE) == 0)
         if self.pending is not None and self.pending.repeat():
             self.post(TARGET.name, self._target)
+        if self.called is not None and self.called.repeat(self.steady()):
+            self.post(self.called.topic, None)
         self._deliver()
 
     def _sample(self) -> None:
         """Advance the world, and publish its measurements, unless the needle has left it."""
         if not self._left:
             try:
-                self._robot.measure(self.run.take(self.now), self.now)
+                self.axis.measure(self.run.take(self.now), self.now)
             except InsertionDepthError:
-                self._left, self._robot.runs = True, False
+                self._left, self.axis.runs = True, False
 
     def _deliver(self) -> None:
         while self._waiting and self._waiting[0][0] <= self.now:
             _, _, receiver, posted = heappop(self._waiting)
-            if receiver == USER:
+            if receiver == USER and posted.topic.startswith(RESPONSE):
+                if self.called is not None and self.called.success is None:
+                    self.called.success = posted.content
+            elif receiver == USER:
                 node, status = posted.content
                 if node == STEERING and self.pending is not None:
                     self.pending.take_status(node, status)
@@ -161,6 +201,12 @@ class SteeringGraph(NodeNetwork):
         """Reason of a stop of the system in any running node, '' without a stop."""
         nodes = [one for one in self.nodes.values() if one.runs]
         return next((one.authority.reason for one in nodes if one.authority.reason), '')
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the system in the first running node."""
+        nodes = [one for one in self.nodes.values() if one.runs and not one.paused]
+        return nodes[0].authority.mode if nodes else Mode.STOPPED
 
     @property
     def phase(self) -> Phase | None:

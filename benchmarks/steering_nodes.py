@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
@@ -32,13 +32,13 @@ from needle_controller.steering.motion import JointMotion
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NEEDLES
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.run import Event, follow, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.run import PlantRun
 from needle_ros.contract import (
     BASE,
     BASE_WRENCH,
     DIAGNOSTICS,
-    ENTRY,
-    INSERTION,
+    EMERGENCY_STOP,
+    JOINT_COMMANDS,
     JOINT_STATES,
     JOINT_TRAJECTORY,
     SYSTEM_STATE,
@@ -46,11 +46,10 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
     WRENCH_COMMAND,
 )
-from needle_ros.requests import RequestLog, Verdict
-from needle_ros.system_state import Authority, Mode
+from needle_ros.requests import Acknowledgement, RequestLog, RequestStatus
+from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import JointPath
-from needle_ros.waiting_requests import WaitingRequests
 from needle_ros.wire import Reading
 
 #: Rate of samples [Hz], and start time [ns].
@@ -58,28 +57,51 @@ RATE: Final = 50.0
 EPOCH: Final = 1_700_000_000 * NANOSECONDS
 PERIOD: Final = round(NANOSECONDS / RATE)
 
-#: Kinds of robots: force commands on the topics of the contract without an adapter, or position
-#: commands in mm, away from the tissue, through the adapter of the controller.
-CONTRACT, HARDWARE = 'contract', 'hardware'
-ROBOTS: Final = (CONTRACT, HARDWARE)
+#: Kinds of robots: force commands on the topics of the contract without an adapter; position
+#: commands in mm, away from the tissue, through the adapter of the controller; positions that
+#: follow the trajectories of `steering`; positions by `joint_commands` of a commander
+#: (ros2_control) that follows goals of `steering`. The last two have no controller.
+CONTRACT, HARDWARE, DIRECT, COMMANDED = 'contract', 'hardware', 'direct', 'commanded'
+ROBOTS: Final = (CONTRACT, HARDWARE, DIRECT, COMMANDED)
 
-#: Topic of the commands of either robot.
+#: Topic of the commands of the first two robots; goals of an action, and their answers.
 COMMAND: Final = WRENCH_COMMAND.name
+GOAL, GOAL_ANSWER = 'goal', 'goal answer'
 
 #: Nodes.
 ROBOT, CONTROLLER, STEERING, USER = 'robot', 'controller', 'steering', 'user'
-NODES: Final = (ROBOT, CONTROLLER, STEERING)
+COMMANDER: Final = 'commander'
+NODES: Final = {
+    CONTRACT: (ROBOT, CONTROLLER, STEERING),
+    HARDWARE: (ROBOT, CONTROLLER, STEERING),
+    DIRECT: (ROBOT, STEERING),
+    COMMANDED: (ROBOT, COMMANDER, STEERING),
+}
 
-#: Receivers of each topic.
+#: Nodes with the services of a user, and the words of these services.
+SERVERS: Final = (ROBOT, CONTROLLER, STEERING)
+WORDS: Final = (STOP, PAUSE, RESUME, RETRACT, CLEAR_STOP)
+
+#: Requests to a service by topic, and the topic of the response.
+CALLS: Final = {f'{word} at {node}': (word, node) for word in WORDS for node in SERVERS}
+RESPONSE: Final = 'response of '
+
+#: Receivers of each topic, where they exist.
 ROUTES: Final = {
     BASE_WRENCH.name: (CONTROLLER,),
     TIP_DEFLECTION.name: (CONTROLLER, STEERING),
     JOINT_STATES.name: (CONTROLLER, STEERING),
     COMMAND: (ROBOT,),
+    JOINT_COMMANDS.name: (ROBOT,),
     JOINT_TRAJECTORY.name: (CONTROLLER, ROBOT),
+    GOAL: (COMMANDER,),
+    GOAL_ANSWER: (STEERING,),
     DIAGNOSTICS.name: (STEERING, USER),
-    SYSTEM_STATE.name: NODES,
+    SYSTEM_STATE.name: SERVERS,
     TARGET.name: (STEERING,),
+    EMERGENCY_STOP.name: SERVERS,
+    **{topic: (node,) for topic, (_, node) in CALLS.items()},
+    **{f'{RESPONSE}{topic}': (USER,) for topic in CALLS},
 }
 
 #: Messages that a paused node keeps.
@@ -102,7 +124,7 @@ SETTINGS: Final = ExecutiveSettings(
 )  # fmt: skip
 
 #: Robot with position commands: its joint points out of the tissue, in mm, with an offset.
-_SLIDE: Final = HardwareSettings(
+SLIDE: Final = HardwareSettings(
     joint='slide', sign=-1.0, scale=1e-3, zero=120.0, command='position', speed=0.05,
     command_type='joint_state', command_topic='slide_command', state_topic='slide_states',
 )  # fmt: skip
@@ -135,7 +157,8 @@ class NodeNetwork(ABC):
     def __init__(self, robot: str, *, continuous: bool) -> None:
         self.robot, self.continuous = robot, continuous
         self.now = EPOCH
-        self.run = PlantRun({**_WORLD, 'mode': 'robot' if robot == HARDWARE else 'simulation'})
+        mode = 'simulation' if robot == CONTRACT else 'robot'
+        self.run = PlantRun({**_WORLD, 'mode': mode})
         self.nodes: dict[str, GraphNode] = {}
 
     def steady(self) -> float:
@@ -180,7 +203,7 @@ class GraphNode(ABC):
         """Create the object behind the node, and activate it."""
 
     @abstractmethod
-    def take(self, topic: str, content: Any, now: int) -> None:
+    def take(self, topic: str, content: Any, now: int, /) -> None:
         """Process a message."""
 
     @abstractmethod
@@ -201,8 +224,8 @@ class GraphNode(ABC):
         """Check for missing inputs."""
 
     @abstractmethod
-    def request(self, word: str, now: int) -> None:
-        """Execute a request of a user."""
+    def request(self, word: str, now: int) -> bool:
+        """Execute a request of a user; return whether it was not refused."""
 
     def receive(self, posted: Posted, now: int) -> None:
         """Take a message, or keep it while paused."""
@@ -212,6 +235,12 @@ class GraphNode(ABC):
             self.authority.receive(posted.content)
             if self.authority.changed:
                 self.obey(now)
+        elif self.runs and posted.topic == EMERGENCY_STOP.name:
+            if posted.content:
+                self.request(STOP, now)
+        elif self.runs and posted.topic in CALLS:
+            success = self.request(CALLS[posted.topic][0], now)
+            self.graph.post(f'{RESPONSE}{posted.topic}', success, self.name)
         elif self.runs:
             self.take(posted.topic, posted.content, now)
 
@@ -234,94 +263,6 @@ class GraphNode(ABC):
             self.graph.post(DIAGNOSTICS.name, content, self.name)
 
 
-class RobotNode(GraphNode):
-    """Driver of the robot and the sensors, as `PlantNode`."""
-
-    def _begin(self) -> None:
-        graph, self._mode = self.graph, Mode.RUNNING
-        self._moved = GUIDE_JOINTS
-        self._log = RequestLog({JOINT_TRAJECTORY: self._moved}, steady=graph.steady)
-        self._waiting = WaitingRequests(self._log)
-        #: Time of the newest sample, 0 before the first [ns].
-        self._sampled = 0
-        graph.run.begin()
-        graph.run.commands.count_commanders(1)
-        self.obey(graph.now)
-
-    @property
-    def requests(self) -> RequestLog:
-        return self._log
-
-    def measure(self, measured: Iterable[tuple[str, int, Sequence[float]]], now: int) -> None:
-        """Publish the measurements of a sample."""
-        if not self.runs or self.paused:
-            return
-        for name, _, values in measured:
-            if name in ROUTES:
-                self.graph.post(name, _reading(name, now, values), self.name)
-        self._sampled = now
-        self._waiting.execute(now + PERIOD, self.graph.run, 0.0)
-
-    def take(self, topic: str, content: Any, now: int) -> None:
-        run = self.graph.run
-        if topic == JOINT_TRAJECTORY.name:
-            self._follow(content, now)
-        elif self.graph.robot == HARDWARE:
-            ((position,), *_) = content.values
-            depth = _SLIDE.sign * _SLIDE.scale * (position - _SLIDE.zero)
-            own = content._replace(names=(INSERTION,), values=((depth,), (), ()))
-            run.command_joints(own, now)
-        else:
-            _, force, _, torque, _, _ = content.values[0]
-            run.commands.offer(content.stamp, content.frame, force, torque, now)
-
-    def _follow(self, move: JointMotion, now: int) -> None:
-        """Follow the guide in a trajectory, from its stamp on, as `PlantTrajectories`."""
-        own = [k for k, name in enumerate(move.joints) if name in self._moved]
-        joints = [move.joints[k] for k in own]
-        stopped, log, topic = self.authority.reason, self._log, JOINT_TRAJECTORY
-        if not own or log.check(topic, move.stamp, now, '', joints) is not None:
-            return
-        if stopped:
-            log.answer(topic, move.stamp, Verdict.SUPERSEDED, f'stopped: {stopped}')
-            return
-        times, positions = move.times.tolist(), move.positions[:, own].tolist()
-        path = JointPath(joints, times, positions, efforts=[[]] * len(times))
-        request = self._waiting.add(topic, move.stamp, joints, partial(follow, path, joints))
-        sampled = self._sampled or now
-        self._waiting.execute(sampled + PERIOD, self.graph.run, request.elapsed(sampled))
-
-    def request(self, word: str, now: int) -> None:
-        self.authority.request(word)
-        self.obey(now)
-
-    def watch(self, now: int) -> None:
-        self.obey(now)
-
-    def obey(self, now: int) -> None:
-        mode, before = self.authority.mode, self._mode
-        self._mode = mode
-        if mode in (Mode.STOPPED, Mode.RETRACTING) and mode is not before:
-            self._log.supersede(now)
-            self._waiting.end(f'the system is {mode.value}', Verdict.SUPERSEDED)
-        if mode is Mode.STOPPED and mode is not before:
-            self._halt()
-        self.graph.run.commands.stopped = mode is Mode.STOPPED and self.graph.robot == CONTRACT
-
-    def stop(self, _now: int) -> None:
-        self._halt()
-        self.runs = False
-
-    def _halt(self) -> None:
-        """Stop the guide, and the needle; a foreign driver is stopped by the controller only."""
-        if self.graph.robot == CONTRACT:
-            self.graph.run.halt()
-            return
-        at = [*self.graph.guide.values()]
-        rest = {'joints': GUIDE_JOINTS, 'times': [0.05], 'positions': [at], 'efforts': [[]]}
-        self.graph.run.perform(Event(TRAJECTORY, rest))
-
-
 class SimulatedController(GraphNode):
     """Axial supervisor, as the node of the same name."""
 
@@ -331,7 +272,7 @@ class SimulatedController(GraphNode):
         supervisor.authority = self.authority
         self._adapter: Robot | None = None
         if graph.robot == HARDWARE:
-            self._adapter = Robot(_SLIDE)
+            self._adapter = Robot(SLIDE)
             self._adapter.configure(controller)
         supervisor.receive(targets=False)
         supervisor.configure(controller, SafetyLimits(), None, self._adapter)
@@ -367,8 +308,10 @@ class SimulatedController(GraphNode):
     def obey(self, now: int) -> None:
         self._act(self._supervisor.obey(now))
 
-    def request(self, word: str, now: int) -> None:
-        self._act(self._supervisor.request(word, now)[2])
+    def request(self, word: str, now: int) -> bool:
+        success, _, command = self._supervisor.request(word, now)
+        self._act(command)
+        return success
 
     def watch(self, now: int) -> None:
         self._act(self._supervisor.watch(now, _SOURCES))
@@ -388,7 +331,7 @@ class SimulatedController(GraphNode):
             positions = self._adapter.command(answer, supervisor.bending.load, stopped=stopped)
             if positions is None:
                 return
-            command = Reading(answer.stamp, '', (_SLIDE.joint,), (tuple(positions), (), ()))
+            command = Reading(answer.stamp, '', (SLIDE.joint,), (tuple(positions), (), ()))
         self.graph.post(COMMAND, command, self.name)
 
 
@@ -401,6 +344,7 @@ class SimulatedSteering(GraphNode):
             NEEDLE, STEERING_CONSTANTS, PRIOR, settings, steady=self.graph.steady
         )
         self.loop.authority = self.authority
+        self._goal: JointMotion | None = None  #: last goal, as `TrajectoryClient`
 
     @property
     def requests(self) -> RequestLog:
@@ -415,6 +359,9 @@ class SimulatedSteering(GraphNode):
         elif topic == TARGET.name:
             stamp, frame, point = content
             self._act(loop.target(stamp, frame, point, now))
+        elif topic == GOAL_ANSWER:
+            if self._goal is not None and content.stamp == self._goal.stamp:
+                self._report(self._goal, (content,), now)
         else:
             node, status = content
             if status.takes:
@@ -423,8 +370,10 @@ class SimulatedSteering(GraphNode):
     def obey(self, now: int) -> None:
         self._act(self.loop.obey(now))
 
-    def request(self, word: str, now: int) -> None:
-        self._act(self.loop.request(word, now)[2])
+    def request(self, word: str, now: int) -> bool:
+        success, _, move = self.loop.request(word, now)
+        self._act(move)
+        return success
 
     def watch(self, now: int) -> None:
         self.obey(now)
@@ -435,9 +384,20 @@ class SimulatedSteering(GraphNode):
         self.runs = False
 
     def _act(self, move: JointMotion | None) -> None:
-        """Send a motion."""
-        if move is not None:
+        """Send a motion, or a goal."""
+        if move is None:
+            return
+        if self.graph.robot == COMMANDED:
+            self._goal = move
+            self._report(move, (), self.graph.now)
+            self.graph.post(GOAL, move, self.name)
+        else:
             self.graph.post(JOINT_TRAJECTORY.name, move, self.name)
+
+    def _report(self, goal: JointMotion, answers: tuple[Acknowledgement, ...], now: int) -> None:
+        """Process the answers to a goal, as `TrajectoryClient`."""
+        status = RequestStatus({JOINT_TRAJECTORY.name: goal.joints}, answers)
+        self._act(self.loop.receive(COMMANDER, status, now))
 
 
 #: Publishers of commands and measurements, as counted by the controller.
@@ -451,18 +411,7 @@ def _controller() -> Controller:
     return Controller(NEEDLE, settings=ControllerSettings(rate=RATE), limits=limits)
 
 
-def _reading(name: str, stamp: int, values: Sequence[float]) -> Reading:
-    """Return a measurement as a message."""
-    if name != JOINT_STATES.name:
-        frame = ENTRY if name == TIP_DEFLECTION.name else BASE
-        return Reading(stamp, frame, (), (tuple(values),))
-    names = (INSERTION, *GUIDE_JOINTS)
-    count = len(names)
-    columns = tuple(tuple(values[k : k + count]) for k in range(0, 3 * count, count))
-    return Reading(stamp, '', names, columns)
-
-
 def _of_slide(reading: Reading) -> Reading:
     """Return the joint states of the robot with position commands, without velocities."""
-    position = reading.values[0][0] / (_SLIDE.sign * _SLIDE.scale) + _SLIDE.zero
-    return Reading(reading.stamp, '', (_SLIDE.joint,), ((position,), (), ()))
+    position = reading.values[0][0] / (SLIDE.sign * SLIDE.scale) + SLIDE.zero
+    return Reading(reading.stamp, '', (SLIDE.joint,), ((position,), (), ()))
