@@ -47,10 +47,6 @@ from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Lateral bias of the tip sensor [m].
-ASIDE: Final = 'x biased by 2 mm'
-OFFSET: Final = 2e-3
-
 #: Delays of messages [s].
 DELAYS: Final = {'late': 0.1, 'very late': 0.6, 'late by 1 s': 1.0}
 
@@ -198,7 +194,7 @@ MESSAGES: Final[dict[str, dict[str, Alter]]] = {
     TIP_DEFLECTION.name: {
         **_ANY,
         'frozen, old stamps': _OLD,
-        ASIDE: _shifted(0, OFFSET),
+        'x biased by 2 mm': _shifted(0, 2e-3),
         'depth biased by 2 mm': _shifted(1, 2e-3),
         **_MILLIMETERS,
         'other frame': _FRAME,

@@ -17,7 +17,7 @@ import os
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
-from benchmarks.message_faults import ARRIVALS, ASIDE, DELAYS, MESSAGES, OFFSET, places, TopicFault
+from benchmarks.message_faults import ARRIVALS, DELAYS, MESSAGES, places, TopicFault
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
 from benchmarks.steering_nodes import (
@@ -32,7 +32,7 @@ from benchmarks.steering_nodes import (
     SPEED,
 )
 from needle_controller.steering.motion_control import BRAKING
-from needle_ros.contract import EMERGENCY_STOP, TARGET, TIP_DEFLECTION
+from needle_ros.contract import EMERGENCY_STOP, TARGET
 from needle_ros.event_log import Severity
 from needle_ros.process_pool import processes
 from needle_ros.requests import REPEATS
@@ -178,16 +178,6 @@ def allowed(cell: SteeringCell) -> float:
     if cell.robot == HARDWARE and cell.fault in _MISREAD:
         return inf
     return BRAKING_DISTANCE + SPEED * DELAYS.get(cell.fault, 0.0)
-
-
-def registers(cell: SteeringCell) -> bool:
-    """
-    Return whether a bias of the tip sensor is an offset of its frame.
-
-    It begins before the first measurement and lasts: target and tip are then in this frame.
-    """
-    first = cell.phase == REST or (cell.continuous and cell.phase in (GUIDING, LOOKING))
-    return (cell.place, cell.fault, cell.lasts) == (TIP_DEFLECTION.name, ASIDE, inf) and first
 
 
 def _reach(graph: SteeringGraph, phase: str) -> None:
@@ -349,9 +339,7 @@ def _result(graph: SteeringGraph, seen: _Observer, cell: SteeringCell) -> Steeri
     if loop.law is not None:
         x, z = np.asarray(loop.law.target).tolist()
         aim = x, AIM[1], z
-    # Position of the world in the frame of the target.
-    offset = np.array([OFFSET, 0.0, 0.0]) * registers(cell)
-    miss = float(np.linalg.norm(np.subtract(graph.world.tip, aim) + offset))
+    miss = float(np.linalg.norm(np.subtract(graph.world.tip, aim)))
     outcome = _outcome(graph, cell, miss)
     if not seen.rests or _is_busy(graph):
         outcome = RESTLESS
@@ -447,12 +435,6 @@ def _section(
         )
     kind = 'node ' if place not in MESSAGES else ''
     notes = ''
-    if place == TIP_DEFLECTION.name:
-        notes = (
-            'A bias along x that begins before the first measurement and lasts is an offset of '
-            'the frame of the sensor, in which target and tip are then given: the miss of these '
-            'cells is measured in this frame. It is not detected.'
-        )
     if place == COMMAND:
         notes = (
             'A driver that misreads its position commands (biased, in another unit or direction) '

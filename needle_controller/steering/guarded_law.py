@@ -50,6 +50,7 @@ class GuardedLaw:
         self.measured: AveragedTipMeasurement | None = None  #: last measurement
         self._scatter = 0.0  #: largest deviation of a reading of the tip so far [m]
         self._ahead: float | None = None  #: first depth of the tip less the insertion depth [m]
+        self._aside = 0.0  #: first distance of the tip from the guide, which is at zero [m]
         #: Successive missing and identical measurements, and the last measurement [m].
         self._missing = self._same = 0
         self._last = np.full(2, nan)
@@ -89,6 +90,8 @@ class GuardedLaw:
         """Pass a measurement at a depth number to the law; it may have no readings."""
         depth = float(self.depths[at]) if depth is None else depth
         self._take(readings.average(self._noise), at, depth)
+        if at == 0 and self._aside > HIT:
+            self._events.add(Severity.WARNING, self._frame())
 
     def _take(self, measured: AveragedTipMeasurement | None, at: int, depth: float) -> None:
         self.measured = measured
@@ -101,6 +104,8 @@ class GuardedLaw:
         if measured is not None:
             self._check_slip(measured, depth)
             tip = measured.tip[[0, 2]]
+            if at == 0:
+                self._aside = float(np.hypot(*tip))
             self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
             noise = max(measured.error, self._scatter / sqrt(measured.readings))
         self._check_sensor(tip)
@@ -167,6 +172,10 @@ class GuardedLaw:
             self._events.add(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
         return to
 
+    def _frame(self) -> str:
+        shift = f'the tip was {1e3 * self._aside:.2f} mm beside the guide before the insertion'
+        return f'{shift}: tilt of the guide, or origin of the sensor, whose frame the target has'
+
     def outcome(self) -> tuple[str, Severity]:
         """Describe the tip at the end; a warning unless it is within 1 mm with its interval."""
         there, measured = self.expected, self.measured
@@ -184,6 +193,8 @@ class GuardedLaw:
             for axis, center, width in zip('xyz', tip, half, strict=True)
         )
         line = f'the tip is at {words} (95 %), {1e3 * miss:.2f} mm from the target'
+        if self._aside > HIT:
+            return f'{line}; {self._frame()}', Severity.WARNING
         if most <= HIT:
             return line, Severity.INFO
         return f'{line}, at most {1e3 * most:.2f} mm', Severity.WARNING

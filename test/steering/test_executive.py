@@ -115,6 +115,24 @@ def test_uncertain_hit_is_a_warning(off: float, half: float, severity: Severity)
     assert ('at most' in line) == (severity is Severity.WARNING)
 
 
+@pytest.mark.requirement('S-300')
+@pytest.mark.parametrize(('offset', 'severity'), [(0.0, Severity.INFO), (2e-3, Severity.WARNING)])
+def test_tip_beside_the_guide_is_a_warning(offset: float, severity: Severity) -> None:
+    """A shift of the sensor frame is reported; the tilt of the guide alone is less than 1 mm."""
+    robot = Robot()
+    robot.sees = lambda tip: np.add(tip, (offset, 0.0, 0.0))
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    line, found = robot.loop._insertion.law.outcome()
+    warned = severity is Severity.WARNING
+    assert found is severity
+    assert ('mm beside the guide' in line) == warned
+    reported = [
+        k for k, (_, line) in enumerate(robot.loop.events.take()) if line.startswith('the tip')
+    ]
+    assert bool(reported) == warned
+
+
 @pytest.mark.requirement('S-124')
 def test_late_and_lost_readings_are_tolerated() -> None:
     """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
