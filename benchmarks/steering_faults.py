@@ -386,7 +386,12 @@ def compare(tick: Tick, fault: str = '') -> Answer:
         return [], []
     tick('steered insertions')
     found = measure_all(chosen, os.cpu_count() or 1)
-    sections = [_section(place, chosen, found) for place in dict.fromkeys(c.place for c in chosen)]
+    heads = dict.fromkeys(_place(cell) for cell in chosen)
+    sections = [_section(head, chosen, found) for head in heads]
+    beyond = [
+        cell.place for cell, one in zip(chosen, found, strict=True) if one.advance > allowed(cell)
+    ]
+    cleared = sum(word_of(place) == CLEAR_STOP for place in beyond)
     bars = [
         Bar(
             'steered: misses of more than 1 mm without a warning',
@@ -402,7 +407,12 @@ def compare(tick: Tick, fault: str = '') -> Answer:
         Bar(
             'steered: cells that move into the tissue after a stop by more than the braking '
             'distance',
-            float(sum(o.advance > allowed(c) for c, o in zip(chosen, found, strict=True))),
+            float(len(beyond) - cleared),
+            0.0,
+        ),
+        Bar(
+            'steered: clearances of a stop after which the needle moves into the tissue',
+            float(cleared),
             0.0,
         ),
     ]
@@ -411,16 +421,26 @@ def compare(tick: Tick, fault: str = '') -> Answer:
     return sections, bars
 
 
+def _place(cell: SteeringCell) -> str:
+    """Return the message or node of a cell; requests of a user at all nodes are one."""
+    call = CALLS.get(cell.place.removeprefix(RESPONSE))
+    return f'~/{call[0]}' if call else cell.place
+
+
+def _fault(cell: SteeringCell) -> str:
+    return f'response {cell.fault}' if cell.place.startswith(RESPONSE) else cell.fault
+
+
 def _section(
     place: str, chosen: Sequence[SteeringCell], found: Sequence[SteeringResult]
 ) -> PageSection:
     """Return the table of a message or node: one row per fault, over all phases and robots."""
     rows = []
-    for fault in dict.fromkeys(cell.fault for cell in chosen if cell.place == place):
+    for fault in dict.fromkeys(_fault(cell) for cell in chosen if _place(cell) == place):
         own = [
             one
             for cell, one in zip(chosen, found, strict=True)
-            if (cell.place, cell.fault) == (place, fault)
+            if (_place(cell), _fault(cell)) == (place, fault)
         ]
         rows.append(
             (
@@ -433,7 +453,7 @@ def _section(
                 f'{max(one.safe for one in own):.2f}',
             )
         )
-    kind = 'node ' if place not in MESSAGES else ''
+    kind = 'node ' if place in set().union(*NODES.values()) else ''
     notes = ''
     if place == COMMAND:
         notes = (

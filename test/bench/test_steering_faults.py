@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from math import inf
+from typing import Final
 
 from benchmarks import steering_faults
-from benchmarks.message_faults import MESSAGES
+from benchmarks.message_faults import MESSAGES, places
 from benchmarks.steering_faults import (
     allowed,
-    BRAKING_DISTANCE,
     cells,
     measure,
     NODE_FAULTS,
@@ -17,9 +17,31 @@ from benchmarks.steering_faults import (
     PHASES,
     SteeringCell,
 )
-from benchmarks.steering_nodes import NODES, ROBOTS, ROUTES
+from benchmarks.steering_nodes import CALLS, NODES, ROBOTS, ROUTES
 import numpy as np
 import pytest
+
+#: Place, fault, phase and duration of a fault, and the possible outcomes.
+_SAMPLE: Final = [
+    ('joint_states', 'lost', 'inserting', inf, {'stopped'}),
+    ('joint_states', 'doubled', 'inserting', inf, {'hit'}),
+    ('base_wrench', 'in mN', 'measuring', inf, {'stopped'}),
+    ('/diagnostics', 'lost', 'guiding', inf, {'hit'}),
+    ('target', 'in mm', 'at rest', inf, {'ended'}),
+    ('steering', 'killed', 'inserting', inf, {'ended'}),
+    ('controller', 'stopped', 'braking', inf, {'stopped'}),
+    ('joint_trajectory to controller', 'in mm', 'measuring', inf, {'stopped'}),
+    ('goal', 'lost', 'inserting', inf, {'stopped'}),
+    ('joint_commands', 'in mm', 'inserting', inf, {'stopped'}),
+    ('joint_trajectory', 'lost', 'guiding', inf, {'stopped'}),
+    ('emergency_stop', 'late', 'inserting', inf, {'stopped'}),
+    ('emergency_stop to steering', 'lost', 'guiding', inf, {'stopped'}),
+    ('emergency_stop', 'lost', 'inserting', inf, {'hit'}),
+    ('pause at robot', 'doubled after 1 s', 'inserting', inf, {'paused'}),
+    ('retract at steering', 'first lost', 'inserting', inf, {'retracted'}),
+    ('resume at steering', 'late', 'guiding', inf, {'hit'}),
+    ('response of stop at robot', 'first lost', 'measuring', inf, {'stopped'}),
+]
 
 
 @pytest.mark.requirement('S-185')
@@ -30,7 +52,11 @@ def test_steered_cells_cover_messages_nodes_and_phases() -> None:
     assert {cell.robot for cell in all_cells} == {*ROBOTS}
     assert {cell.phase for cell in all_cells} == {*PHASES}
     assert {name.partition(' to ')[0] for name in MESSAGES} == {*ROUTES}
-    assert {cell.fault for cell in all_cells if cell.place in NODES} == {*NODE_FAULTS}
+    nodes = {name for robot in ROBOTS for name in NODES[robot]}
+    assert {cell.place for cell in all_cells} == {*MESSAGES} | nodes
+    assert {cell.fault for cell in all_cells if cell.place in nodes} == {*NODE_FAULTS}
+    requests = {(cell.place, cell.phase) for cell in all_cells if cell.place in CALLS}
+    assert requests == {(place, phase) for place in CALLS for phase in PHASES}
 
 
 @pytest.mark.requirement('S-186')
@@ -45,29 +71,25 @@ def test_random_cells_rest_without_an_unnoticed_miss(seed: int) -> None:
 
 
 @pytest.mark.requirement('S-186')
-@pytest.mark.parametrize('robot', ROBOTS)
 @pytest.mark.parametrize('continuous', [False, True])
 @pytest.mark.parametrize(
-    ('place', 'fault', 'phase', 'lasts', 'outcomes'),
+    ('robot', 'place', 'fault', 'phase', 'lasts', 'outcomes'),
     [
-        ('joint_states', 'lost', 'inserting', inf, {'stopped'}),
-        ('joint_states', 'doubled', 'inserting', inf, {'hit'}),
-        ('base_wrench', 'in mN', 'measuring', inf, {'stopped'}),
-        ('/diagnostics', 'lost', 'guiding', inf, {'hit'}),
-        ('target', 'in mm', 'at rest', inf, {'ended'}),
-        ('steering', 'killed', 'inserting', inf, {'ended'}),
-        ('controller', 'stopped', 'braking', inf, {'stopped'}),
+        (robot, *row)
+        for robot in ROBOTS
+        for row in _SAMPLE
+        if row[0] in (*places(robot), *NODES[robot])
     ],
 )
 def test_outcome_of_a_steered_cell_is_measured(
     robot: str, continuous: bool, place: str, fault: str, phase: str, lasts: float,
     outcomes: set[str],
 ) -> None:  # fmt: skip
-    """With both robots and strategies; reproducible."""
+    """With all robots that have the message or node, and both strategies; reproducible."""
     cell = SteeringCell(robot, continuous, place, fault, phase, lasts)
     found = measure(cell)
     assert found.outcome in outcomes
-    assert found.advance <= BRAKING_DISTANCE
+    assert found.advance <= allowed(cell)
     if robot == ROBOTS[0]:
         assert measure(cell) == found
 
