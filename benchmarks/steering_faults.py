@@ -23,12 +23,16 @@ from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
 from benchmarks.steering_nodes import (
     CALLS,
     COMMAND,
+    DIRECT,
     GraphNode,
     HARDWARE,
     NODES,
     RATE,
     RESPONSE,
+    ROBOT,
     ROBOTS,
+    SERVERS,
+    SETTINGS,
     SPEED,
 )
 from needle_controller.steering.motion_control import BRAKING
@@ -173,6 +177,10 @@ def allowed(cell: SteeringCell) -> float:
             return _NOTHING
         late = word != CLEAR_STOP and (cell.phase != BRAKED)
         return BRAKING_DISTANCE + (SPEED * arrives(cell) if late else 0.0)
+    if cell.robot == DIRECT and cell.place == ROBOT and cell.fault != 'stopped':
+        # No stop reaches this robot: it follows its trajectory, at most to the end.
+        path = AIM[1] if cell.continuous else SETTINGS.step_length
+        return BRAKING_DISTANCE + min(path, SPEED * cell.lasts)
     if cell.place != COMMAND:
         return BRAKING_DISTANCE
     if cell.robot == HARDWARE and cell.fault in _MISREAD:
@@ -268,7 +276,8 @@ def _begin_fault(graph: SteeringGraph, cell: SteeringCell) -> None:
     elif word is not None:
         graph.call(cell.place.removeprefix(RESPONSE))
     elif cell.phase == BRAKED:
-        running = [one for one in reversed(graph.nodes.values()) if one.runs and not one.paused]
+        servers = [graph.nodes[name] for name in SERVERS if name in graph.nodes]
+        running = [one for one in reversed(servers) if one.runs and not one.paused]
         running[0].request(STOP, graph.now)
     elif cell.phase == REST or cell.place == TARGET.name:
         graph.target(AIM if cell.phase == REST else _CHANGED)
@@ -303,7 +312,8 @@ def measure(cell: SteeringCell) -> SteeringResult:
     seen = _Observer(graph)
     _begin_fault(graph, cell)
     word = word_of(cell.place)
-    if (cell.phase == BRAKED or word is not None) and word != RESUME:
+    judged = cell.phase == BRAKED if word is None else word != RESUME and isfinite(arrives(cell))
+    if judged:
         seen.stop()
     ended = False
     while seen.elapsed < _LONGEST:
@@ -461,6 +471,11 @@ def _section(
             'moves against every command: no stop of the controller ends this motion. These '
             'cells are in the table, but not in the bar of the motion after a stop. Of late '
             'commands, the bar is larger by the motion within the delay.'
+        )
+    if place == ROBOT:
+        notes = (
+            'A robot without a controller that is killed or paused receives no stop: it follows '
+            'its trajectory, at most to its end. The bar of these cells is larger by this motion.'
         )
     return PageSection(
         f'Steered: {kind}`{place}`',
