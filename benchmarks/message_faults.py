@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any, Final, TypeAlias
@@ -43,6 +43,7 @@ from needle_ros.contract import (
     TIP_DEFLECTION,
 )
 from needle_ros.requests import REPEAT_AFTER, Verdict
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, STOP
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
@@ -174,6 +175,19 @@ _REQUEST: Final[dict[str, Alter]] = {
 #: Faults of the response of a service.
 _RESPONSE: Final[dict[str, Alter]] = {'lost': _LOST['lost'], 'first lost': _ONCE}
 
+#: Separates a fault of a request from the request of another user that follows it.
+THEN: Final = ', then '
+
+#: Requests of another user that must not be ended by the repetition of an earlier request.
+_OPPOSITES: Final = {RESUME: PAUSE, CLEAR_STOP: STOP}
+
+
+def _of_call(topic: str, faults: Mapping[str, Alter], repeated: str) -> dict[str, Alter]:
+    """Return the faults of a request, and the one that repeats it, before a later request."""
+    later = _OPPOSITES.get(CALLS[topic][0])
+    return {**faults, **({f'{repeated}{THEN}{later}': faults[repeated]} if later else {})}
+
+
 #: Time from a request to its arrival, if it is not immediate [s]; infinite: it never arrives.
 ARRIVALS: Final = {**DELAYS, 'lost': inf, 'false': inf, 'first lost': REPEAT_AFTER}
 
@@ -248,8 +262,8 @@ MESSAGES: Final[dict[str, dict[str, Alter]]] = {
     },
     EMERGENCY_STOP.name: _EMERGENCY,
     **{f'{EMERGENCY_STOP.name} to {node}': _LOST for node in SERVERS},
-    **dict.fromkeys(CALLS, _REQUEST),
-    **{f'{RESPONSE}{topic}': _RESPONSE for topic in CALLS},
+    **{topic: _of_call(topic, _REQUEST, 'doubled after 1 s') for topic in CALLS},
+    **{f'{RESPONSE}{topic}': _of_call(topic, _RESPONSE, 'first lost') for topic in CALLS},
 }
 
 

@@ -32,7 +32,7 @@ MODULES = {
     'steering-fit': ('steering_fit',),
     'steering': ('steering', 'worlds.compare'),
     'laws': ('laws',),
-    'safety': ('safety', 'steering_faults'),
+    'safety': ('safety', 'steering_bars'),
     'commissioning': ('commissioning',),
     'graph': ('graph',),
     'slicer': ('slicer',),

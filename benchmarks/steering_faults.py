@@ -9,16 +9,12 @@ phase of the insertion on, see `steering_graph`.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import inf, isfinite
-import os
 from typing import Final, NamedTuple
 
-from benchmarks.measure import Bar
-from benchmarks.message_faults import ARRIVALS, DELAYS, MESSAGES, places, TopicFault
-from benchmarks.page import Answer, PageSection, Tick
+from benchmarks.message_faults import ARRIVALS, DELAYS, MESSAGES, places, THEN, TopicFault
 from benchmarks.steering_graph import AIM, GraphFault, SteeringGraph, World
 from benchmarks.steering_nodes import (
     CALLS,
@@ -38,7 +34,6 @@ from benchmarks.steering_nodes import (
 from needle_controller.steering.motion_control import BRAKING
 from needle_ros.contract import EMERGENCY_STOP, TARGET
 from needle_ros.event_log import Severity
-from needle_ros.process_pool import processes
 from needle_ros.requests import REPEATS
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.system_state import CLEAR_STOP, Mode, PAUSE, RESUME, RETRACT, RETRACT_DEPTH, STOP
@@ -61,6 +56,9 @@ _ASIDE: Final = 1e-3
 
 #: Rest: largest change of a position within a time [m, s].
 _STILL, _AT_REST = 5e-5, 0.3
+
+#: Time from a request with a fault to the one of another user [s].
+_LATER: Final = 0.5
 
 #: Observation after a fault, and longest time to rest [s].
 _WATCHED, _LONGEST = 0.6, 20.0
@@ -163,16 +161,24 @@ def word_of(place: str) -> str | None:
     return CALLS.get(place.removeprefix(RESPONSE), (None,))[0]
 
 
+def later_word(cell: SteeringCell) -> str | None:
+    """Return the request of another user that follows the one with the fault, None without."""
+    _, _, word = cell.fault.partition(THEN)
+    return word or None
+
+
 def arrives(cell: SteeringCell) -> float:
     """Return the time until a request of a user arrives at the first node [s]."""
     some = cell.place.startswith(RESPONSE) or ' to ' in cell.place
-    return 0.0 if some else ARRIVALS.get(cell.fault, 0.0)
+    return 0.0 if some else ARRIVALS.get(cell.fault.partition(THEN)[0], 0.0)
 
 
 def allowed(cell: SteeringCell) -> float:
     """Return the largest motion into the tissue after a stop or request [m]; both may be late."""
     word = word_of(cell.place)
     if word is not None:
+        if later_word(cell):
+            return BRAKING_DISTANCE
         if word == CLEAR_STOP and cell.phase != BRAKED:
             return _NOTHING
         late = word != CLEAR_STOP and (cell.phase != BRAKED)
@@ -237,6 +243,10 @@ class _Observer:
         """Measure the motion from now on: the fault is detected."""
         if not isfinite(self.stopped_at):
             self.stopped_at = self._before.depth
+
+    def restart(self) -> None:
+        """Measure the motion from now on, instead of from the time before."""
+        self.stopped_at, self.advance = self._before.depth, 0.0
 
     def update(self) -> None:
         """Process a step of the graph."""
@@ -315,18 +325,22 @@ def measure(cell: SteeringCell) -> SteeringResult:
     judged = cell.phase == BRAKED if word is None else word != RESUME and isfinite(arrives(cell))
     if judged:
         seen.stop()
-    ended = False
+    ended, later = False, later_word(cell)
     while seen.elapsed < _LONGEST:
         if not ended and seen.elapsed >= cell.lasts:
             ended = True
             _end_fault(graph, cell)
+        if later is not None and seen.elapsed >= _LATER:
+            seen.restart()
+            graph.steering.request(later, graph.now)
+            later = None
         graph.step()
         seen.update()
         if graph.reason:
             seen.stop()
         least = _WATCHED + (cell.lasts if isfinite(cell.lasts) else 0.0)
         if word is not None and isfinite(arrives(cell)):
-            least += 1.0
+            least += 1.0 + _LATER
         if seen.rests and seen.elapsed > least and not _is_busy(graph):
             break
     return _result(graph, seen, cell)
@@ -361,8 +375,9 @@ def _result(graph: SteeringGraph, seen: _Observer, cell: SteeringCell) -> Steeri
 
 def _outcome(graph: SteeringGraph, cell: SteeringCell, miss: float) -> str:
     wanted = {STOP: Mode.STOPPED, PAUSE: Mode.PAUSED, RETRACT: Mode.RETRACTING}
-    mode = wanted.get(word_of(cell.place) or '')
-    if graph.reason:
+    mode = wanted.get(later_word(cell) or word_of(cell.place) or '')
+    refused = cell.phase == BRAKED and later_word(cell) is None
+    if graph.reason and (mode in (None, Mode.STOPPED) or refused):
         return 'stopped'
     if mode not in (None, graph.mode) and isfinite(arrives(cell)):
         return IGNORED
@@ -378,112 +393,3 @@ def _outcome(graph: SteeringGraph, cell: SteeringCell, miss: float) -> str:
     if graph.severity() is not Severity.INFO:
         return 'warning'
     return 'hit' if miss <= _HIT else MISSED
-
-
-# Page.
-
-
-def measure_all(chosen: Sequence[SteeringCell], workers: int) -> list[SteeringResult]:
-    """Measure cells in a number of processes."""
-    with processes(workers) as pool:
-        return list(pool.map(measure, chosen))
-
-
-def compare(tick: Tick, fault: str = '') -> Answer:
-    """Measure all cells, or a single fault; an empty page without cells of this fault."""
-    chosen = [cell for cell in cells() if fault in ('', cell.fault)]
-    if not chosen:
-        return [], []
-    tick('steered insertions')
-    found = measure_all(chosen, os.cpu_count() or 1)
-    heads = dict.fromkeys(_place(cell) for cell in chosen)
-    sections = [_section(head, chosen, found) for head in heads]
-    beyond = [
-        cell.place for cell, one in zip(chosen, found, strict=True) if one.advance > allowed(cell)
-    ]
-    cleared = sum(word_of(place) == CLEAR_STOP for place in beyond)
-    bars = [
-        Bar(
-            'steered: misses of more than 1 mm without a warning',
-            float(sum(one.outcome == MISSED for one in found)),
-            0.0,
-        ),
-        Bar(
-            'steered: requests of a user that are not executed',
-            float(sum(one.outcome == IGNORED for one in found)),
-            0.0,
-        ),
-        Bar('steered: cells without rest', float(sum(o.outcome == RESTLESS for o in found)), 0.0),
-        Bar(
-            'steered: cells that move into the tissue after a stop by more than the braking '
-            'distance',
-            float(len(beyond) - cleared),
-            0.0,
-        ),
-        Bar(
-            'steered: clearances of a stop after which the needle moves into the tissue',
-            float(cleared),
-            0.0,
-        ),
-    ]
-    if not fault:
-        bars.insert(0, Bar('steered: cells', float(len(chosen)), 2000.0, at_least=True))
-    return sections, bars
-
-
-def _place(cell: SteeringCell) -> str:
-    """Return the message or node of a cell; requests of a user at all nodes are one."""
-    call = CALLS.get(cell.place.removeprefix(RESPONSE))
-    return f'~/{call[0]}' if call else cell.place
-
-
-def _fault(cell: SteeringCell) -> str:
-    return f'response {cell.fault}' if cell.place.startswith(RESPONSE) else cell.fault
-
-
-def _section(
-    place: str, chosen: Sequence[SteeringCell], found: Sequence[SteeringResult]
-) -> PageSection:
-    """Return the table of a message or node: one row per fault, over all phases and robots."""
-    rows = []
-    for fault in dict.fromkeys(_fault(cell) for cell in chosen if _place(cell) == place):
-        own = [
-            one
-            for cell, one in zip(chosen, found, strict=True)
-            if (_place(cell), _fault(cell)) == (place, fault)
-        ]
-        rows.append(
-            (
-                fault,
-                *(str(sum(one.outcome == outcome for one in own)) for outcome in OUTCOMES),
-                f'{1e3 * max(one.advance for one in own):.2f}',
-                f'{1e3 * max(one.deepest for one in own):.2f}',
-                f'{1e3 * max(one.travel for one in own):.1f}',
-                f'{max(one.load for one in own):.1f}',
-                f'{max(one.safe for one in own):.2f}',
-            )
-        )
-    kind = 'node ' if place in set().union(*NODES.values()) else ''
-    notes = ''
-    if place == COMMAND:
-        notes = (
-            'A driver that misreads its position commands (biased, in another unit or direction) '
-            'moves against every command: no stop of the controller ends this motion. These '
-            'cells are in the table, but not in the bar of the motion after a stop. Of late '
-            'commands, the bar is larger by the motion within the delay.'
-        )
-    if place == ROBOT:
-        notes = (
-            'A robot without a controller that is killed or paused receives no stop: it follows '
-            'its trajectory, at most to its end. The bar of these cells is larger by this motion.'
-        )
-    return PageSection(
-        f'Steered: {kind}`{place}`',
-        (
-            'fault', *OUTCOMES, 'motion into the tissue after a stop [mm]',
-            'beyond the target depth [mm]', 'guide travel [mm]', 'lateral load [N]',
-            'time to safe [s]',
-        ),
-        rows,
-        notes,
-    )  # fmt: skip

@@ -6,7 +6,7 @@ from __future__ import annotations
 from math import inf
 from typing import Final
 
-from benchmarks import steering_faults
+from benchmarks import steering_bars
 from benchmarks.message_faults import MESSAGES, places
 from benchmarks.steering_faults import (
     allowed,
@@ -96,4 +96,4 @@ def test_outcome_of_a_steered_cell_is_measured(
 
 @pytest.mark.requirement('S-185')
 def test_unknown_fault_has_no_steered_cells() -> None:
-    assert steering_faults.compare(lambda _stage: None, fault='swapped') == ([], [])
+    assert steering_bars.compare(lambda _stage: None, fault='swapped') == ([], [])
