@@ -47,7 +47,7 @@ _SAMPLE: Final = [
 ]
 
 
-@pytest.mark.requirement('S-185')
+@pytest.mark.requirement('S-185', 'S-301')
 def test_steered_cells_cover_messages_nodes_and_phases() -> None:
     """At least 2000 cells without duplicates; every topic and every node has faults."""
     all_cells = cells()
@@ -88,6 +88,7 @@ def _is_open(cell: SteeringCell) -> bool:
     )
 
 
+@pytest.mark.requirement('S-302')
 @pytest.mark.parametrize('cause', _OPEN)
 @pytest.mark.xfail(strict=True, reason='not repaired')
 def test_open_cell(cause: str) -> None:
@@ -108,7 +109,7 @@ def test_random_cells_rest_without_an_unnoticed_miss(seed: int) -> None:
         assert found.advance <= allowed(all_cells[k]), all_cells[k]
 
 
-@pytest.mark.requirement('S-186')
+@pytest.mark.requirement('S-186', 'S-302')
 @pytest.mark.parametrize('continuous', [False, True])
 @pytest.mark.parametrize(
     ('robot', 'place', 'fault', 'phase', 'lasts', 'outcomes'),
