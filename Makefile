@@ -21,6 +21,7 @@ check: $(VENV)/.dev
 	$(BIN)/python -m tools.safety_file
 	$(BIN)/python -m tools.changelog --check
 	$(BIN)/python -m tools.license
+	$(BIN)/python -m tools.commit_message
 
 # Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs compiled

@@ -106,7 +106,7 @@ def _frozen(kind: str, numbers: tuple[float, ...]) -> Any:
     """Return the distribution of SciPy, which takes 0.5 ms to construct, or of the user."""
     if kind in KINDS:
         return KINDS[kind].frozen(*numbers)
-    of_class = find_class('a distribution', kind, {})
+    of_class = find_class('a distribution', kind, dict.fromkeys((*KINDS, _CHOICE), ''))
     try:
         found = of_class(*numbers)
         found.cdf(found.ppf(0.5))

@@ -84,7 +84,7 @@ class _Insertion(NamedTuple):
         return np.asarray(self.model.parameters.length - self.states[:, 0])
 
     @property
-    def speed(self) -> FloatArray:
+    def velocity(self) -> FloatArray:
         """Insertion velocity [m/s], shape (k + 1,)."""
         return np.asarray(-self.states[:, self.model.coordinates])
 
@@ -97,7 +97,7 @@ class _Insertion(NamedTuple):
     def measured(self) -> FloatArray:
         """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
         noise = np.concatenate([self.noise, np.zeros((1, 2))])[: len(self.states)]
-        return np.asarray(np.stack([self.depth, self.speed]) + noise.T)
+        return np.asarray(np.stack([self.depth, self.velocity]) + noise.T)
 
     def until(self, end: int) -> '_Insertion':
         cut = {name: getattr(self, name)[: end + 1] for name in ('states', 'noise', 'goal')}
@@ -171,7 +171,9 @@ class InsertionScenario(Scenario):
             'tissue_stiffness': Variable(1.0, '1', 'k_a over its nominal value', 0.0, 1e3),
             'tissue_damping': Variable(1.0, '1', 'c_a over its nominal value', 0.0, 1e3),
             'depth_noise': Variable(0.0, 'm', 'standard deviation of a measured depth', 0.0),
-            'speed_noise': Variable(0.0, 'm/s', 'standard deviation of a measured velocity', 0.0),
+            'velocity_noise': Variable(
+                0.0, 'm/s', 'standard deviation of a measured velocity', 0.0
+            ),
             'force_noise': Variable(
                 0.0, 'N', 'standard deviation of the additional force on the needle', 0.0
             ),
@@ -215,12 +217,12 @@ class InsertionScenario(Scenario):
         (run,) = self._simulate([row], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
         m = run.model.coordinates
-        depths, speeds = run.measured
+        depths, velocities = run.measured
         # The effort acted up to the sample.
         acted = np.concatenate([[0.0], run.forces])
         for k, (state, tip) in enumerate(zip(run.states, run.tip, strict=True)):
             stamp = round(k * self._period * NANOSECONDS)
-            joints = (depths[k], state[1], speeds[k], state[m + 1], acted[k], 0.0)
+            joints = (depths[k], state[1], velocities[k], state[m + 1], acted[k], 0.0)
             yield MeasuredRun(contract.JOINT_STATES, stamp, [float(value) for value in joints])
             at = (0.0, float(run.depth[k]), float(tip))
             yield MeasuredRun(contract.TIP_DEFLECTION, stamp, at)
@@ -246,7 +248,7 @@ class InsertionScenario(Scenario):
 
     def _noise(self, row: Row, rng: np.random.Generator, count: int) -> FloatArray:
         """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
-        sizes = [row[name] for name in ('depth_noise', 'speed_noise', 'force_noise')]
+        sizes = [row[name] for name in ('depth_noise', 'velocity_noise', 'force_noise')]
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
     def _closed(self, law: Law, row: Row, rng: np.random.Generator) -> _Insertion:
@@ -282,8 +284,8 @@ class InsertionScenario(Scenario):
 
     def _stop(self, run: _Insertion) -> int | None:
         """Return the sample of the stop by the guard, or None."""
-        depth, speed = run.measured
-        samples = np.stack([depth, speed, run.goal - depth, run.tip], axis=1)
+        depth, velocity = run.measured
+        samples = np.stack([depth, velocity, run.goal - depth, run.tip], axis=1)
         low, high = samples.min(axis=0), samples.max(axis=0)
         # Limits are intervals: nearly always the extremes are within them, and so all samples.
         extremes = np.stack([low, low, high, high])
@@ -292,9 +294,9 @@ class InsertionScenario(Scenario):
     def _violated(self, samples: FloatArray) -> int | None:
         """Return the first row of depth, velocity, error and deflection that the guard rejects."""
         guard = Guard(self._limits, (self._needle.minimum_depth, self._needle.length))
-        for k, (depth, speed, error, tip) in enumerate(samples.tolist()):
-            encoders = guard.encoders(control.Measurement(time=0.0, depth=depth, velocity=speed))
-            if encoders or guard.tracking(error) or guard.tip(tip):
+        for k, (depth, velocity, error, tip) in enumerate(samples.tolist()):
+            measured = control.Measurement(time=0.0, depth=depth, velocity=velocity)
+            if guard.encoders(measured) or guard.tracking(error) or guard.tip(tip):
                 return k
         return None
 
@@ -332,12 +334,12 @@ class InsertionScenario(Scenario):
             ).until(done)  # fmt: skip
 
     def _metrics_of(self, row: Row, run: _Insertion) -> dict[str, float]:
-        depth, speed, target = run.depth, run.speed, row['target']
+        depth, velocity, target = run.depth, run.velocity, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)
-        moving = np.flatnonzero(np.abs(speed) > _REST)
+        moving = np.flatnonzero(np.abs(velocity) > _REST)
         still = 0 if not len(moving) else int(moving[-1]) + 1
-        after = speed[-(1 + round(self._numbers.wait * self._numbers.rate)) :]
+        after = velocity[-(1 + round(self._numbers.wait * self._numbers.rate)) :]
         directions = np.sign(after[np.abs(after) > _REST])
         whole = not (run.left or run.stopped == 1.0)
         return {
@@ -347,7 +349,7 @@ class InsertionScenario(Scenario):
             'following': float(np.sqrt(np.square(run.goal - depth).mean())),
             'force': float(np.abs(run.forces).max(initial=0.0)),
             'deflection': float(np.abs(run.tip).max()),
-            'rest': still * self._period if whole and still < len(speed) else nan,
+            'rest': still * self._period if whole and still < len(velocity) else nan,
             'reversals': float(np.count_nonzero(np.diff(directions))) if whole else nan,
             'stopped': run.stopped,
             'left': run.left,

@@ -116,7 +116,19 @@ def dimensions(population: Mapping[str, Distribution]) -> list[str]:
 
 
 def read_study(path: Path | str) -> Study:
-    """Read a study file (.yaml), or raise `ParameterError` with its name."""
+    """
+    Read a study file.
+
+    Parameters
+    ----------
+    path : Path or str
+        File in YAML; its tables are relative to its folder.
+
+    Raises
+    ------
+    ParameterError
+        If it is not readable or invalid, with its name.
+    """
     path = Path(path)
     try:
         document = read_document(path.read_text(encoding='utf-8'))
@@ -134,7 +146,19 @@ def read_study(path: Path | str) -> Study:
 
 
 def build_study(document: Any) -> Study:
-    """Build a study from the content of a study file, in SI units, or raise `ParameterError`."""
+    """
+    Build a study from the content of a study file.
+
+    Parameters
+    ----------
+    document : mapping
+        Keys and values of the file, in SI units or as text with a unit.
+
+    Raises
+    ------
+    ParameterError
+        If a key or a value is invalid, with the valid ones.
+    """
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)

@@ -85,9 +85,20 @@ def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
 
 def probability(parts: Iterable[FloatArray], design: RandomDesign | None = None) -> Estimate:
     """
-    Estimate the fraction of ones among 1 and 0, with the interval of Wilson; NaN is ignored.
+    Estimate the fraction of ones among 1 and 0, with the interval of Wilson [Wilson1927]_.
 
-    The replicates of a design give the number of independent samples that have the same variance.
+    Parameters
+    ----------
+    parts : iterable of array, shape (n,)
+        Values 1 and 0 in parts; NaN is ignored.
+    design : RandomDesign, optional
+        Its replicates give the number of independent samples that have the same variance.
+
+    References
+    ----------
+    .. [Wilson1927] E. B. Wilson, "Probable inference, the law of succession, and statistical
+       inference", Journal of the American Statistical Association 22(158), 1927.
+
     """
     sums = np.zeros((2, max(1, design.replicates if design else 0)))
     first = 0
@@ -126,7 +137,18 @@ def _size(sums: FloatArray) -> float:
 
 
 def quantile(values: FloatArray, part: float, design: RandomDesign | None = None) -> Estimate:
-    """Estimate the quantile below which a part of the values is; NaN is ignored."""
+    """
+    Estimate a quantile, with an interval by ranks.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        Values; NaN is ignored.
+    part : float
+        Fraction of the values below the quantile, in (0, 1).
+    design : RandomDesign, optional
+        As for `probability`.
+    """
     known = np.flatnonzero(np.isfinite(values))
     finite = np.sort(values[known])
     n = len(finite)

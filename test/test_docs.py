@@ -42,7 +42,7 @@ RUN: dict[str, str | tuple[str, ...]] = {
 
 
 #: Packages with exported names.
-PACKAGES = ('needle_dynamics', 'needle_controller', 'needle_identification')
+PACKAGES = ('needle_dynamics', 'needle_controller', 'needle_identification', 'needle_study')
 
 #: Python files of all installed packages.
 SOURCES = sorted([*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('reproduction/**/*.py')])

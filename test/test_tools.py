@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+import subprocess
+
 from hypothesis import given
 from hypothesis import strategies as st
 import pytest
-from tools.commit_message import faults, LONGEST
+from tools.commit_message import faults, LONGEST, messages
 from tools.language import idioms, texts_of_code
 from tools.license import license_line, licensed
 
@@ -61,6 +65,36 @@ def test_only_the_length_of_a_subject_is_limited(subject: str) -> None:
 )
 def test_invalid_commit_messages_are_rejected(message: str, fault: str) -> None:
     assert fault in faults(message)
+
+
+def test_new_commits_are_checked_also_in_a_shallow_clone(tmp_path: Path) -> None:
+    """Without commits before the rule; without a repository nothing is checked."""
+
+    def git(*words: str, at: str = '2030-01-01T00:00:00Z') -> None:
+        who = {
+            f'GIT_{one}_{key}': 'a@b'
+            for one in ('AUTHOR', 'COMMITTER')
+            for key in ('NAME', 'EMAIL')
+        }
+        known = {**os.environ, **who, 'GIT_COMMITTER_DATE': at}
+        subprocess.run(
+            ['/usr/bin/env', 'git', *words],
+            cwd=tmp_path,
+            env=known,
+            check=True,
+            capture_output=True,
+        )
+
+    assert messages(tmp_path) is None
+    git('init', 'old')
+    git('-C', 'old', 'commit', '--allow-empty', '-m', 'Before', at='2026-01-01T00:00:00Z')
+    assert messages(tmp_path / 'old') == {}
+    for number in (1, 2):
+        git('-C', 'old', 'commit', '--allow-empty', '-m', f'Add {number}', '-m', 'Reason.')
+    git('clone', '--depth', '1', f'file://{tmp_path}/old', 'new')
+    for folder, subjects in (('old', ['Add 2', 'Add 1']), ('new', ['Add 2'])):
+        found = (messages(tmp_path / folder) or {}).values()
+        assert [message.rstrip() for message in found] == [f'{one}\n\nReason.' for one in subjects]
 
 
 @pytest.mark.parametrize(

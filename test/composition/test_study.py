@@ -29,7 +29,7 @@ from needle_insertion.report import study_page as page
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.process_pool import processes
 from needle_study.designs import DESIGNS, RandomDesign, SaltelliDesign, SobolDesign
-from needle_study.distribution import distribution, KINDS
+from needle_study.distribution import Distribution, distribution, KINDS
 from needle_study.engine import chunk, compute, dask, order, Results
 from needle_study.steering import SteeringScenario
 from needle_study.study import build_study, read_study, Study
@@ -296,6 +296,11 @@ def test_page_lists_the_variables_of_the_scenario() -> None:
     assert {name: listed[name] for name in variables} == {
         name: (f'{one.default:g}', one.unit, one.meaning) for name, one in variables.items()
     }
+
+
+def test_unknown_distribution_names_the_valid_ones() -> None:
+    with pytest.raises(ParameterError, match=rf"{', '.join(KINDS)}, .* got 'gama'$"):
+        Distribution('gama', (1.0, 0.2)).quantiles(np.array([0.5]))
 
 
 def test_own_scenario_of_a_file_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

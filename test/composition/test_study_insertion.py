@@ -44,7 +44,7 @@ POPULATION: dict[str, Any] = {
     'tissue_stiffness': {'uniform': [0.5, 2.0]},
     'tissue_damping': {'uniform': [0.5, 2.0]},
     'depth_noise': {'choice': [0.0, 2e-6]},
-    'speed_noise': {'choice': [0.0, 2e-4]},
+    'velocity_noise': {'choice': [0.0, 2e-4]},
     'force_noise': {'choice': [0.0, 0.05]},
     'late': {'choice': [0, 2]},
 }
@@ -204,7 +204,7 @@ def test_needles_outside_their_range_are_reported() -> None:
 def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, Any]) -> None:
     """The guard of the node finds a violation at the last replayed sample, and not before."""
     study = build_study({**SMALL, 'settings': settings, 'population': {}})
-    drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
+    drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'velocity_noise': 2e-4}
     rows = {name: np.array([value]) for name, value in drawn.items()}
     found = study.scenario.run(rows, [study.design.noise(0)])
     guard = Guard(SafetyLimits(**limits), (PHANTOM.minimum_depth, PHANTOM.length))
