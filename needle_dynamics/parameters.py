@@ -154,7 +154,6 @@ class NeedleParameters:
         return Tissue(
             starts=(0.0, *self.layer_depths),
             stiffnesses=(self.tissue_stiffness, *self.layer_stiffnesses),
-            damping=self.tissue_damping,
             swelling=self.swelling,
             swelling_time=self.swelling_time,
         )

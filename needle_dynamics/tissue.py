@@ -23,7 +23,6 @@ class Tissue:
 
     starts: tuple[float, ...] = constant((), 'm', 'depths at which the layers begin, the first 0')
     stiffnesses: tuple[float, ...] = constant((), 'N/m^2', 'stiffness of each layer per length')
-    damping: float = constant(0.0, 'N s/m^2', 'damping c_a per length (Kelvin-Voigt)')
     swelling: float = constant(
         0.0, '1', 'final relative increase of the stiffness over its value at time 0',
         low=-1.0, open_low=True,
