@@ -22,6 +22,8 @@ SOURCES = {
     path.relative_to(ROOT): ast.parse(path.read_text(encoding='utf-8'))
     for path in sorted(ROOT.glob('needle_*/**/*.py'))
 }
+#: Metadata of a field that is declared by them; a status has others.
+DECLARED = {'low', 'valid', 'type'}
 #: Methods of a node that declare a parameter, and that read one.
 DECLARE_ROS = ('declare_text', 'declare_parameter')
 READ_ROS = ('text', 'get_parameter', 'get')
@@ -37,7 +39,9 @@ def settings_classes() -> list[type]:
             continue
         module = import_module('.'.join(path.with_suffix('').parts))
         for _, one in getmembers(module, isclass):
-            if is_dataclass(one) and any('description' in item.metadata for item in fields(one)):
+            if is_dataclass(one) and DECLARED & {
+                key for item in fields(one) for key in item.metadata
+            }:
                 found.add(one)
     return sorted(found, key=lambda one: one.__name__)
 
