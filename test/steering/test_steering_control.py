@@ -528,3 +528,33 @@ def test_guide_load_stays_within_its_limit() -> None:
     # The plan uses the nominal model until the bending length is identified.
     assert loads[2.0] < 3.0
     assert miss[2.0] < 1e-3
+
+
+class LoadedPlant(SteeringPlant):
+    """Records the largest load of the guide along x or z after a motion [N]."""
+
+    load = 0.0
+
+    def guide(self, to: GuideSetpoint) -> None:
+        super().guide(to)
+        self.load = max(self.load, float(np.abs(self.needle.guide_load[0]).max()))
+
+
+class AlternatingLaw(GuideLaw):
+    """A guide that moves to and fro, as far as it may."""
+
+    def choose(self, _tip: FloatArray, at: int) -> FloatArray:
+        return np.full(2, self.limits.guide_limit * (-1.0) ** at)
+
+
+@pytest.mark.parametrize('of_class', [SpringsLaw, BroydenLaw, AlternatingLaw])
+def test_every_other_law_obeys_the_load_limit(of_class: type[GuideLaw]) -> None:
+    """A nominal needle equals the prediction: its load exceeds the limit by rounding only."""
+    loads = {}
+    for limit in (np.inf, 1.0):
+        law = of_class(MODEL, (8e-3, 6e-3), replace(LIMITS, load_limit=limit))
+        plant = LoadedPlant(SteeredNeedle(NEEDLE, STEERING), DEPTHS)
+        simulate_steering(law, plant, sensor(0.0))
+        loads[limit] = plant.load
+    assert loads[np.inf] > 1.5
+    assert loads[1.0] <= 1.0 + 1e-9

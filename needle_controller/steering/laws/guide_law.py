@@ -3,6 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from math import inf
 
 from needle_controller.steering.law import (
     checked_roll,
@@ -14,6 +15,7 @@ from needle_controller.steering.law import (
 from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.steering.needle import SteeredNeedle
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -23,7 +25,8 @@ class GuideLaw(ABC):
     Steering law that computes the guide from the newest tip measurement.
 
     A derived class implements `choose`, and may implement `prepare`. Position and change of the
-    guide are clipped to their limits; ``load_limit`` has no effect. Parameters as for `LawClass`.
+    guide are clipped to their limits, and its load on the nominal needle to ``load_limit``.
+    Parameters as for `LawClass`.
     """
 
     warning = ''
@@ -33,6 +36,7 @@ class GuideLaw(ABC):
     ) -> None:
         self.depths, self.limits = model.depths, limits
         self.turns, self.roll = limits.turns, checked_roll(roll)
+        self._nominal = SteeredNeedle(model.needle, model.steering, roll=self.roll)
         self.step = 0
         self.guides = [np.zeros(2)]  #: guide at each depth so far [m], at last its setpoint
         self._newest: tuple[FloatArray, int] | None = None
@@ -61,12 +65,28 @@ class GuideLaw(ABC):
         guide, most, change = self.guides[-1], self.limits.guide_limit, self.limits.guide_step
         if self._newest is not None and self.step < len(self.depths) - 1:
             wanted = np.clip(self.choose(*self._newest), guide - change, guide + change)
-            guide = np.clip(wanted, -most, most)
+            guide = self._within_load(np.clip(wanted, -most, most))
         self._newest = None
         self.guides.append(guide)
         self.step += 1
         x, z = guide.tolist()
         return GuideSetpoint(x, z, self.roll)
+
+    def _within_load(self, guide: FloatArray) -> FloatArray:
+        """Return the guide [m], less of its motion where it would exceed the load limit."""
+        limit, needle, before = self.limits.load_limit, self._nominal, self.guides[-1]
+        if limit == inf:
+            return guide
+        needle.move(depth=float(self.depths[self.step]))
+        now = needle.guide_load[0]
+        needle.move(guide=guide.tolist(), roll=self.roll)
+        # At a constant depth the load is linear in the guide, and each plane has its own.
+        then = needle.guide_load[0]
+        change, over = then - now, np.sign(then) * np.maximum(0.0, np.abs(then) - limit)
+        back = np.divide(over, change, out=np.zeros(2), where=change != 0.0)
+        guide = guide - np.clip(back, 0.0, 1.0) * (guide - before)
+        needle.move(guide=guide.tolist())
+        return guide
 
     @abstractmethod
     def choose(self, tip: FloatArray, at: int) -> FloatArray:
