@@ -40,7 +40,7 @@ import yaml
 STUDY: Final = Path(__file__).parents[1] / 'examples/studies/steering.yaml'
 
 #: Changes for needles with a fixed guide: 100 mm in steps of 1 mm.
-_OPEN: Final = {'law': 'open_loop', 'depth': 0.1, 'step': 1e-3}
+_OPEN: Final = {'law': 'open_loop', 'depth': 0.1, 'step_length': 1e-3}
 
 #: Warm-up samples of a worker.
 _FIRST: Final = 16

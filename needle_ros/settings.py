@@ -72,6 +72,12 @@ def text(default: str, description: str) -> Any:
     return field(default=default, metadata={'type': str, 'description': description})
 
 
+def same_field(settings: type, name: str) -> Any:
+    """Declare a field with the default and the range of a field of other settings."""
+    of_other = settings.__dataclass_fields__[name]  # type: ignore[attr-defined]
+    return field(default=of_other.default, metadata=of_other.metadata)
+
+
 def check_constants(values: object) -> None:
     """Check every field of a dataclass that is declared by a function of this module."""
     for item in fields(values):  # type: ignore[arg-type]

@@ -2,7 +2,7 @@
 """Insert sampled flexible needles to a depth, under a control law or in open loop."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
@@ -16,7 +16,7 @@ from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParamete
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice, constant, from_values
+from needle_ros.settings import check_choice, constant, from_values, same_field
 from needle_ros.timing import NANOSECONDS
 from needle_study import scenario
 from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
@@ -46,22 +46,16 @@ METRICS: Final[Mapping[str, Metric]] = {
 }
 
 
-def _same(settings: type, name: str) -> Any:
-    """Declare a field with the default and the range of a field of other settings."""
-    of_other = settings.__dataclass_fields__[name]  # type: ignore[attr-defined]
-    return field(default=of_other.default, metadata=of_other.metadata)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InsertionStudy(control.ReferenceLimits):
     """Settings of the scenario that are the same for all samples."""
 
-    rate: float = _same(control.ControllerSettings, 'rate')
-    delay: float = _same(control.ControllerSettings, 'delay')
-    force_limit: float = _same(control.ControllerSettings, 'force_limit')
-    speed_limit: float = _same(control.SafetyLimits, 'speed')
-    error_limit: float = _same(control.SafetyLimits, 'tracking_error')
-    deflection_limit: float = _same(control.SafetyLimits, 'tip_deflection')
+    rate: float = same_field(control.ControllerSettings, 'rate')
+    delay: float = same_field(control.ControllerSettings, 'delay')
+    force_limit: float = same_field(control.ControllerSettings, 'force_limit')
+    speed_limit: float = same_field(control.SafetyLimits, 'speed')
+    error_limit: float = same_field(control.SafetyLimits, 'tracking_error')
+    deflection_limit: float = same_field(control.SafetyLimits, 'tip_deflection')
     wait: float = constant(1.0, 's', 'time after the end of the reference', open_low=True)
     push: float = constant(3.0, 'N', 'force of the open loop', open_low=True)
     tolerance: float = constant(1e-4, 'm', 'largest error of a hit', open_low=True)

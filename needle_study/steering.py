@@ -10,13 +10,13 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
-from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits, STEP_LENGTH
+from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
 from needle_dynamics.simulated.tip_errors import TipErrorParameters
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import constant, from_values
+from needle_ros.settings import constant, from_values, same_field
 from needle_ros.timing import NANOSECONDS
 from needle_study import scenario
 from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
@@ -68,11 +68,8 @@ class SteeringStudy(SteeringLimits):
     """Settings of the scenario that are the same for all samples; its limits are of the law."""
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
-    step: float = constant(STEP_LENGTH, 'm', 'depth between two tip measurements', open_low=True)
     hit_radius: float = constant(1e-3, 'm', 'largest miss of a hit', open_low=True)
-    interval: float = constant(
-        _EXACT.interval, 's', 'time from one tip measurement to the next', open_low=True
-    )  # fmt: skip
+    interval: float = same_field(simulation.SteppedTipErrors, 'interval')
 
 
 class SteeringScenario(Scenario):
@@ -108,10 +105,10 @@ class SteeringScenario(Scenario):
                 f'settings.depth must be <= {reach:g} m, the length of the needle without its '
                 f'free length, got {numbers.depth:g} m'
             )
-        steps = numbers.depth / numbers.step
+        steps = numbers.depth / numbers.step_length
         if steps > _MOST:
             raise ParameterError(
-                f'settings: depth over step must be <= {_MOST} steps, got {steps:.3g}'
+                f'settings: depth over step_length must be <= {_MOST} steps, got {steps:.3g}'
             )
         moves = {
             DEFAULT_LAW: numbers.guide_limit or numbers.turns,
@@ -123,7 +120,7 @@ class SteeringScenario(Scenario):
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        self._depths = simulation.step_depths(numbers.depth, numbers.step)
+        self._depths = simulation.step_depths(numbers.depth, numbers.step_length)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
         self.variables: Mapping[str, Variable] = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of a steering law, as parameters."""
+"""Steps and limits of a steering law, as parameters."""
 
 from dataclasses import dataclass
 from math import inf
@@ -11,11 +11,14 @@ from needle_ros.settings import check_constants, constant
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringLimits:
     """
-    Limits of the guide setpoints of a steering law.
+    Length of the steps, and limits of the guide setpoints of a steering law.
 
     The defaults are for a robot: a force on tissue and a motion without a limit are never implied.
     """
 
+    step_length: float = constant(
+        5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
+    )
     guide_limit: float = constant(
         6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
     )
@@ -35,6 +38,6 @@ class SteeringLimits:
         object.__setattr__(self, 'turns', int(self.turns))
 
 
-STEP_LENGTH: Final = 5e-3  #: Default insertion from one tip measurement to the next [m].
-#: Default limits of simulations: only the position of the guide is limited.
+#: Default limits of simulations; these two differ from the node: a simulated guide has time for
+#: any motion between two steps, and its force harms no tissue.
 SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)

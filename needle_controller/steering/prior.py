@@ -3,7 +3,8 @@
 
 from dataclasses import dataclass
 
-from needle_ros.settings import check_constants, constant
+from needle_dynamics.steering.parameters import SteeringParameters
+from needle_ros.settings import check_constants, constant, same_field
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,9 +29,7 @@ class SteeringPrior:
         1e-4, 'rad^2/m', 'least growth of the variance of the path direction per length; up to '
         '100 times as much is considered', open_low=True,
     )  # fmt: skip
-    path_noise_length: float = constant(
-        5e-3, 'm', 'correlation length of the path noise', open_low=True
-    )
+    path_noise_length: float = same_field(SteeringParameters, 'path_noise_length')
     noise: float = constant(
         4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
     )

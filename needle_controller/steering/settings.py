@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Final
 
-from needle_controller.steering.limits import SteeringLimits, STEP_LENGTH
+from needle_controller.steering.limits import SteeringLimits
 from needle_dynamics.arrays import FloatArray
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
@@ -23,9 +23,6 @@ JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
 class ExecutiveSettings(SteeringLimits):
     """Steps, tip measurements and limits of a steered insertion."""
 
-    step_length: float = constant(
-        STEP_LENGTH, 'm', 'insertion from one tip measurement to the next', open_low=True
-    )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
     acceleration: float = constant(
@@ -107,6 +104,7 @@ class ExecutiveSettings(SteeringLimits):
             # Both axes at once, at the peak of the insertion speed.
             change = min(change, sqrt(0.5) * self.guide_speed * step / self.speed)
         return SteeringLimits(
+            step_length=self.step_length,
             guide_limit=self.guide_limit,
             guide_step=change,
             load_limit=self.load_limit,

@@ -11,7 +11,6 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
-from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS, NeedlePreset
@@ -68,7 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     limits = SIMULATION_LIMITS
     add = partial(common.add_quantity, parser)
-    add('--step', 'm', f'depth per step (default {1e3 * STEP_LENGTH:g}mm)', STEP_LENGTH)
+    step = limits.step_length
+    add('--step', 'm', f'depth per step (default {1e3 * step:g}mm)', step)
     most = f'along x and z (default {1e3 * limits.guide_limit:g}mm)'
     add('--limit', 'm', f'largest displacement of the guide {most}', limits.guide_limit)
     load = 'largest planned lateral force on the guide (default: no limit)'

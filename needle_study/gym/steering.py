@@ -7,7 +7,6 @@ import gymnasium
 from gymnasium import spaces
 from needle_controller import SIMULATION_LIMITS, SteeringPrior
 from needle_controller.steering.law import GuideSetpoint
-from needle_controller.steering.limits import STEP_LENGTH
 from needle_controller.steering.simulation import sample_truth, SteeringPlant, step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray
 from needle_ros.errors import ParameterError
@@ -26,10 +25,10 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
     Steer the tip to a target in steps of a needle; needle, tissue and target are sampled.
 
-    ``needle`` is as for `find_needle`, ``depth`` of the target, ``step`` and the limits of guide
-    and target (``aside``) along x and z in m, ``prior`` the distribution of the needles. The
-    action is the position of the guide for the next step, as a fraction of its limit. The
-    observation is the depth over the target depth, and as fractions of the guide limit the
+    ``needle`` is as for `find_needle`, ``depth`` of the target, ``step_length``, and the
+    limits of guide and target (``aside``) along x and z in m, ``prior`` the distribution of the
+    needles. The action is the position of the guide for the next step, as a fraction of its limit.
+    The observation is the depth over the target depth, and as fractions of the guide limit the
     measured tip, the target and the guide, each x and z. The reward at the end is the negative
     distance of the tip from the target [mm], before it is 0. Then the info has ``miss``, the
     distance [m]; it always has ``tip``, the true tip in x and z [m]. Images show the plane of z.
@@ -42,7 +41,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         needle: str = DEFAULT_NEEDLE,
         *,
         depth: float = 0.1,
-        step: float = STEP_LENGTH,
+        step_length: float = SIMULATION_LIMITS.step_length,
         guide_limit: float = SIMULATION_LIMITS.guide_limit,
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
@@ -51,7 +50,12 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         if render_mode is not None:
             check_choice('render_mode', render_mode, self.metadata['render_modes'])
         self.render_mode = render_mode
-        sizes = {'depth': depth, 'step': step, 'guide_limit': guide_limit, 'aside': aside}
+        sizes = {
+            'depth': depth,
+            'step_length': step_length,
+            'guide_limit': guide_limit,
+            'aside': aside,
+        }
         for name, value in sizes.items():
             if not 0.0 < value < np.inf:
                 raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
@@ -59,7 +63,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         reach = self._needle.length - self._steering.free_length
         if depth > reach:
             raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
-        self._depths = step_depths(depth, step)
+        self._depths = step_depths(depth, step_length)
         self._limit, self._aside, self._prior = guide_limit, aside, prior
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (7,))

@@ -19,7 +19,7 @@ SMALL = {
     'scenario': 'steering',
     'samples': 1,
     'seed': 3,
-    'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
+    'settings': {'depth': 0.05, 'step_length': 0.01, 'law': 'springs'},
     'population': {'bending_length': {'uniform': [0.8, 1.2]}},
 }
 

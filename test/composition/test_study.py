@@ -47,7 +47,7 @@ SMALL: dict[str, Any] = {
     'scenario': 'steering',
     'samples': 40,
     'seed': 3,
-    'settings': {'depth': 0.05, 'step': 0.01, 'law': 'springs'},
+    'settings': {'depth': 0.05, 'step_length': 0.01, 'law': 'springs'},
     'population': {
         'target_x': {'uniform': [-0.002, 0.002]},
         'bending_length': {'lognormal': [1.0, 0.1], 'within': [0.6, 1.6]},
@@ -389,7 +389,7 @@ def test_killed_workers_do_not_change_the_table(tmp_path: Path) -> None:
 
 def test_killed_studies_are_resumed(tmp_path: Path) -> None:
     """Ten kills with SIGKILL; no chunk is computed twice, and the table is the same."""
-    document = {**SMALL, 'samples': 1500, 'settings': {**SMALL['settings'], 'step': 0.005}}
+    document = {**SMALL, 'samples': 1500, 'settings': {**SMALL['settings'], 'step_length': 0.005}}
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(document))
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '1']
@@ -756,7 +756,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'correlations': [['skin', 'tilt_z', 1]]}, 'value between -1 and 1'),
         ({'correlations': [['skin', 'tilt_z', 0.5], ['tilt_z', 'skin', 0.1]]}, 'skin twice'),
         ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
-        ({'settings': {'step': 1e-9}}, 'depth over step must be <= 1000 steps, got 1e+08'),
+        ({'settings': {'step_length': 1e-9}}, 'depth over step_length must be <= 1000 steps'),
         ({'settings': {'turns': 0.7}}, 'settings.turns must be a whole number, got 0.7'),
         ({'settings': {'guide_limit': 0}}, 'law multi_hypothesis with guide_limit 0'),
         ({'settings': {'guide_limit': 0, 'law': 'broyden'}}, 'law broyden with'),

@@ -59,11 +59,11 @@ def names_read() -> Iterator[str]:
             if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
                 yield node.attr
             # Attributes by name: of each layer, and of forces and torques.
-            text = node.value if isinstance(node, ast.Constant) else ''
+            text = str(node.value) if isinstance(node, ast.Constant) else ''
             if path.name == 'force_sensor.py':
                 yield from (f'force_{text}', f'torque_{text}')
             elif path.parts[-2:] == ('steering', 'insertion.py'):
-                yield str(text)
+                yield text
 
 
 READ = frozenset(names_read())

@@ -23,7 +23,7 @@ from needle_controller import (
     SteeringPrior,
 )
 from needle_controller.steering.law import build_law, DEFAULT_LAW
-from needle_controller.steering.limits import STEP_LENGTH
+from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.simulation import sample_truth, simulate_steering, step_depths
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, NEEDLES
 from needle_identification import Bag
@@ -396,7 +396,7 @@ def test_nodes_end_at_the_tip_of_the_simulated_loop(tmp_path: Path, seed: int) -
         frame=np.zeros(2),
         bevel=np.array([0.0, bevel]),
     )
-    depths = DEPTH + step_depths(target[1] - DEPTH, STEP_LENGTH)
+    depths = DEPTH + step_depths(target[1] - DEPTH, SteeringLimits().step_length)
     tips = []
     for law in (DEFAULT_LAW, 'open_loop'):
         plant = truth.plant(depths)

@@ -14,6 +14,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.controller_node import ControllerNode
+from needle_controller.steering.law import STEERING_LAWS
+from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
@@ -188,6 +190,17 @@ def test_law_outside_the_package_steers(
     # A fixed guide misses by 2 mm.
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 1e-3
     assert not bench.expected
+
+
+@pytest.mark.parametrize('law', STEERING_LAWS)
+def test_every_law_ends_at_the_target_depth(ros_graph: RosGraph, law: str) -> None:
+    """With setpoints within the limits, which the executive checks; one law needs turns."""
+    needs: dict[str, Any] = {'turns': 2, 'roll_speed': 20.0} if law == 'roll_to_target' else {}
+    bench = Bench(ros_graph, law=law, bevel=0.3, **needs)
+    bench.aim()
+    assert bench.end() is SteeringPhase.DONE
+    assert abs(bench.at('insertion') - TARGET[1]) <= ExecutiveSettings().depth_tolerance
+    assert bench.status.step == bench.status.steps
 
 
 def test_robot_topics_may_be_remapped(ros_graph: RosGraph) -> None:
