@@ -272,7 +272,7 @@ def measure(cell: FaultCell) -> MotionResult:
             unsafe = k + 1
         if loop.supervisor.safety.stop is not None:
             outcome = STOPPED
-        elif outcome == CONTINUED and loop.acting == 0.0 and loop.supervisor.fault is not None:
+        elif outcome == CONTINUED and loop.acting == 0.0 and loop.supervisor.fault:
             outcome = NO_FORCE
     return MotionResult(outcome, force, beyond, (unsafe - begin) / _RATE, _recovery(loop))
 

@@ -15,7 +15,7 @@ from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.response_monitor import ResponseMonitor
-from needle_controller.safety.safety import Safety
+from needle_controller.safety.safety import FaultKind, Safety
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
 from needle_dynamics import NeedleModel, NeedleParameters
@@ -39,7 +39,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     Every event is a method: it takes the present time [ns] of the clock that stamps the messages,
     and returns a command. None leaves the last command unchanged. `events` contains lines for the
-    log; `fault` is why no force is commanded, apart from a stop. `steady`: see `EventLog`.
+    log; `fault`: why no force is commanded or the reference waits, else ''. `steady`: `EventLog`.
     """
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
@@ -48,7 +48,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
         #: Insertion depth of `retract` [m].
         self.retract_depth = 0.0
-        self.fault: str | None = None
+        self.fault, self._kind = '', FaultKind.WAITING
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
         self._last = ForceCommand(0)
@@ -107,11 +107,11 @@ class Supervisor(StateMachine[ForceCommand]):
     @property
     def waits(self) -> bool:
         """Whether no measurement was received yet."""
-        return self.fault == _WAITING
+        return bool(self.fault) and self._kind is FaultKind.WAITING
 
     def activate(self, now: int, publishers: Mapping[str, int]) -> None:
         """Start to answer measurements; see `watch`."""
-        self.fault = _WAITING
+        self.fault, self._kind = _WAITING, FaultKind.WAITING
         if self.controller is not None:
             stamped = self._robot is None or self._robot.settings.stamps == STAMPS[0]
             self._timing = TimingMonitor(self.controller.settings, stamped=stamped)
@@ -145,7 +145,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if not (back := self.clock_went_back(now, self.safety.streams['joint_states'].timeout)):
             return None
         self._begin(now)
-        return self._release_for(f'clock went back by {back:.3f} s', now)
+        return self._release_for(f'clock went back by {back:.3f} s', now, FaultKind.CLOCK)
 
     # Requests.
 
@@ -254,7 +254,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._waiting.end(f'stopped: {reason}')
         self.requests.supersede(now)
         self.bending.forget()
-        self.fault = reason
+        self.fault, self._kind = reason, FaultKind.STOP
         if self.controller is not None:
             self.controller.guide.forget()
         self.events.add(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
@@ -266,7 +266,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self.authority.stop(reason)
             self._obeyed = Mode.STOPPED
             return False
-        self.fault = _WAITING
+        self.fault, self._kind = _WAITING, FaultKind.WAITING
         self.bending.forget()
         self.events.add(Severity.INFO, 'the stop is cleared')
         return True
@@ -380,10 +380,10 @@ class Supervisor(StateMachine[ForceCommand]):
         if safety.stop is not None:
             return self._command(ForceCommand(stamp))
         if safety.duplicate_publishers is not None:
-            return self._release_for(safety.duplicate_publishers, stamp)
+            return self._release_for(safety.duplicate_publishers, stamp, FaultKind.PUBLISHERS)
         command = controller.command(measured, self.bending.load, age)
         if command.fault is not None:
-            return self._release_for(command.fault, stamp)
+            return self._release_for(command.fault, stamp, FaultKind.CONTROL)
         if command.refusal is not None or not command.is_finite():
             # The memory of the laws is invalid.
             controller.forget()
@@ -405,11 +405,11 @@ class Supervisor(StateMachine[ForceCommand]):
         controller.guide.waits, controller.relaxed = lost, following.relaxed
         if lost:
             controller.unwind()
-            self._log_fault(following.notice or '', 'the reference waits')
+            self._log_fault(FaultKind.RESPONSE, following.notice or '', 'the reference waits')
         else:
             self._warn('rest', following.notice)
-            if self.fault is not None:
-                self.fault = None
+            if self.fault:
+                self.fault = ''
                 self.events.add(Severity.INFO, kind='recovery')
         force = 0.0 if following.relaxed else command.force
         torque, limits = command.torque, controller.settings
@@ -425,15 +425,15 @@ class Supervisor(StateMachine[ForceCommand]):
         joints = safety.streams['joint_states']
         timeout, silence = joints.timeout / NANOSECONDS, joints.silence(now)
         if safety.duplicate_publishers is not None:
-            answer = self._release_for(safety.duplicate_publishers, now)
+            answer = self._release_for(safety.duplicate_publishers, now, FaultKind.PUBLISHERS)
         elif silence > timeout:
             line = f'joint_states is stale: none received for {silence:.3f} s'
             answer = self._release_for(line, now)
         answer = self._stop_for(safety.mixed_sources(now), now) or answer
         if safety.streams['ground_truth'].silence(now) > timeout:
             self.bending.load = 0.0
-        for line in safety.new_warnings(now):
-            self._warn(line.partition(' ')[0], f'{line}; the observer continues without it')
+        for name, line in safety.new_warnings(now).items():
+            self._warn(name, f'{line}; the observer continues without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
         self._warn('pace', self._timing.compare_rate(joints))
@@ -446,16 +446,16 @@ class Supervisor(StateMachine[ForceCommand]):
         self.authority.stop(reason)
         return self.obey(stamp)
 
-    def _release_for(self, fault: str, stamp: int) -> ForceCommand:
-        self._log_fault(fault, 'no force is commanded')
+    def _release_for(
+        self, fault: str, stamp: int, kind: FaultKind = FaultKind.INPUT
+    ) -> ForceCommand:
+        self._log_fault(kind, fault, 'no force is commanded')
         return self._release(stamp)
 
-    def _log_fault(self, fault: str, consequence: str) -> None:
-        # The first word of the line identifies the kind of fault.
-        kind = fault.partition(' ')[0]
-        if self.fault is None or not self.fault.startswith(kind):
-            self.events.add(Severity.ERROR, f'{fault}; {consequence}', kind)
-        self.fault = fault
+    def _log_fault(self, kind: FaultKind, fault: str, consequence: str) -> None:
+        if not self.fault or self._kind is not kind:
+            self.events.add(Severity.ERROR, f'{fault}; {consequence}', kind.value)
+        self.fault, self._kind = fault, kind
 
     def _release(self, stamp: int) -> ForceCommand:
         if self.controller is not None:
@@ -476,7 +476,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if self._active is None:
             return ControllerPhase.INACTIVE
         faulty = ControllerPhase.WAITING if self.waits else ControllerPhase.FAULT
-        return ControllerPhase.ACTIVE if self.fault is None else faulty
+        return faulty if self.fault else ControllerPhase.ACTIVE
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, ControllerStatus]:
         """Return severity, fault if there is any, and status."""
@@ -486,7 +486,7 @@ class Supervisor(StateMachine[ForceCommand]):
             safety.status(ControllerStatus() if control is None else control.status(), now),
             phase=self._phase,
             system=self.authority.mode,
-            fault=self.fault or '',
+            fault=self.fault,
             warning=(warning or '') if active is not None else '',
             observer=self.bending.status(),
             latency=self._timing.status(),

@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import Enum
 from typing import Final
 
 from needle_controller.controller import ControllerSettings
@@ -18,6 +19,18 @@ _VITAL: Final = ('wrench_command', 'joint_states')  #: Topics that need exactly 
 _LATE: Final = 0.5  #: Fraction of messages out of order for a warning.
 _MIXED: Final = 0.9  #: Fraction of messages out of order for a stop.
 _FEW: Final = 10.0  #: Least rate for both [Hz].
+
+
+class FaultKind(Enum):
+    """Kind of a fault: no force is commanded, or the reference waits."""
+
+    STOP = 'stop'
+    WAITING = 'no measurement yet'
+    CLOCK = 'clock'
+    INPUT = 'joint_states'
+    PUBLISHERS = 'duplicate publishers'
+    CONTROL = 'control'
+    RESPONSE = 'response'
 
 
 class Safety:
@@ -145,10 +158,10 @@ class Safety:
             > self.limits.sensor_timeout
         }
 
-    def new_warnings(self, now: int) -> list[str]:
+    def new_warnings(self, now: int) -> dict[str, str]:
         """Return a line for each expected topic that has become stale since the last call."""
         silent = self._silent(now)
-        lines = [line for name, line in silent.items() if name not in self._stale]
+        lines = {name: line for name, line in silent.items() if name not in self._stale}
         self._stale = set(silent)
         return lines
 

@@ -24,7 +24,7 @@ import pytest
 PERIOD = 1_000_000
 SECOND = 1000 * PERIOD
 PHANTOM = NeedleParameters.preset('phantom')
-TOPIC = '/wrench_command'
+TOPIC = 'wrench_command'
 
 
 class Loop:
@@ -174,7 +174,7 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
         assert isfinite(answer.force)
         assert abs(answer.force) <= limits.force_limit
         assert abs(answer.torque) <= limits.torque_limit
-        assert loop.supervisor.fault is None or answer.force == 0.0
+        assert not loop.supervisor.fault or answer.force == 0.0
 
 
 @pytest.mark.requirement('S-002')
@@ -238,6 +238,18 @@ def test_all_safety_limits_are_read_by_the_supervisor() -> None:
     assert {one.name for one in fields(SafetyLimits)} <= read
 
 
+def test_fault_of_the_same_kind_gets_one_line() -> None:
+    """Also if its line begins with another word."""
+    loop = Loop()
+    loop.supervisor.events.take()
+    for nodes in (2, 3):
+        loop.watch(nodes)
+    assert [line for _, line in loop.supervisor.events.take() if line] == [
+        '2 nodes publish wrench_command; no force is commanded'
+    ]
+    assert loop.supervisor.fault == '3 nodes publish wrench_command'
+
+
 class Robot:
     """A control loop around a robot that follows its commands or not, and may report its force."""
 
@@ -266,7 +278,7 @@ def test_reference_waits_while_plant_does_not_follow() -> None:
     robot = Robot()
     supervisor = robot.loop.supervisor
     robot.runs(200, obeys=True)
-    assert supervisor.fault is None
+    assert not supervisor.fault
     start = robot.loop.depth
     robot.runs(300, obeys=False)
     assert 'the plant does not follow: it reports 0 N' in str(supervisor.fault)
@@ -283,7 +295,7 @@ def test_reference_waits_while_plant_does_not_follow() -> None:
     assert supervisor._last.force == pytest.approx(force, rel=1e-6)
     assert 0.0 < force < 10.0
     robot.runs(3000, obeys=True)
-    assert supervisor.fault is None
+    assert not supervisor.fault
     assert robot.aim > waits + 0.02
 
 
@@ -293,12 +305,12 @@ def test_gap_ends_the_wait_of_the_reference() -> None:
     robot = Robot()
     robot.runs(200, obeys=True)
     robot.runs(300, obeys=False)
-    assert robot.loop.supervisor.fault is not None
+    assert robot.loop.supervisor.fault
     robot.loop.now += SECOND
     robot.runs(10, obeys=False)
     depth = robot.loop.depth
     robot.runs(3000, obeys=True)
-    assert robot.loop.supervisor.fault is None
+    assert not robot.loop.supervisor.fault
     assert robot.loop.depth > depth + 0.01
 
 
@@ -357,7 +369,7 @@ def test_late_clock_does_not_change_the_commands(lag: int) -> None:
         answer, expected = late.measure(1e-5, 1e-2, late=-behind), punctual.measure(1e-5, 1e-2)
         late.now += behind
         assert answer == expected
-    assert late.supervisor.fault is None
+    assert not late.supervisor.fault
     real = Loop()
     for _ in range(100):
         real.measure(1e-5, 1e-2)
