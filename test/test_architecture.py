@@ -33,6 +33,7 @@ MAY_IMPORT = {
         'needle_identification',
         'needle_insertion',
         'needle_ros',
+        'needle_study',
     },
     'benchmarks': {
         'needle_controller',

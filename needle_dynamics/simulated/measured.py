@@ -17,6 +17,7 @@ from needle_ros.errors import JobError
 from needle_ros.status import PlantStatus
 from needle_ros.trajectories import JointReference, Points
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 AT_REST: Final = 1e-6  #: velocity below which taring is permitted [m/s]
 
@@ -37,12 +38,11 @@ class MeasuredShape(NamedTuple):
     @property
     def turns(self) -> FloatArray:
         """Shortest rotations from y to the needle axis, quaternions x, y, z, w; shape (k, 4)."""
-        # From (0, 1, 0) to (slope_x, 1, slope_z): half the angle about their common normal.
+        # From (0, 1, 0) to (slope_x, 1, slope_z): their cross product, and a scalar part.
         x, z = self.slopes.T
-        length = np.sqrt(1.0 + x * x + z * z)
-        cosine = np.sqrt(0.5 * (1.0 + 1.0 / length))
-        share = 0.5 / (length * cosine)
-        return np.column_stack([share * z, np.zeros_like(share), -share * x, cosine])
+        scalar = 1.0 + np.sqrt(1.0 + x * x + z * z)
+        turns = Rotation.from_quat(np.column_stack([z, np.zeros_like(z), -x, scalar]))
+        return np.asarray(turns.as_quat())
 
     @property
     def tip(self) -> tuple[list[float], list[float]]:
