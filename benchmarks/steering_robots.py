@@ -151,7 +151,8 @@ class RobotNode(GraphNode):
         mode, before = self.authority.mode, self._mode
         new, self._retracted = self.authority.compare(before, self._retracted)
         self._mode, run = mode, self.graph.run
-        if new and mode in (Mode.STOPPED, Mode.RETRACTING):
+        ends = mode in (Mode.STOPPED, Mode.RETRACTING) or before is Mode.STOPPED
+        if new and ends:
             self._log.supersede(now)
             self._waiting.end(f'the system is {mode.value}', Verdict.SUPERSEDED)
             self._forget(self._moved)

@@ -237,6 +237,8 @@ class Supervisor(StateMachine[ForceCommand]):
         return self.safety.obstacle(now) or ''
 
     def _change_mode(self, mode: Mode, before: Mode, now: int) -> ForceCommand | None:
+        if mode in (Mode.STOPPED, Mode.RETRACTING) or before is Mode.STOPPED:
+            self.requests.supersede(now)
         if mode is Mode.STOPPED:
             return self._stop(self.authority.reason, now)
         if before is Mode.STOPPED and not self._clear(now):
@@ -245,14 +247,13 @@ class Supervisor(StateMachine[ForceCommand]):
             guide = self._active.guide
             (guide.pause if mode is Mode.PAUSED else guide.resume)()
             if mode is Mode.RETRACTING:
-                self._retract(self._active, self._depth, now)
+                self._retract(self._active, self._depth)
         return None
 
     def _stop(self, reason: str, now: int) -> ForceCommand:
         """Latch a stop: zero force, and no motion until the next request."""
         self.safety.latch(reason)
         self._waiting.end(f'stopped: {reason}')
-        self.requests.supersede(now)
         self.bending.forget()
         self.fault, self._kind = reason, FaultKind.STOP
         if self.controller is not None:
@@ -271,9 +272,8 @@ class Supervisor(StateMachine[ForceCommand]):
         self.events.add(Severity.INFO, 'the stop is cleared')
         return True
 
-    def _retract(self, controller: Controller, depth: float | None, now: int) -> None:
+    def _retract(self, controller: Controller, depth: float | None) -> None:
         """Withdraw a needle at a depth [m]; one that is less deep rests."""
-        self.requests.supersede(now)
         self._waiting.end('the needle is retracted', Verdict.SUPERSEDED)
         if depth is not None:
             low, high = controller.settings.depths(controller.parameters)

@@ -316,6 +316,8 @@ class PlantNode(ModelNode):
             self._trajectories.pause(withdraws=before is Mode.RETRACTING)
         if before is Mode.PAUSED:
             self._trajectories.resume()
+        elif before is Mode.STOPPED:
+            self._trajectories.end('it was sent during a stop')
         self._run.commands.stopped = mode is Mode.STOPPED
         self._run.held = mode in (Mode.PAUSED, Mode.RETRACTING)
         self.publish_diagnostics()

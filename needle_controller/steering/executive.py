@@ -228,6 +228,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
         return ''
 
     def _change_mode(self, mode: Mode, before: Mode, now: int) -> JointMotion | None:
+        if mode in (Mode.STOPPED, Mode.RETRACTING) or before is Mode.STOPPED:
+            self.requests.supersede(now)
         if mode is Mode.STOPPED:
             return self.halt(self.authority.reason, now)
         self._motions.discard_stop()
@@ -244,7 +246,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     def _retract(self, before: Mode, now: int) -> JointMotion | None:
         """End an insertion; the retraction begins with the next positions of the joints."""
-        self.requests.supersede(now)
         self._cancel(Verdict.SUPERSEDED, 'the needle is retracted')
         halt = None
         if self.steers:

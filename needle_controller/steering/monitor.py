@@ -126,6 +126,11 @@ class MotionMonitor:
         # The motions before the newest are superseded by it.
         return answer.verdict is Verdict.SUPERSEDED and answer.stamp in self._stamps[-1:]
 
+    @property
+    def sent(self) -> bool:
+        """Whether the motion was sent; joints at their goal need none."""
+        return bool(self._stamps)
+
     def failure(self) -> str:
         """Describe how often the motion was sent, and which nodes answered."""
         topic, count = JOINT_TRAJECTORY.name, len(self._stamps)

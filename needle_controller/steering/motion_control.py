@@ -116,7 +116,9 @@ class MotionControl:
     # Checks.
 
     def repeat(self, now: int) -> JointMotion | None:
-        """Send the motion again: the message may have been lost."""
+        """Send the motion again: the message may have been lost, or was not needed before."""
+        if not self.monitor.sent:
+            return self.again(now)
         pending = self.monitor.pending
         failure = f'{self.missed(pending if pending.any() else None)}: {self.monitor.failure()}'
         if self.monitor.exhausted:

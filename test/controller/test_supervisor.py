@@ -614,6 +614,20 @@ def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
     assert loop.supervisor.controller.target == 0.01
 
 
+@pytest.mark.requirement('S-291')
+def test_target_sent_during_a_stop_is_not_followed_after_it() -> None:
+    """It is late, or repeated by its sender."""
+    loop = Loop()
+    loop.measure()
+    loop.stop()
+    loop.measure()
+    sent = loop.now
+    loop.measure()
+    loop.clear()
+    loop.supervisor.target(sent, '', loop.depth + 0.01, 0.0, loop.now)
+    assert all(answer is None or answer.force == 0.0 for answer in map(loop.measure, [0.0] * 50))
+
+
 @pytest.mark.requirement('S-010', 'S-014')
 def test_clearance_of_another_node_does_not_end_a_violation() -> None:
     """The limit stops the system again, also a retraction; below the limit the stop ends."""

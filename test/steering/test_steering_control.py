@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 import copy
 from dataclasses import replace
+from functools import partial
 import pickle
 from typing import Any
 
@@ -319,13 +320,11 @@ def test_large_slow_error_of_the_sensor_widens_the_intervals() -> None:
     size, decay, held, misses = 3.0 * SteeringPrior().drift, np.exp(-0.1), [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        error = size * rng.standard_normal(2)
-
-        def measure(tip: FloatArray) -> FloatArray:
-            nonlocal error
-            error = decay * error + size * np.sqrt(1.0 - decay**2) * rng.standard_normal(2)
-            return np.asarray(tip + error + 4e-5 * rng.standard_normal(2))
-
+        errors = [size * rng.standard_normal(2)]
+        for change in size * np.sqrt(1.0 - decay**2) * rng.standard_normal((len(DEPTHS), 2)):
+            errors.append(decay * errors[-1] + change)
+        found = [error + 4e-5 * rng.standard_normal(2) for error in errors]
+        measure = partial(lambda left, tip: np.asarray(tip + left.pop(0)), found)
         controller = MultiHypothesisLaw(MODEL, (2e-3, -1e-3), LIMITS)
         plant = SteeringPlant(SteeredNeedle(*other(rng.uniform(0.8, 1.2))), DEPTHS)
         simulate_steering(controller, plant, measure)

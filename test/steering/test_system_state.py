@@ -15,7 +15,7 @@ from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRAC
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from support.steered_robot import CONTINUOUS, Robot, SETTINGS
+from support.steered_robot import CONTINUOUS, Robot, SETTINGS, TARGET
 
 #: Largest displacement after a request [m]: braking from 10 mm/s within 0.2 s, and a period.
 BRAKED = 1.1e-3
@@ -461,3 +461,35 @@ def test_pause_during_planning_holds_the_start() -> None:
     assert robot.request(RESUME)
     robot.steer()
     assert robot.loop.phase is Phase.DONE
+
+
+@pytest.mark.requirement('S-291')
+def test_target_sent_during_a_stop_is_not_executed_after_it() -> None:
+    """It is late, or repeated by its sender."""
+    robot = Robot()
+    robot.tick(20)
+    assert robot.request(STOP)
+    robot.tick(10)
+    sent = robot.now
+    robot.tick(10)
+    assert robot.request(CLEAR_STOP)
+    robot.follow(robot.loop.target(sent, '', TARGET, robot.now))
+    robot.tick(100)
+    assert robot.loop.phase is Phase.IDLE
+    assert_allclose(robot.at, 0.0, atol=1e-12)
+    assert robot.aim() == ''
+
+
+@pytest.mark.requirement('S-292')
+@pytest.mark.parametrize('periods', [0, 1, 2])
+def test_guide_moved_during_the_retraction_of_a_resting_needle(periods: int) -> None:
+    """The retraction needs no motion at first; the guide returns when something moves it."""
+    robot = Robot()
+    robot.tick(20)
+    assert robot.request(RETRACT)
+    robot.tick(periods)
+    robot.ways[1] = robot.now + np.array([0.0, 2e8]), np.array([0.0, 1e-3])
+    # Longer than the patience of a motion.
+    robot.tick(1500)
+    assert robot.loop.phase is Phase.IDLE
+    assert robot.loop.authority.reason == ''
