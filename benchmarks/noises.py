@@ -58,6 +58,8 @@ class NoiseKind:
         Samples per second, and length [s].
     speed_noise, position_noise, position_counts : float
         White noise of velocity [m/s] and position [m], and resolution of the position [m].
+    speed_filter : float
+        Time constant of a first-order low-pass filter of the velocity by the driver [s].
     positions_only : bool
         Whether the recording has no velocities.
     speeds : (float, float)
@@ -78,6 +80,7 @@ class NoiseKind:
     speed_noise: float = 0.0
     position_noise: float = 0.0
     position_counts: float = 1e-6
+    speed_filter: float = 0.0
     positions_only: bool = False
     speeds: tuple[float, float] = (2e-3, 15e-3)
     truth: Mapping[str, float] = field(default_factory=dict)
@@ -97,6 +100,8 @@ def recorded(
     depth = 0.05 + np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
     time = np.asarray(np.arange(len(speed)) * step, dtype=np.float64)
     force = _force(truth, time, speed)
+    if kind.speed_filter:
+        speed = _low_pass(speed, kind.speed_filter / step)
     kept = slice(None, None, _FINER)
     time, depth = time[kept], np.asarray(depth[kept])
     speed, force = speed[kept], np.asarray(force[kept])
@@ -159,6 +164,12 @@ def _noise(kind: NoiseKind, rng: np.random.Generator, n: int) -> FloatArray:
     return np.asarray(noise)
 
 
+def _low_pass(values: FloatArray, samples: float) -> FloatArray:
+    """Filter values from rest by the time constant `samples`."""
+    kept = exp(-1.0 / samples)
+    return np.asarray(lfilter([1.0 - kept], [1.0, -kept], values))
+
+
 def _counted(values: FloatArray, step: float) -> FloatArray:
     return np.round(values / step) * step if step else values
 
@@ -204,6 +215,7 @@ LINES: Final[Mapping[str, NoiseRow]] = {
         kind=NoiseKind(positions_only=True, position_noise=1e-6, position_counts=0.0)
     ),
     'noisy speed, 1 mm/s': NoiseRow(kind=NoiseKind(speed_noise=1e-3)),
+    'filtered speed, 32 ms': NoiseRow(kind=NoiseKind(speed_filter=0.032)),
     'offset': NoiseRow(kind=NoiseKind(truth={'offset': 0.02}), effect='offset'),
     'drift': NoiseRow(kind=NoiseKind(truth={'force_drift': 1e-3}), effect='drift'),
     'direction': NoiseRow(

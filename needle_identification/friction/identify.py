@@ -25,7 +25,7 @@ from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
 from needle_identification.friction.filtering import filter_signals, FilteredSignals, HALF_LENGTH
 from needle_identification.friction.intervals import parameter_estimates
-from needle_identification.friction.lag import find_lag, lag_estimate
+from needle_identification.friction.lag import find_lag, lag_estimate, velocity_delay
 from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
 from needle_identification.recordings.recording import Recording
@@ -129,17 +129,21 @@ def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
 
 
 def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | None:
-    """Differentiate the positions if noise of the velocity matters, and they have less of it."""
-    remark = _noise_remark(chosen)
-    if not remark or recording.velocity is None:
+    """Differentiate the positions if they have less error than a noisy or filtered velocity."""
+    if recording.velocity is None:
+        return None
+    remark, delay = _noise_remark(chosen), velocity_delay(recording)
+    if not (remark or delay):
         return None
     velocities = chosen.design.signals
     positions = filter_signals(replace(recording, velocity=None), velocities.settings)
     # Integrated velocities are no other source.
     apart = float(np.std(positions.motion(velocities.time) - velocities.motion(velocities.time)))
-    noise = _CLEANER * velocities.velocity_noise
-    if not (positions.velocity_noise < noise and apart > noise):
+    noise = _CLEANER * (apart if delay else velocities.velocity_noise)
+    if not (positions.velocity_noise < noise and apart >= noise):
         return None
+    if delay:
+        remark = f'the speed is {1e3 * delay:.2g} ms behind the positions: a filter of the driver'
     return _fitted(positions, f'{remark}: took the speed from the positions')
 
 

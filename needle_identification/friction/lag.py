@@ -7,7 +7,7 @@ The lag is estimated coarsely in steps of half the filter, then by Gauss-Newton 
 step is part of the friction regression.
 """
 
-from math import hypot
+from math import hypot, sqrt
 from typing import Final
 
 from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
@@ -15,6 +15,7 @@ from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
 from needle_identification.friction.terms import NeedleMotion, regressors
+from needle_identification.recordings.recording import Recording
 import numpy as np
 from scipy.special import ndtri
 
@@ -33,6 +34,9 @@ _SMALLEST_ACCELERATION: Final = 0.01
 #: [sampling periods]; of fourth order. Found with the simulated plant, whose velocity is
 #: piecewise linear between samples.
 _SPLINE_ERROR: Final = 10.0
+
+_CERTAIN: Final = 5.0  # smallest delay of a velocity [standard errors]
+_DELAY_PARTS: Final = 0.1  # length of the differences that show it [s]
 
 _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
@@ -92,6 +96,34 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     x = regressors(motion, settings.terms, settings)
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))
+
+
+def velocity_delay(recording: Recording) -> float:
+    r"""
+    Return the delay of the recorded velocity behind the positions [s]; 0 if not significant.
+
+    A low-pass filter of first order, :math:`T \dot v + v = \dot s`, integrates to
+    :math:`s - \int v = T v + const`; a pure delay does likewise to first order.
+    """
+    time, velocity = recording.time, recording.velocity
+    if velocity is None:
+        return 0.0
+    ends = np.searchsorted(time, np.arange(time[0], time[-1], _DELAY_PARTS))
+    travel = np.concatenate(
+        [[0.0], np.cumsum(0.5 * np.diff(time) * (velocity[1:] + velocity[:-1]))]
+    )
+    x = np.diff(np.stack([velocity, travel])[:, ends]).T
+    missing = np.diff((recording.depth - travel)[ends])
+    gram = x.T @ x
+    free = len(missing) - x.shape[1]
+    if free < 1 or np.linalg.matrix_rank(gram) < len(gram):
+        return 0.0
+    # The travel as a second column is an error of scale.
+    delay, scale = np.linalg.solve(gram, x.T @ missing)
+    left = missing - x @ [delay, scale]
+    error = sqrt(float(left @ left) / free * float(np.linalg.inv(gram)[0, 0]))
+    period = float(np.median(np.diff(time)))
+    return float(delay) if delay > max(period, _CERTAIN * error) else 0.0
 
 
 def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:

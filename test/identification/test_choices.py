@@ -17,6 +17,7 @@ from needle_identification import (
     summarize,
 )
 from needle_identification.friction.filtering import cut_off
+from needle_identification.friction.lag import velocity_delay
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -177,6 +178,22 @@ def test_presliding_samples_are_discarded(seed: int) -> None:
     assert abs(found['viscous_friction'].value - MU_V) < 0.01 * MU_V
     plain = identify_friction(insertion(seed))
     assert not any('presliding' in words for words in plain.warnings)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_velocities_filtered_by_the_driver_are_replaced(seed: int) -> None:
+    """A first-order filter of 32 ms smooths strokes: positions show it, and replace it."""
+    generator = np.random.default_rng(seed)
+    recording, truth = recorded(NoiseKind(speed_filter=0.032), generator)
+    # The end points of 0.1 s of samples of 4 ms determine the delay to a sample.
+    assert abs(velocity_delay(recording) - 0.032) < 0.004
+    found = identify_friction(recording)
+    assert any('behind the positions: a filter' in words for words in found.warnings)
+    for name, value in truth.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].error
+    plain, _ = recorded(NoiseKind(speed_noise=1e-3), generator)
+    assert velocity_delay(plain) == 0.0
+    assert velocity_delay(replace(recording, velocity=None)) == 0.0
 
 
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
