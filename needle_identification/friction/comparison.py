@@ -3,9 +3,9 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from math import log, nan
+from math import inf, log, nan
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
@@ -80,7 +80,7 @@ class _Comparison(NamedTuple):
         """Fit additional terms; a supported term must also improve the prediction."""
         tried = [self._tried(more) for more in candidates]
         p_values = _holm([trial.p_value for trial in tried])
-        return list(map(self._judged, candidates, tried, p_values))
+        return _simplest(list(map(self._judged, candidates, tried, p_values)))
 
     def _tried(self, more: tuple[str, ...]) -> Trial:
         """Fit additional terms, with errors for autocorrelated noise if they are significant."""
@@ -142,6 +142,17 @@ class _Comparison(NamedTuple):
         return CandidateFit(
             terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
         )
+
+
+def _simplest(found: list[CandidateFit]) -> list[CandidateFit]:
+    """Reject `direction` where `offset`, a linear combination of its columns, has a lower BIC."""
+    differences = {frozenset(one.terms): one.difference for one in found}
+    for k, one in enumerate(found):
+        simpler = frozenset(one.terms) - {'direction'} | {'offset'}
+        if one.supported and differences.get(simpler, inf) < one.difference:
+            words = f'{one.words}, which offset explains with fewer coefficients'
+            found[k] = replace(one, supported=False, words=words)
+    return found
 
 
 def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:

@@ -196,6 +196,19 @@ def test_velocities_filtered_by_the_driver_are_replaced(seed: int) -> None:
     assert velocity_delay(replace(recording, velocity=None)) == 0.0
 
 
+def test_outliers_of_one_sign_are_not_friction_by_direction() -> None:
+    """Their mean is an offset, which is a linear combination of the columns of `direction`."""
+    advised = []
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        recording, _ = recorded(NoiseKind(), generator)
+        size = len(recording.time)
+        spikes = np.where(generator.random(size) < 0.02, generator.exponential(0.3, size), 0.0)
+        found = identify_friction(replace(recording, force=recording.force + spikes))
+        advised += [c for c in found.comparison if c.supported and 'direction' in c.terms]
+    assert not advised
+
+
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
     recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
