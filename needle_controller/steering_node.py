@@ -19,7 +19,8 @@ from needle_controller.steering.record_file import RecordFile
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.compiled_node import CompiledNode
-from needle_dynamics.needles import DEFAULT_NEEDLE, NEEDLE_HELP, usable_needle
+from needle_dynamics.model_node import declare_needle
+from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -38,7 +39,6 @@ from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectory_client_node import TrajectoryClient
 from needle_ros.wire import Reading
 import numpy as np
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header, String
@@ -98,15 +98,7 @@ class SteeringNode(CompiledNode):
             'action follow_joint_trajectory of a robot that moves needle and guide, such as '
             '/arm/follow_joint_trajectory; empty: the topic joint_trajectory',
         )
-        # Fixed at start: it determines the other defaults.
-        self.declare_parameter(
-            'needle',
-            DEFAULT_NEEDLE,
-            ParameterDescriptor(
-                description=NEEDLE_HELP, additional_constraints=NEEDLE_HELP, read_only=True
-            ),
-        )
-        needle = usable_needle(self.text('needle'))
+        needle = declare_needle(self, DEFAULT_NEEDLE)
         for prefix, names in (('model.', OF_NEEDLE), ('steering.', OF_STEERING)):
             self.declare_settings(prefix, defaults_of(prefix, needle), names)
 

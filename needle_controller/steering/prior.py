@@ -4,11 +4,11 @@
 from dataclasses import dataclass
 
 from needle_dynamics.steering.parameters import SteeringParameters
-from needle_ros.settings import check_constants, constant, same_field
+from needle_ros.settings import CheckedSettings, constant, same_field
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SteeringPrior:
+class SteeringPrior(CheckedSettings):
     """Prior uncertainty of needle, tissue, guide, path and sensor."""
 
     spread: float = constant(
@@ -37,6 +37,3 @@ class SteeringPrior:
         5e-4, 'm', 'standard deviation of a slow error of the tip sensor; 0, one and three times '
         'as much is considered',
     )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)

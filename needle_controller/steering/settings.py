@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steps, tip measurements and limits of a steered insertion, as parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import sqrt
 from typing import Final
 
@@ -103,13 +103,8 @@ class ExecutiveSettings(SteeringLimits):
         if self.continuous:
             # Both axes at once, at the peak of the insertion speed.
             change = min(change, sqrt(0.5) * self.guide_speed * step / self.speed)
-        return SteeringLimits(
-            step_length=self.step_length,
-            guide_limit=self.guide_limit,
-            guide_step=change,
-            load_limit=self.load_limit,
-            turns=self.turns,
-        )
+        own = {item.name: getattr(self, item.name) for item in fields(SteeringLimits)}
+        return SteeringLimits(**{**own, 'guide_step': change})
 
     @property
     def tolerances(self) -> FloatArray:

@@ -50,12 +50,8 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         if render_mode is not None:
             check_choice('render_mode', render_mode, self.metadata['render_modes'])
         self.render_mode = render_mode
-        sizes = {
-            'depth': depth,
-            'step_length': step_length,
-            'guide_limit': guide_limit,
-            'aside': aside,
-        }
+        names = 'depth', 'step_length', 'guide_limit', 'aside'
+        sizes = dict(zip(names, (depth, step_length, guide_limit, aside), strict=True))
         for name, value in sizes.items():
             if not 0.0 < value < np.inf:
                 raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
