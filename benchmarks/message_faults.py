@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Any, Final, TypeAlias
@@ -182,10 +182,10 @@ THEN: Final = ', then '
 _OPPOSITES: Final = {RESUME: PAUSE, CLEAR_STOP: STOP}
 
 
-def _of_call(topic: str, faults: Mapping[str, Alter], repeated: str) -> dict[str, Alter]:
-    """Return the faults of a request, and the one that repeats it, before a later request."""
-    later = _OPPOSITES.get(CALLS[topic][0])
-    return {**faults, **({f'{repeated}{THEN}{later}': faults[repeated]} if later else {})}
+def _of_response(topic: str) -> dict[str, Alter]:
+    """Return the faults of a response, and the one before a later request."""
+    later, first = _OPPOSITES.get(CALLS[topic][0]), 'first lost'
+    return {**_RESPONSE, **({f'{first}{THEN}{later}': _ONCE} if later else {})}
 
 
 #: Time from a request to its arrival, if it is not immediate [s]; infinite: it never arrives.
@@ -262,8 +262,8 @@ MESSAGES: Final[dict[str, dict[str, Alter]]] = {
     },
     EMERGENCY_STOP.name: _EMERGENCY,
     **{f'{EMERGENCY_STOP.name} to {node}': _LOST for node in SERVERS},
-    **{topic: _of_call(topic, _REQUEST, 'doubled after 1 s') for topic in CALLS},
-    **{f'{RESPONSE}{topic}': _of_call(topic, _RESPONSE, 'first lost') for topic in CALLS},
+    **dict.fromkeys(CALLS, _REQUEST),
+    **{f'{RESPONSE}{topic}': _of_response(topic) for topic in CALLS},
 }
 
 

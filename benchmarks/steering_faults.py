@@ -34,7 +34,6 @@ from benchmarks.steering_nodes import (
 from needle_controller.steering.motion_control import BRAKING
 from needle_ros.contract import EMERGENCY_STOP, TARGET
 from needle_ros.event_log import Severity
-from needle_ros.requests import REPEATS
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.system_state import CLEAR_STOP, Mode, PAUSE, RESUME, RETRACT, RETRACT_DEPTH, STOP
 from needle_ros.timing import NANOSECONDS
@@ -350,8 +349,7 @@ def _is_busy(graph: SteeringGraph) -> bool:
     """Whether an insertion or retraction is under way, or a request waits for its answer."""
     loop, phase, called = graph.steering.loop, graph.phase, graph.called
     waits = graph.pending is not None and not graph.pending.done
-    if called is not None and called.success is None and called.repeats < REPEATS:
-        waits = True
+    waits = waits or (called is not None and called.waits)
     if phase is None or graph.mode is Mode.PAUSED:
         return waits
     return waits or loop.steers or loop.busy or phase is Phase.RETRACTING

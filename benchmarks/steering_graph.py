@@ -38,7 +38,7 @@ from needle_ros.contract import ENTRY, GUIDE_X, TARGET
 from needle_ros.event_log import Severity
 from needle_ros.requests import PendingRequest, REPEAT_AFTER, REPEATS
 from needle_ros.status import SteeringPhase as Phase
-from needle_ros.system_state import Mode
+from needle_ros.system_state import CLEAR_STOP, Mode, RESUME
 
 #: Target of the tip, x, y, z [m].
 AIM: Final = (5e-4, 0.031, -4e-4)
@@ -55,17 +55,22 @@ class World(NamedTuple):
 
 @dataclass(slots=True)
 class ServiceCall:
-    """Call of a service by a user, repeated without a response, as `Calls` does."""
+    """Call of a service by a user, repeated without a response, as `Operator` does."""
 
     topic: str
     begun: float
     repeats: int = 0
     success: bool | None = None  #: response; None without one
 
+    @property
+    def waits(self) -> bool:
+        """Whether the call has no response and will be sent again."""
+        most = 0 if self.topic.startswith((RESUME, CLEAR_STOP)) else REPEATS
+        return self.success is None and self.repeats < most
+
     def repeat(self, now: float) -> bool:
         """Return whether the call must be sent again."""
-        elapsed = now - self.begun
-        due = self.repeats < min(REPEATS, int(elapsed / REPEAT_AFTER)) and self.success is None
+        due = self.waits and self.repeats < int((now - self.begun) / REPEAT_AFTER)
         self.repeats += due
         return due
 

@@ -20,6 +20,7 @@ class _Call:
     request: Any
     later: Future
     begun: float
+    most: int  #: largest number of repetitions
     repeats: int = 0
 
     def send(self) -> None:
@@ -39,9 +40,9 @@ class Calls:
         self._calls: list[_Call] = []
         steady_timer(node, _CHECK, self._check)
 
-    def call(self, client: Client, request: Any) -> Future:
+    def call(self, client: Client, request: Any, *, once: bool = False) -> Future:
         """Call a service; the future has result None after `CALL_TIMEOUT` without a response."""
-        made = _Call(client, request, Future(), monotonic())
+        made = _Call(client, request, Future(), monotonic(), 0 if once else requests.REPEATS)
         self._calls.append(made)
         made.send()
         return made.later
@@ -53,7 +54,7 @@ class Calls:
             elapsed = now - one.begun
             if elapsed > requests.CALL_TIMEOUT:
                 one.end()
-            elif one.repeats < min(requests.REPEATS, int(elapsed / requests.REPEAT_AFTER)):
+            elif one.repeats < min(one.most, int(elapsed / requests.REPEAT_AFTER)):
                 one.repeats += 1
                 one.send()
 

@@ -32,6 +32,7 @@ TARE: Final = 'tare'
 RESET: Final = 'reset'
 
 _HALT: Final = 0.05  #: time in which joints come to rest at their positions [s]
+_JOINED: Final = 1e-4  #: distance from a command at which a joint follows again [m or rad]
 _WITHDRAWAL: Final = 0.01  #: mean velocity of a retraction [m/s]
 _ROUNDING: Final = 2  #: tolerance of the period due to the rounding of stamps [ns]
 
@@ -76,6 +77,8 @@ class PlantRun:
         #: Joints that the latest `joint_commands` have moved.
         self.commanded: set[str] = set()
         self.held = False  #: Whether `joint_commands` move nothing: a pause or a retraction.
+        #: Joints that a stop or a withdrawal has moved away from their `joint_commands`.
+        self._apart: set[str] = set()
 
     # Commands.
 
@@ -92,20 +95,31 @@ class PlantRun:
             asked = self._joint_commands.read(reading, self._positions(), now)
             counts, refusal = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
             if counts and not refusal and commands.may_move(now) and not self.held:
-                for goals, within in asked.motions:
+                for asked_for, within in asked.motions:
+                    goals = self._joined(asked_for)
                     content = {
                         'joints': list(goals),
                         'times': [within],
                         'positions': [list(goals.values())],
                         'efforts': [[]],
                     }
-                    self.perform(Event(MOTION, content))
+                    if goals:
+                        self.perform(Event(MOTION, content))
                     self.commanded |= {*goals}
                 self._joint_commands.accept(asked)
         except ParameterError as error:
             commands.refuse()
             return True, f'{JOINT_COMMANDS.name}: {error}; no force is applied'
         return counts, refusal
+
+    def _joined(self, goals: Mapping[str, float]) -> dict[str, float]:
+        """Return the goals without those of joints that are away from all their commands."""
+        # A driver of ros2_control does not know a stop: its setpoint has moved on.
+        at = self._positions()
+        self._apart -= {
+            name for name, goal in goals.items() if abs(goal - at.get(name, goal)) <= _JOINED
+        }
+        return {name: goal for name, goal in goals.items() if name not in self._apart}
 
     def followed(self) -> dict[str, FollowedJoint]:
         """Return reference and measurement of each joint that follows trajectories."""
@@ -137,6 +151,7 @@ class PlantRun:
     def halt(self) -> None:
         """End every force and motion, of the needle and of all joints that move by themselves."""
         self.commands.stop()
+        self._apart = {*moved_joints(self.constants.mode, steered=self.constants.steered)}
         self.hold(moved_joints(self.constants.mode, steered=self.constants.steered))
 
     def hold(self, joints: Sequence[str]) -> None:
@@ -161,6 +176,7 @@ class PlantRun:
     def withdraw(self) -> None:
         """Withdraw the needle by its own base, if it has one."""
         if self.constants.mode == 'robot':
+            self._apart.add(INSERTION)
             at = self._positions()[INSERTION]
             end = min(at, RETRACT_DEPTH)
             self._follow((INSERTION,), (at - end) / _WITHDRAWAL + _HALT, [end], [])

@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.messages import listen_states, State, target_message
-from needle_insertion.live.requests import CONTROLLER, NODES, REQUESTS, STEERING
+from needle_insertion.live.requests import CONTROLLER, NODES, ONCE, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile, steady_timer
 from needle_ros.calls_node import Calls
@@ -96,7 +96,8 @@ class Operator:
         service, data = REQUESTS[word]
         clients = {f'{name}/{service}': self._clients[name, service] for name in NODES}
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
-        return self._call(clients, request, f'no node offers {" or ".join(clients)}')
+        missing = f'no node offers {" or ".join(clients)}'
+        return self._call(clients, request, missing, once=word in ONCE)
 
     def set(self, node: str, name: str, value: Any) -> Future:
         """Set a parameter of a node; the future has a `RequestOutcome`."""
@@ -107,11 +108,13 @@ class Operator:
         request = SetParameters.Request(parameters=[parameter])
         return self._call({f'{node}/set_parameters': client}, request, f'no node {node}')
 
-    def _call(self, clients: Mapping[str, Client], request: Any, missing: str) -> Future:
+    def _call(
+        self, clients: Mapping[str, Client], request: Any, missing: str, *, once: bool = False
+    ) -> Future:
         """Return one outcome of all calls, when the last has an answer or has failed."""
         gathered = Future()
         answers = {
-            service: self._calls.call(client, request)
+            service: self._calls.call(client, request, once=once)
             for service, client in clients.items()
             if client.service_is_ready()
         }

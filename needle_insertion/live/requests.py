@@ -21,3 +21,7 @@ REQUESTS: Final[Mapping[str, tuple[str, bool | None]]] = {
     'stop': (STOP, None),
     'clear': (CLEAR_STOP, None),
 }
+
+#: Commands that are not sent again without a response: another user may have paused or stopped the
+#: system since.
+ONCE: Final = ('resume', 'clear')

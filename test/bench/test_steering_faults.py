@@ -20,7 +20,7 @@ from benchmarks.steering_faults import (
     word_of,
 )
 from benchmarks.steering_nodes import CALLS, COMMANDED, DIRECT, HARDWARE, NODES, ROBOTS, ROUTES
-from needle_ros.system_state import CLEAR_STOP, RETRACT
+from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 import numpy as np
 import pytest
 
@@ -64,27 +64,17 @@ def test_steered_cells_cover_messages_nodes_and_phases() -> None:
 
 #: Cells that fail, by cause: see docs/safety.md.
 _OPEN: Final = {
-    'a repeated resume ends a later pause': SteeringCell(
-        DIRECT, False, 'response of resume at steering', 'first lost, then pause', 'inserting'
-    ),
-    'a repeated clear_stop ends a later stop': SteeringCell(
-        DIRECT, False, 'response of clear_stop at steering', 'first lost, then stop', 'inserting'
-    ),
-    'joint_commands move the needle after a clearance': SteeringCell(
-        COMMANDED, False, 'clear_stop at robot', 'late', 'inserting'
-    ),
     'a reversal of a position robot is taken for frozen encoders': SteeringCell(
         HARDWARE, False, 'retract at steering', 'late', 'guiding'
-    ),
+    )
 }
 
 
 def _is_open(cell: SteeringCell) -> bool:
     word = word_of(cell.place)
-    return (
-        later_word(cell) is not None
-        or (cell.robot, word) == (COMMANDED, CLEAR_STOP)
-        or (cell.robot, word) == (HARDWARE, RETRACT)
+    return (cell.robot == HARDWARE and later_word(cell) is not None) or (cell.robot, word) == (
+        HARDWARE,
+        RETRACT,
     )
 
 
@@ -96,6 +86,28 @@ def test_open_cell(cause: str) -> None:
     found = measure(_OPEN[cause])
     assert found.outcome in OUTCOMES
     assert found.advance <= allowed(_OPEN[cause])
+
+
+@pytest.mark.requirement('S-304')
+@pytest.mark.parametrize(
+    ('word', 'later', 'outcome'), [(RESUME, PAUSE, 'paused'), (CLEAR_STOP, STOP, 'stopped')]
+)
+def test_lost_response_of_a_resume_does_not_end_a_later_pause(
+    word: str, later: str, outcome: str
+) -> None:
+    """Nor a lost one of a clearance a later stop: they are not sent again."""
+    place, fault = f'response of {word} at steering', f'first lost, then {later}'
+    cell = SteeringCell(DIRECT, False, place, fault, 'inserting')
+    found = measure(cell)
+    assert found.outcome == outcome
+    assert found.advance <= allowed(cell)
+
+
+@pytest.mark.requirement('S-303')
+@pytest.mark.parametrize('fault', ['late', 'doubled'])
+def test_driver_moves_nothing_after_a_clearance(fault: str) -> None:
+    cell = SteeringCell(COMMANDED, False, 'clear_stop at robot', fault, 'inserting')
+    assert measure(cell).advance <= allowed(cell)
 
 
 @pytest.mark.requirement('S-186')

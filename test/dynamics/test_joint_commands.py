@@ -136,6 +136,25 @@ def drive(plant: PlantRun, samples: int, every: int, say: Any) -> list[float]:
     return depths
 
 
+@pytest.mark.requirement('S-303')
+def test_setpoints_after_a_stop_are_followed_from_the_joint_on() -> None:
+    """A driver that does not know the stop moves on; its next trajectory begins at the joint."""
+    plant = run(mode='robot')
+
+    def setpoint(depth: float) -> Any:
+        return lambda now, _time: message(now, ('insertion',), (depth,))
+
+    drive(plant, 500, 1, lambda now, time: message(now, ('insertion',), (0.05 + 0.01 * time,)))
+    plant.halt()
+    plant.commands.stopped = True
+    drive(plant, 300, 1, setpoint(0.056))
+    plant.commands.stopped = False
+    rest = plant.plant.depth
+    assert drive(plant, 500, 1, setpoint(0.06))[-1] == pytest.approx(rest, abs=1e-6)
+    drive(plant, 100, 1, setpoint(rest))
+    assert drive(plant, 1500, 1, setpoint(0.06))[-1] == pytest.approx(0.06, abs=2e-6)
+
+
 @pytest.mark.parametrize('every', [1, 5, 10, 50])
 def test_base_follows_positions_at_any_message_rate(every: int) -> None:
     """At a message rate below the sample rate it lags by one message, and arrives."""
