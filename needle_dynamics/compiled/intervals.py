@@ -131,6 +131,7 @@ def run_refined(
     c: CompiledNeedle,
     state: Vector,
     forces: Vector,
+    torques: Vector,
     interval: float,
     finer: int,
     runs: int,
@@ -138,7 +139,7 @@ def run_refined(
     steps: Vector,
 ) -> tuple[int, float]:
     """Advance through k intervals; return the completed count and the time left as `advance`."""
-    # ``forces``, shape (k,), are the insertion forces [N]; every step is divided by ``finer``.
+    # ``forces`` [N] and ``torques`` [N m] have shape (k,); every step is divided by ``finer``.
     # ``states``, shape (k + 1, 2 (2 + n)), takes the states at the ends of the intervals,
     # ``steps``, shape (k,), the shortest step of each interval [s].
     n = c.modes.modes.shape[1]
@@ -151,7 +152,7 @@ def run_refined(
     for i in range(state.shape[0]):
         states[0, i] = state[i]
     for k in range(forces.shape[0]):
-        inputs = Inputs(forces[k], 0.0, 0.0, False)
+        inputs = Inputs(forces[k], torques[k], 0.0, False)
         rest, steps[k] = interval, interval
         while rest > 0.0:
             depth = c.length - state[0]

@@ -12,13 +12,12 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
-from needle_dynamics.compiled.step import CompiledNeedle
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
-from needle_dynamics.simulated.trajectory import count_of, floats
+from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, floats, refined
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +35,8 @@ class Batch:
     time: FloatArray
     states: FloatArray
     completed: FloatArray  #: end of the valid part of each run [s], shape (runs,)
+    #: `Trajectory.error` of the valid part of each run, shape (runs,); NaN without a tolerance.
+    error: FloatArray
 
     def __repr__(self) -> str:
         samples = f'{len(self.time)} samples' if len(self.time) > 1 else 'state at the end'
@@ -74,8 +75,9 @@ def simulate_batch(
     *,
     duration: float,
     interval: float,
-    step: float = DEFAULT_STEP,
+    step: float | None = None,
     graded: bool = False,
+    tolerance: float | None = None,
     keep: bool = True,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -91,10 +93,15 @@ def simulate_batch(
         Initial states.
     forces, torques : array_like, shape (), (runs,) or (runs, k)
         Insertion force [N] and torque [N m], constant over each interval.
-    duration, interval, step : float
+    duration, interval : float
         As in `simulate` [s].
+    step : float, optional
+        Longest step of all runs [s], by default 1e-5.
     graded : bool
         As in `Integrator`.
+    tolerance : float, optional
+        Instead of a step: largest `Trajectory.error` of each run, whose samples then equal those
+        of `simulate`, to the bit.
     keep : bool
         Keep the states at all samples, or only the final states.
     workers : int, optional
@@ -106,6 +113,11 @@ def simulate_batch(
     -------
     Batch
         Results.
+
+    Raises
+    ------
+    ToleranceError
+        If a run cannot meet the tolerance.
 
     Examples
     --------
@@ -143,16 +155,21 @@ def simulate_batch(
         )
     if not (np.isfinite(pushes).all() and np.isfinite(turns).all()):
         raise ParameterError('forces and torques must be finite')
-    step = checked_step(step)
+    if tolerance is not None and (step is not None or graded):
+        raise ParameterError('tolerance excludes step and graded')
+    tolerance = None if tolerance is None else checked_tolerance(tolerance)
+    step = checked_step(DEFAULT_STEP if step is None else step)
     _check(each, starts)
     inputs = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)
     # In C order, as compiled.
     ends = np.broadcast_to(starts, (runs, starts.shape[1])).copy()
     workers = thread_count(workers, runs)
     with progress_of(progress, runs, 'runs') as advance:
-        kept, completed = _take(each, ends, inputs, keep=keep, workers=workers, progress=advance)
+        kept, completed, error = _take(
+            each, ends, inputs, tolerance, keep=keep, workers=workers, progress=advance
+        )
     time = np.arange(count + 1, dtype=np.float64) * interval
-    return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
+    return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval, error)
 
 
 def number_of_runs(**counts: int) -> int:
@@ -175,19 +192,20 @@ def _take(
     each: Sequence[NeedleParameters],
     states: FloatArray,
     inputs: lanes.BatchTrajectory,
+    tolerance: float | None,
     *,
     keep: bool,
     workers: int,
     progress: Callable[[], object],
-) -> tuple[FloatArray, FloatArray]:
-    """Return the states and the completed intervals of all runs; overwrite ``states``."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return states, completed intervals and errors of all runs; overwrite ``states``."""
     runs, width = states.shape
     kept = np.full((runs, inputs.intervals + 1 if keep else 1, width), np.nan)
-    completed = np.zeros(runs)
+    completed, errors = np.zeros(runs), np.full(runs, np.nan)
 
     @cache
-    def needle(k: int) -> CompiledNeedle:
-        return NeedleModel(each[k]).compiled
+    def model(k: int) -> NeedleModel:
+        return NeedleModel(each[k])
 
     def alone(some: IntArray) -> None:
         for i in some:
@@ -195,10 +213,17 @@ def _take(
                 np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (inputs.intervals,)))
                 for values in (inputs.forces, inputs.torques)
             )
-            completed[i] = run(
-                needle(i % len(each)), states[i], push, turn, inputs.interval, inputs.longest,
-                inputs.graded, 1, kept[i],
-            )  # fmt: skip
+            needle = model(i % len(each))
+            if tolerance is None:
+                completed[i] = run(
+                    needle.compiled, states[i], push, turn, inputs.interval, inputs.longest,
+                    inputs.graded, 1, kept[i],
+                )  # fmt: skip
+            else:
+                found = refined(needle, states[i], push, turn, inputs.interval, tolerance)
+                completed[i], errors[i], states[i] = found.done, found.error, found.end
+                if keep:
+                    kept[i, : found.done + 1] = found.states[: found.done + 1]
             progress()
 
     def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
@@ -209,7 +234,8 @@ def _take(
     # Several runs per task: the overhead of one task per run exceeds the cost of short runs.
     size = min(_CHUNK, -(-runs // workers))
     jobs = list[Callable[[], None]]()
-    for reach, some in _groups(each, runs).items():
+    groups = _groups(each, runs) if tolerance is None else {None: np.arange(runs)}
+    for reach, some in groups.items():
         job = alone
         if reach is not None:
             job = partial(together, _constants(each), _table(reach))
@@ -220,7 +246,7 @@ def _take(
     if not keep:
         whole = completed == inputs.intervals
         kept[whole, 0] = states[whole]
-    return kept, completed
+    return kept, completed, errors
 
 
 def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain, count
 from math import inf, nan
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.friction import COULOMB, FRICTION_LAWS
@@ -182,9 +182,7 @@ def simulate(
             f'order must be {ORDERS[0]} unless friction_law is {FRICTION_LAWS[COULOMB]}, '
             f'got {order!r} and {parameters.friction_law}'
         )
-    tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
-    if not 0.0 < tolerance < inf:
-        raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
+    tolerance = checked_tolerance(DEFAULT_TOLERANCE if tolerance is None else tolerance)
     if interval is None:
         if callable(force):
             raise ParameterError('interval must be given with a force that is a function of time')
@@ -200,7 +198,13 @@ def simulate(
     model = NeedleModel(parameters)
     start = model.checked_state(state)
     if step is None:
-        return _refined(model, start, time, forces, float(interval), tolerance)
+        found = refined(model, start, forces, np.zeros(count), float(interval), tolerance)
+        if found.done < count:
+            raise not_completed(model, found.end, found.left)
+        return Trajectory(
+            parameters, time, found.states, forces, found.steps, error=found.error,
+            order=found.order,
+        )  # fmt: skip
     step, states = checked_step(step), np.empty((count + 1, start.size))
     done = run(
         model.compiled, start, forces, np.zeros(count), float(interval), step, graded, order // 2,
@@ -212,31 +216,43 @@ def simulate(
     return Trajectory(parameters, time, states, forces, steps, graded, order=order)
 
 
-def _refined(
+class Refined(NamedTuple):
+    """Run that meets a tolerance, or that leaves the range of the needle."""
+
+    states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n)), valid up to ``done``
+    steps: FloatArray  #: shortest step of each interval [s], shape (k,)
+    error: float  #: as `Trajectory.error`, of the samples up to ``done``
+    order: int  #: as `Trajectory.order`
+    done: int  #: completed intervals
+    end: FloatArray  #: state after them, or the last valid one, shape (2 (2 + n),)
+    left: float  #: time left undone of the last interval [s]
+
+
+def refined(
     model: NeedleModel,
     start: FloatArray,
-    time: FloatArray,
     forces: FloatArray,
+    torques: FloatArray,
     interval: float,
     tolerance: float,
-) -> Trajectory:
-    """Raise the order or halve the steps until the samples have converged."""
-    states, steps = np.empty((len(time), start.size)), np.empty(len(forces))
+) -> Refined:
+    """Raise the order or halve the steps until the samples have converged, see `simulate`."""
+    states, steps = np.empty((len(forces) + 1, start.size)), np.empty(len(forces))
     before: tuple[int, FloatArray] | None = None
     best, tries, error = inf, 0, inf
     exact = model.parameters.friction_law == FRICTION_LAWS[COULOMB]
     orders = ORDERS[1:] if exact and tolerance < _SMALL else ORDERS[:1]
     # Divisions of the steps and order of the runs to compare, by rising cost.
-    rising = ((1, one) for one in orders)
-    for finer, order in chain(rising, ((2**k, orders[-1]) for k in count(1))):
-        state = start.copy()
+    rising = chain(((1, one) for one in orders), ((2**k, orders[-1]) for k in count(1)))
+    while True:
+        (finer, order), state = next(rising), start.copy()
         done, left = run_refined(
-            model.compiled, state, forces, interval, finer, order // 2, states, steps
+            model.compiled, state, forces, torques, interval, finer, order // 2, states, steps
         )
         if before is not None:
             error = _difference(model, before[1], states[: done + 1]) if before[0] == done else inf
             if error <= tolerance:
-                break
+                return Refined(states, steps, error, order, done, state, left)
             tries = tries + 1 if error >= best and finer > 1 else 0
             best = min(best, error)
             if tries == _TRIES or steps[:done].min(initial=interval) < 2.0 * SHORTEST_STEP:
@@ -244,9 +260,6 @@ def _refined(
                     f'tolerance {tolerance:g} cannot be met at any step; the best is {best:.1g}'
                 )
         before = done, states[: done + 1].copy()
-    if done < len(forces):
-        raise not_completed(model, state, left)
-    return Trajectory(model.parameters, time, states, forces, steps, error=error, order=order)
 
 
 def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
@@ -258,6 +271,13 @@ def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
     return max(
         float(np.abs(two[:, 0] - one[:, 0]).max()) / farthest, apart / peak if peak else apart
     )
+
+
+def checked_tolerance(tolerance: float) -> float:
+    """Check a tolerance and return it as a float."""
+    if not 0.0 < tolerance < inf:
+        raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
+    return float(tolerance)
 
 
 def floats(name: str, values: object) -> FloatArray:

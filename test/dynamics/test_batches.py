@@ -99,6 +99,52 @@ def test_batch_equals_single_simulations_bit_for_bit(n: int) -> None:
         assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
 
 
+@pytest.mark.parametrize('tolerance', [1e-3, 1e-6])
+def test_tolerance_gives_the_samples_and_errors_of_single_runs(tolerance: float) -> None:
+    """To the bit, for any number of workers; friction laws of several orders."""
+    parameters = [preset('phantom', friction_law=law) for law in ('coulomb', 'stribeck')]
+    states = np.array([NeedleModel(p).state_at(0.05, 5e-4) for p in parameters])
+    options = {'duration': 0.02, 'interval': 0.01, 'tolerance': tolerance}
+    found = simulate_batch(parameters, states, 3.0, **options)
+    for i, p in enumerate(parameters):
+        alone = simulate(p, states[i], 3.0, **options)
+        assert np.array_equal(found.states[i], alone.states)
+        assert found.error[i] == alone.error <= tolerance
+    last = simulate_batch(parameters, states, 3.0, keep=False, workers=1, **options)
+    assert np.array_equal(last.states[:, 0], found.states[:, -1])
+    assert np.array_equal(last.error, found.error)
+
+
+def test_tolerance_with_torques_and_with_a_run_that_ends_early() -> None:
+    """The rotation has no error; a run that leaves its range is compared up to there."""
+    p = preset('phantom')
+    states = np.array([NeedleModel(p).state_at(depth) for depth in (0.05, 1.5e-3)])
+    options = {'duration': 0.2, 'interval': 0.02}
+    found = simulate_batch(p, states, -3.0, 1e-5, tolerance=1e-4, **options)
+    with_step = simulate_batch(p, states, -3.0, 1e-5, step=1e-5, **options)
+    assert_allclose(found.states[0, :, [1, 5]], with_step.states[0, :, [1, 5]], rtol=1e-12)
+    assert found.states[0, -1, 1] > 0.0
+    assert np.array_equal(found.completed, with_step.completed)
+    assert found.completed[1] < 0.2
+    assert np.isnan(found.states[1, -1]).all()
+    assert (found.error <= 1e-4).all()
+    assert np.isnan(with_step.error).all()
+
+
+@pytest.mark.parametrize(
+    ('options', 'complaint'),
+    [
+        ({'tolerance': 1e-4, 'step': 1e-5}, 'tolerance excludes step and graded'),
+        ({'tolerance': 1e-4, 'graded': True}, 'tolerance excludes step and graded'),
+        ({'tolerance': 0.0}, r'tolerance must be positive and finite, got 0\.0'),
+    ],
+)
+def test_invalid_tolerance_is_rejected(options: dict[str, Any], complaint: str) -> None:
+    p = preset('phantom')
+    with pytest.raises(ParameterError, match=f'^{complaint}$'):
+        batch(p, NeedleModel(p).state_at(0.05), 3.0, **options)
+
+
 def test_batch_equals_the_integrator_over_its_intervals() -> None:
     """The clock of the integrator is the sum of the intervals."""
     constants, states, forces = study()
