@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import needle_controller as control
 from needle_controller.controller import LAW_OF
+from needle_controller.in_loop.sampled import run_insertions
 from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
 from needle_controller.safety.guard import Guard
@@ -27,7 +28,7 @@ OPEN_LOOP: Final = 'open loop'
 CONTROLLERS: Final = (*control.LAWS, OPEN_LOOP)  #: control laws, and the open loop
 _REST: Final = 1e-5  #: largest speed of a needle at rest [m/s]
 _MOST: Final = 1_000_000  #: most samples of an insertion
-_AT_ONCE: Final = 16  #: open-loop insertions per batch, whose samples are all in memory
+_AT_ONCE: Final = 32  #: insertions per batch, whose samples are all in memory
 
 #: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
@@ -238,43 +239,47 @@ class InsertionScenario(Scenario):
         law = self._law
         if law is None:
             return self._open(rows, streams)
-        return (self._closed(law, row, rng) for row, rng in zip(rows, streams, strict=True))
+        return self._closed(law, rows, streams)
 
     def _noise(self, row: Row, rng: np.random.Generator, count: int) -> FloatArray:
         """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
         sizes = [row[name] for name in ('depth_noise', 'velocity_noise', 'force_noise')]
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
-    def _closed(self, law: Law, row: Row, rng: np.random.Generator) -> _Insertion:
-        numbers, model = self._numbers, NeedleModel(self._truth(row))
-        # The reference starts at the measured depth.
-        begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
-        reference: control.Reference = self._kind(control.Setpoint(begin), row['target'], numbers)
-        count = max(1, round((reference.duration + numbers.wait) * numbers.rate))
-        noise, late = self._noise(row, rng, count), round(row['late'])
-        batch = control.run_batch(
+    def _closed(self, law: Law, rows: Sequence[Row], streams: Streams) -> Iterator[_Insertion]:
+        numbers, models, references, noises = self._numbers, [], [], []
+        for row, rng in zip(rows, streams, strict=True):
+            models.append(NeedleModel(self._truth(row)))
+            # The reference starts at the measured depth.
+            begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
+            reference = self._kind(control.Setpoint(begin), row['target'], numbers)
+            count = max(1, round((reference.duration + numbers.wait) * numbers.rate))
+            references.append(reference)
+            noises.append(self._noise(row, rng, count))
+        lates = [round(row['late']) for row in rows]
+        delay = int(numbers.delay)
+        found = run_insertions(
             law,
-            model.parameters,
-            model.state_at(row['depth'], row['tip']),
-            reference,
-            delay=int(numbers.delay),
-            late=late,
-            noise=noise,
+            models,
+            [
+                model.state_at(row['depth'], row['tip'])
+                for model, row in zip(models, rows, strict=True)
+            ],
+            references,
+            noises,
+            lates,
+            delay=delay,
             limit=numbers.force_limit,
-            duration=count * self._period,
             step=numbers.step,
-            record=True,
-            workers=1,
         )
-        commands, delay = batch.commands[0], int(numbers.delay) + late
-        acting = np.concatenate([np.zeros(delay), commands])[:count] + noise[:, 2]
-        done = int(batch.completed[0])
-        run = _Insertion(
-            model, batch.trajectories[0], commands, acting, noise[:, :2], batch.goal, 0.0,
-            float(done < count),
-        ).until(done)  # fmt: skip
-        end = self._stop(run)
-        return run if end is None else run._replace(stopped=1.0, left=0.0).until(end)
+        for model, noise, late, one in zip(models, noises, lates, found, strict=True):
+            acting = np.concatenate([np.zeros(delay + late), one.commands])[: len(noise)]
+            run = _Insertion(
+                model, one.states, one.commands, acting + noise[:, 2], noise[:, :2], one.goal,
+                0.0, float(one.completed < len(noise)),
+            ).until(one.completed)  # fmt: skip
+            end = self._stop(run)
+            yield run if end is None else run._replace(stopped=1.0, left=0.0).until(end)
 
     def _stop(self, run: _Insertion) -> int | None:
         """Return the sample of the stop by the guard, or None."""

@@ -9,9 +9,22 @@ from needle_controller.compiled.laws import (
     LawTuple,
     MEMORY,
 )
-from needle_dynamics.arrays import FloatArray, Matrix, Vector
+from needle_dynamics.arrays import Array3, FloatArray, IntVector, Matrix, Vector
 from needle_dynamics.compiled.cache import inlined, kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
+from needle_dynamics.compiled.lanes import (
+    ACCELERATION,
+    DEPTH,
+    FORCE,
+    INSIDE,
+    LANES,
+    LEFT,
+    load_lane,
+    ROWS,
+    save_lane,
+    step_lanes,
+    VELOCITY,
+)
 from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 import numpy as np
 
@@ -29,8 +42,33 @@ def _delayed(pending: FloatArray, command: float) -> float:
     return force
 
 
+@inlined
+def _respond(
+    law: LawTuple,
+    memory: FloatArray,
+    pending: FloatArray,
+    known: int,
+    setpoints: FloatArray,
+    goal: FloatArray,
+    at: int,
+    depth: float,
+    velocity: float,
+    acts: float,
+    limit: float,
+) -> tuple[float, float, float, int]:
+    """Return the command for a measurement, the force that acts, also for the law, and waits."""
+    aim, delay = setpoints[at], pending.shape[0]
+    instant = (depth, velocity, aim[0], aim[1], aim[2])
+    command = answer(law, memory, pending[delay - known :], instant, acts, 0.0, limit, np.nan)
+    to_go = setpoints[len(setpoints) - 1, 0] - goal[at]
+    waits = 1 if abs(command) >= limit and command * to_go > 0.0 else 0
+    # Force of this period according to the law.
+    acts = pending[delay - known] if known > 0 else command
+    return command, _delayed(pending, command), acts, waits
+
+
 @kernel
-def run_loop(  # noqa: C901
+def run_loop(
     c: CompiledNeedle,
     state: Vector,
     law: LawTuple,
@@ -67,7 +105,7 @@ def run_loop(  # noqa: C901
     without waits minus insertion depth: last, largest in modulus, and mean square [m^2].
     """
     memory, none = np.zeros(MEMORY), np.empty((0, 3))
-    period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
+    period, m = LawConstants(*law).period, state.shape[0] // 2
     count = setpoints.shape[0]
     largest, squares, acts, waited = 0.0, 0.0, 0.0, 0
     for k in range(count + 1):
@@ -85,18 +123,12 @@ def run_loop(  # noqa: C901
             break
         if noise.shape[0] > 0:
             depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
-        aim = setpoints[k - waited]
-        instant = (depth, velocity, aim[0], aim[1], aim[2])
-        newest = pending[delay - known :]
-        command = answer(law, memory, newest, instant, acts, 0.0, limit, np.nan)
-        to_go = setpoints[count - 1, 0] - goal[k - waited]
-        if abs(command) >= limit and command * to_go > 0.0:
-            waited += 1
+        command, force, acts, waits = _respond(
+            law, memory, pending, known, setpoints, goal, k - waited, depth, velocity, acts, limit
+        )
+        waited += waits
         if commands.shape[0] > 0:
             commands[k] = command
-        # Force of this period according to the law.
-        acts = pending[delay - known] if known > 0 else command
-        force = _delayed(pending, command)
         if noise.shape[0] > 0:
             force += noise[k, 2]
         inputs = Inputs(force, 0.0, 0.0, False)
@@ -110,6 +142,65 @@ def run_loop(  # noqa: C901
         if left != 0.0:
             return k
     return int(count)
+
+
+@kernel
+def run_lanes(
+    needles: Matrix,
+    table: Matrix,
+    law: LawTuple,
+    limit: float,
+    setpoints: Array3,
+    goal: Matrix,
+    counts: IntVector,
+    pending: Matrix,
+    delays: IntVector,
+    known: int,
+    noise: Array3,
+    longest: float,
+    which: IntVector,
+    states: Array3,
+    commands: Matrix,
+    completed: Vector,
+) -> None:
+    """
+    Run a law with up to `LANES` needles as `run_loop`, several with each instruction.
+
+    Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
+    ``counts``, and long enough for all. ``which`` has the rows of the runs to compute, ``needles``
+    and ``table`` are as for `lanes.run`. ``pending`` has shape (runs, longest delay), with the
+    ``delays``. ``states`` starts with the initial states. ``completed`` takes the periods.
+    """
+    n, period = len(which), LawConstants(*law).period
+    w, memory, acts = np.zeros(ROWS * LANES), np.zeros((n, MEMORY)), np.zeros(n)
+    waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
+    for i in range(n):
+        load_lane(w, i, needles[which[i]], states[which[i], 0], table)
+    for k in range(counts[which[0]]):
+        while counts[which[n - 1]] <= k:
+            n -= 1
+        for i in range(n):
+            run = which[i]
+            blur = noise[run, k]
+            commands[run, k], force, acts[i], waits = _respond(
+                law, memory[i], pending[run, : delays[run]], known, setpoints[run, : counts[run]],
+                goal[run], k - waited[i], w[DEPTH + i] + blur[0], w[VELOCITY + i] + blur[1],
+                acts[i], limit,
+            )  # fmt: skip
+            waited[i] += waits
+            w[FORCE + i] = force + blur[2]
+            w[LEFT + i], w[ACCELERATION + i] = period, 0.0
+        # All lanes take steps of the same length.
+        while w[LEFT] > 0.0:
+            step_lanes(w, n, table, longest, 0.0)
+            for i in range(n):
+                inside[i] &= w[INSIDE + i] != 0.0
+        for i in range(n):
+            if inside[i]:
+                before, state = states[which[i], k], states[which[i], k + 1]
+                state[1], state[5] = before[1] + period * before[5], before[5]
+                save_lane(w, i, table, state)
+                completed[which[i]] = k + 1
 
 
 @kernel

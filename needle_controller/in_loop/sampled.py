@@ -7,20 +7,30 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, repeat
 from math import isfinite
-from typing import Protocol
+from typing import Final, NamedTuple, Protocol
 
-from needle_controller.compiled.loop import run_loop
+from needle_controller.compiled.loop import run_lanes, run_loop
 from needle_controller.controller import ControllerOutput, Measurement
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.setpoint import Reference
+from needle_controller.reference.trapezoid import Trapezoid
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.compiled.lanes import LANES
 from needle_dynamics.progress import Progress, progress_of
-from needle_dynamics.simulated.batch import number_of_runs, thread_count
+from needle_dynamics.simulated.batch import (
+    lane_constants,
+    lane_groups,
+    lane_table,
+    number_of_runs,
+    thread_count,
+)
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
+
+_NONE: Final = np.empty((0, 3))  #: no additional friction
 
 
 class Commander(Protocol):
@@ -268,9 +278,80 @@ def run_batch(
     )
 
 
+class LoopInsertion(NamedTuple):
+    """A run of `run_insertions`."""
+
+    states: FloatArray  #: states at the measurements, shape (k + 1, 2 (2 + n)); NaN as `LoopBatch`
+    commands: FloatArray  #: command for each measurement [N], shape (k,)
+    goal: FloatArray  #: reference at the measurements [m], shape (k + 1,)
+    completed: int  #: periods completed before the needle left its range
+
+
+def run_insertions(
+    law: Law,
+    models: Sequence[NeedleModel],
+    states: Sequence[FloatArray],
+    references: Sequence[Reference],
+    noises: Sequence[FloatArray],
+    lates: Sequence[int],
+    *,
+    delay: int,
+    limit: float,
+    step: float,
+) -> list[LoopInsertion]:
+    """
+    Run a law on needles, each with its own reference, noise and additional delay, on one core.
+
+    Arguments are as of `run_batch`, and a run has as many periods as its noise, shape (k, 3).
+    Several needles of the same reach that `simulate_batch` computes together are computed with
+    each instruction; they differ from `run_batch` by rounding.
+    """
+    counts = np.array([len(noise) for noise in noises])
+    # In falling order of duration, as for compiled code.
+    order = np.argsort(-counts, kind='stable')
+    runs, most = len(order), int(counts[order[0]])
+    counts, delays = counts[order], delay + np.array(lates)[order]
+    chosen = [models[i] for i in order]
+    setpoints, blurred = np.zeros((2, runs, most, 3))
+    goal, commands = np.full((runs, most + 1), np.nan), np.full((runs, most), np.nan)
+    trajectories = np.full((runs, most + 1, len(states[0])), np.nan)
+    for k, i in enumerate(order.tolist()):
+        count = counts[k]
+        motion = _setpoints(references[i], law.period, count + delay + 1)
+        setpoints[k, :count], goal[k, : count + 1] = motion[delay:-1], motion[: count + 1, 0]
+        blurred[k, :count], trajectories[k, 0] = noises[i], states[i]
+    pending, completed = np.zeros((runs, int(delays.max()))), np.zeros(runs)
+    parameters = [model.parameters for model in chosen]
+    for reach, some in lane_groups(parameters, runs).items():
+        if reach is not None:
+            for part in np.split(some, range(LANES, len(some), LANES)):
+                run_lanes(
+                    lane_constants(parameters), lane_table(reach), law.packed, limit, setpoints,
+                    goal, counts, pending, delays, delay, blurred, step, part, trajectories,
+                    commands, completed,
+                )  # fmt: skip
+            continue
+        for k in some.tolist():
+            n, end = counts[k], trajectories[k, 0].copy()
+            completed[k] = run_loop(
+                chosen[k].compiled, end, law.packed, limit, setpoints[k, :n], goal[k, : n + 1],
+                pending[k, : delays[k]], delay, blurred[k, :n], _NONE, step, np.empty(0),
+                trajectories[k, : n + 1], commands[k, :n], np.empty(3),
+            )  # fmt: skip
+    found = [
+        LoopInsertion(path[: n + 1], force[:n], aim[: n + 1], int(done))
+        for path, force, aim, n, done in zip(
+            trajectories, commands, goal, counts.tolist(), completed, strict=True
+        )
+    ]
+    return [found[k] for k in np.argsort(order)]
+
+
 def _setpoints(reference: Reference, period: float, count: int) -> FloatArray:
     """Return position, velocity and acceleration of a reference at multiples of a period."""
     times = np.arange(count, dtype=np.float64) * period
+    if isinstance(reference, Trapezoid):
+        return np.ascontiguousarray(reference.sampled(times))
     # The reference rests after its end.
     moving = int(np.searchsorted(times, reference.duration))
     result = np.empty((count, 3))

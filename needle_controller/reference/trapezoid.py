@@ -4,6 +4,8 @@
 from math import copysign, sqrt
 
 from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
+from needle_dynamics.arrays import FloatArray
+import numpy as np
 
 
 class Step(Reference):
@@ -66,3 +68,17 @@ class Trapezoid(Reference):
             if time <= 0.0:
                 break
         return Setpoint(position, velocity, acceleration)
+
+    def sampled(self, times: FloatArray) -> FloatArray:
+        """Return the setpoints of `at` as rows, shape (k, 3), for times [s] of shape (k,)."""
+        left, found = np.maximum(times, 0.0), np.zeros((3, len(times)))
+        position, velocity, acceleration = found
+        position[:], velocity[:] = self._start.position, self._start.velocity
+        for duration, change in self._parts:
+            t = np.minimum(left, duration)
+            position += t * (velocity + 0.5 * t * change)
+            velocity += t * change
+            acceleration[left > 0.0] = change
+            left -= t
+        found[:, times >= self.duration] = np.array([[self._target], [0.0], [0.0]])
+        return found.T

@@ -30,13 +30,13 @@ COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' o
 
 # Offset of each row of the lanes. First the constants.
 (
-    _LENGTH, _DENSITY, _BENDING, _STIFFNESS, _DAMPING, _MASS, _COULOMB, _VISCOUS, _WITHDRAWAL,
+    LENGTH, _DENSITY, _BENDING, _STIFFNESS, _DAMPING, _MASS, _COULOMB, _VISCOUS, _WITHDRAWAL,
     _LOW, _HIGH, _STOP, _INERTIA,
     # Motion, modes, and time left of the interval.
-    _S, _U, _A, _Q1, _Q2, _Z1, _Z2, _FORCE, _LEFT,
+    DEPTH, VELOCITY, ACCELERATION, _Q1, _Q2, _Z1, _Z2, FORCE, LEFT,
     # One step: its length, time left after it, relative depth in its middle and fourth power of
     # this depth, whether the depth is in range, and the impulse of the modes.
-    _H, _REST, _XI, _XI4, _INSIDE, _IMPULSE,
+    _H, _REST, _XI, _XI4, INSIDE, _IMPULSE,
     # Result of the step.
     _NEW_Q1, _NEW_Q2, _NEW_Z1, _NEW_Z2, _NEW_U, _TRAVEL, _STOPS,
     # Series of the modes.
@@ -45,7 +45,7 @@ COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' o
 
 #: Number of rows that move with a needle between lanes.
 _KEPT: Final = _H // LANES
-_ROWS: Final = _SERIES // LANES + COLUMNS
+ROWS: Final = _SERIES // LANES + COLUMNS
 
 _ROUND: Final = 1.5 * 2.0**52  #: adding and subtracting this number rounds to an integer
 
@@ -137,13 +137,13 @@ def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
     """Compute the step of each lane and the depth in its middle."""
     sixth = grade / 6.0
     for i in range(n):
-        s, u, left, length = w[_S + i], w[_U + i], w[_LEFT + i], w[_LENGTH + i]
+        s, u, left, length = w[DEPTH + i], w[VELOCITY + i], w[LEFT + i], w[LENGTH + i]
         whole = longest * max(1.0, grade * s / (GRADED_FROM * length))
         count = left / whole * (1.0 - 1e-9)
         near = (count + _ROUND) - _ROUND
         steps = max(near + 1.0 if near < count else near, 1.0)
         h = left / steps
-        middle = min(s + 0.5 * h * u + sixth * h * h * w[_A + i], w[_STOP + i])
+        middle = min(s + 0.5 * h * u + sixth * h * h * w[ACCELERATION + i], w[_STOP + i])
         inside = w[_LOW + i] <= middle <= w[_HIGH + i]
         xi = middle / length if inside else 1.0
         square = xi * xi
@@ -151,7 +151,7 @@ def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
         w[_REST + i] = left - h if steps > 1.0 else 0.0
         w[_XI + i] = xi
         w[_XI4 + i] = square * square
-        w[_INSIDE + i] = 1.0 if inside else 0.0
+        w[INSIDE + i] = 1.0 if inside else 0.0
 
 
 @compiled
@@ -186,7 +186,7 @@ def _rotate(w: FloatArray, n: int) -> None:
     """Advance the deflections through the step, as `modal_flow.rotate_two`."""
     for i in range(n):
         h, xi, rho = w[_H + i], w[_XI + i], w[_DENSITY + i]
-        ka, length = w[_STIFFNESS + i], w[_LENGTH + i]
+        ka, length = w[_STIFFNESS + i], w[LENGTH + i]
         ei = w[_BENDING + i] / (length * length * length * length)
         fifth = w[_XI4 + i] * xi
         g11 = fifth * _powers(w, 0, i, xi)
@@ -219,9 +219,9 @@ def _rotate(w: FloatArray, n: int) -> None:
 def _move(w: FloatArray, n: int) -> None:
     """Move the insertion axis, as `friction.slide` where the motion does not stop."""
     for i in range(n):
-        h, u, mass = w[_H + i], w[_U + i], w[_MASS + i]
+        h, u, mass = w[_H + i], w[VELOCITY + i], w[_MASS + i]
         sign, factor = (1.0, 1.0) if u > 0.0 else (-1.0, w[_WITHDRAWAL + i])
-        drive = w[_FORCE + i] - w[_IMPULSE + i] / h
+        drive = w[FORCE + i] - w[_IMPULSE + i] / h
         a = (drive - sign * factor * w[_COULOMB + i]) / mass
         x = factor * w[_VISCOUS + i] / mass * h
         mean, ramp = _decay_means(x)
@@ -233,7 +233,7 @@ def _move(w: FloatArray, n: int) -> None:
         if w[_STOPS + i] != 0.0:
             h = w[_H + i]
             w[_NEW_U + i], w[_TRAVEL + i] = slide(
-                w[_U + i], w[_FORCE + i] - w[_IMPULSE + i] / h, w[_MASS + i], w[_COULOMB + i],
+                w[VELOCITY + i], w[FORCE + i] - w[_IMPULSE + i] / h, w[_MASS + i], w[_COULOMB + i],
                 w[_VISCOUS + i], h, w[_WITHDRAWAL + i],
             )  # fmt: skip
 
@@ -242,20 +242,30 @@ def _move(w: FloatArray, n: int) -> None:
 def _end(w: FloatArray, n: int) -> None:
     """End the step of each lane; a lane that would leave its range keeps its state."""
     for i in range(n):
-        depth, velocity = w[_S + i] + w[_TRAVEL + i], w[_NEW_U + i]
+        depth, velocity = w[DEPTH + i] + w[_TRAVEL + i], w[_NEW_U + i]
         stopped = depth >= w[_STOP + i]
         high = inf if stopped else w[_HIGH + i]
-        inside = w[_INSIDE + i] != 0.0 and w[_LOW + i] <= depth <= high
-        gain = (velocity - w[_U + i]) / w[_H + i]
-        w[_INSIDE + i] = 1.0 if inside else 0.0
-        w[_S + i] = (w[_STOP + i] if stopped else depth) if inside else w[_S + i]
-        w[_U + i] = (0.0 if stopped else velocity) if inside else w[_U + i]
-        w[_A + i] = gain
+        inside = w[INSIDE + i] != 0.0 and w[_LOW + i] <= depth <= high
+        gain = (velocity - w[VELOCITY + i]) / w[_H + i]
+        w[INSIDE + i] = 1.0 if inside else 0.0
+        w[DEPTH + i] = (w[_STOP + i] if stopped else depth) if inside else w[DEPTH + i]
+        w[VELOCITY + i] = (0.0 if stopped else velocity) if inside else w[VELOCITY + i]
+        w[ACCELERATION + i] = gain
         w[_Q1 + i] = w[_NEW_Q1 + i] if inside else w[_Q1 + i]
         w[_Q2 + i] = w[_NEW_Q2 + i] if inside else w[_Q2 + i]
         w[_Z1 + i] = w[_NEW_Z1 + i] if inside else w[_Z1 + i]
         w[_Z2 + i] = w[_NEW_Z2 + i] if inside else w[_Z2 + i]
-        w[_LEFT + i] = w[_REST + i]
+        w[LEFT + i] = w[_REST + i]
+
+
+@inlined
+def step_lanes(w: FloatArray, n: int, table: FloatArray, longest: float, grade: float) -> None:
+    """Take one step of at most ``longest`` [s] in each of n lanes."""
+    _begin(w, n, longest, grade)
+    _modes(w, n, table)
+    _rotate(w, n)
+    _move(w, n)
+    _end(w, n)
 
 
 @inlined
@@ -272,7 +282,7 @@ def _gram(table: FloatArray, xi: float) -> tuple[float, float, float]:
 
 
 @compiled
-def _load(
+def load_lane(
     w: FloatArray, i: int, constants: FloatArray, state: FloatArray, table: FloatArray
 ) -> None:
     for k in range(len(constants)):
@@ -280,17 +290,17 @@ def _load(
     length, rho = constants[0], constants[1]
     depth = length - state[0]
     g11, g12, g22 = _gram(table, depth / length)
-    w[_S + i], w[_U + i], w[_A + i] = depth, -state[4], 0.0
+    w[DEPTH + i], w[VELOCITY + i], w[ACCELERATION + i] = depth, -state[4], 0.0
     w[_Q1 + i], w[_Q2 + i] = state[2], state[3]
     w[_Z1 + i] = rho * (g11 * state[6] + g12 * state[7])
     w[_Z2 + i] = rho * (g12 * state[6] + g22 * state[7])
 
 
 @compiled
-def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
+def save_lane(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
     """Write the state of a lane, without the angle and its rate."""
-    length, rho = w[_LENGTH + i], w[_DENSITY + i]
-    g11, g12, g22 = _gram(table, w[_S + i] / length)
+    length, rho = w[LENGTH + i], w[_DENSITY + i]
+    g11, g12, g22 = _gram(table, w[DEPTH + i] / length)
     z1, z2 = w[_Z1 + i], w[_Z2 + i]
     # By Cholesky, as in `advance`: G is nearly singular at small depths.
     l11 = sqrt(rho * g11)
@@ -298,8 +308,8 @@ def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
     l22 = sqrt(rho * g22 - l21 * l21)
     v1 = z1 / l11
     rate2 = (z2 - l21 * v1) / (l22 * l22)
-    state[0], state[2], state[3] = length - w[_S + i], w[_Q1 + i], w[_Q2 + i]
-    state[4], state[6], state[7] = -w[_U + i], (v1 - l21 * rate2) / l11, rate2
+    state[0], state[2], state[3] = length - w[DEPTH + i], w[_Q1 + i], w[_Q2 + i]
+    state[4], state[6], state[7] = -w[VELOCITY + i], (v1 - l21 * rate2) / l11, rate2
 
 
 @kernel
@@ -318,7 +328,7 @@ def run(
     # Outputs: ``states``, shape (all, 8), at the end; ``kept``, shape (all, count + 1, 8), at the
     # ends of the intervals (unused if it has one row per run); ``completed``, shape (all,),
     # intervals.
-    w = np.zeros(_ROWS * LANES)
+    w = np.zeros(ROWS * LANES)
     # Run and interval of each lane.
     which, at = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)
     waiting, n = 0, 0
@@ -326,25 +336,21 @@ def run(
         while n < LANES and waiting < len(runs):
             i = runs[waiting]
             waiting += 1
-            _load(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
+            load_lane(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
             if kept.shape[1] > 1:
                 for k in range(states.shape[1]):
                     kept[i, 0, k] = states[i, k]
             which[n], at[n] = i, 0
-            w[_FORCE + n] = _input(trajectory.forces, i, 0)
-            w[_LEFT + n], w[_INSIDE + n] = trajectory.interval, 1.0
+            w[FORCE + n] = _input(trajectory.forces, i, 0)
+            w[LEFT + n], w[INSIDE + n] = trajectory.interval, 1.0
             n += 1
         if n == 0:
             return
-        _begin(w, n, trajectory.longest, 1.0 if trajectory.graded else 0.0)
-        _modes(w, n, table)
-        _rotate(w, n)
-        _move(w, n)
-        _end(w, n)
+        step_lanes(w, n, table, trajectory.longest, 1.0 if trajectory.graded else 0.0)
         # Backwards: a lane that ends is filled with the last lane, which is already checked.
         for i in range(n - 1, -1, -1):
-            continues = w[_INSIDE + i] != 0.0
-            if continues and w[_LEFT + i] == 0.0:
+            continues = w[INSIDE + i] != 0.0
+            if continues and w[LEFT + i] == 0.0:
                 continues = _next(w, i, which[i], at, trajectory, table, states, kept)
                 completed[which[i]] = at[i]
             if not continues:
@@ -369,7 +375,7 @@ def _next(
     state, time = states[which], trajectory.interval
     turn = 2.0 / w[_INERTIA + i] * _input(trajectory.torques, which, at[i])
     angle, rate = state[1], state[5]
-    _save(w, i, table, state)
+    save_lane(w, i, table, state)
     state[1] = angle + (rate + 0.5 * turn * time) * time
     state[5] = rate + turn * time
     size = 0.0
@@ -381,8 +387,8 @@ def _next(
     if kept.shape[1] > 1:
         for k in range(len(state)):
             kept[which, at[i], k] = state[k]
-    w[_FORCE + i] = _input(trajectory.forces, which, min(at[i], trajectory.intervals - 1))
-    w[_LEFT + i], w[_A + i] = time, 0.0
+    w[FORCE + i] = _input(trajectory.forces, which, min(at[i], trajectory.intervals - 1))
+    w[LEFT + i], w[ACCELERATION + i] = time, 0.0
     return bool(at[i] < trajectory.intervals)
 
 

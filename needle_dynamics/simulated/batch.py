@@ -234,11 +234,11 @@ def _take(
     # Several runs per task: the overhead of one task per run exceeds the cost of short runs.
     size = min(_CHUNK, -(-runs // workers))
     jobs = list[Callable[[], None]]()
-    groups = _groups(each, runs) if tolerance is None else {None: np.arange(runs)}
+    groups = lane_groups(each, runs) if tolerance is None else {None: np.arange(runs)}
     for reach, some in groups.items():
         job = alone
         if reach is not None:
-            job = partial(together, _constants(each), _table(reach))
+            job = partial(together, lane_constants(each), lane_table(reach))
         jobs += [partial(job, some[k : k + size]) for k in range(0, len(some), size)]
     with ThreadPoolExecutor(workers) as pool:
         for done in [pool.submit(job) for job in jobs]:
@@ -262,7 +262,7 @@ def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
         NeedleModel(each[i % len(each)]).checked_state(starts[i % len(starts)])
 
 
-def _groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, IntArray]:
+def lane_groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, IntArray]:
     """Group the runs by the reach of a shared mode table; None for runs without one."""
     reaches = [p.reach if _fits(p) else None for p in each]
     if len(each) == 1:
@@ -283,7 +283,8 @@ def _fits(p: NeedleParameters) -> bool:
     )
 
 
-def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
+def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
+    """Return the rows of `lanes.Constants`, shape (runs, 13)."""
     return np.array(
         [
             lanes.Constants(
@@ -298,7 +299,7 @@ def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
 
 
 @cache
-def _table(reach: float) -> FloatArray:
+def lane_table(reach: float) -> FloatArray:
     """Return the series of two modes of length 1 for `lanes.run`: 1 + 4 m terms."""
     series = mode_shapes(1.0, 2, reach).tables.series[:, : lanes.COLUMNS]
     more = -(len(series) - 1) % 4

@@ -25,6 +25,7 @@ from needle_controller import (
     run_controller,
     Setpoint,
 )
+from needle_controller.in_loop.sampled import run_insertions
 from needle_controller.laws.law import SampledLoop
 from needle_dynamics import (
     FloatArray,
@@ -333,6 +334,59 @@ def test_batch_noise_is_encoder_noise() -> None:
         run_batch(law, NOMINAL, START, REFERENCE, noise=noise[1:], **options)
     with pytest.raises(ParameterError, match='delay and late >= 0'):
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
+
+
+def test_insertions_together_equal_batches_of_one() -> None:
+    """Each with its own needle, reference, noise and delay; alone or not, to the bit."""
+    law = InverseDynamics(
+        axis=Axis.insertion(NOMINAL), gains=InverseDynamicsGains(), period=PERIOD
+    )
+    changes: list[dict[str, Any]] = [{}, {'friction_law': 'stribeck'}, {'tissue_stiffness': 2e3}]
+    models = [NeedleModel(replace(NOMINAL, **one)) for one in changes]
+    starts = [model.state_at(0.02, 2e-4) for model in models]
+    targets = [Setpoint(0.02), Setpoint(0.02), Setpoint(0.0201)]
+    references = [
+        MinimumJerk(one, goal, ReferenceLimits())
+        for one, goal in zip(targets, (0.024, 0.022, 0.026), strict=True)
+    ]
+    rng = np.random.default_rng(2)
+    noises = [1e-6 * rng.standard_normal((count, 3)) for count in (700, 400, 900)]
+    lates, options = [0, 1, 2], {'delay': 1, 'limit': 15.0, 'step': 3e-4}
+    together = run_insertions(law, models, starts, references, noises, lates, **options)
+    for i, found in enumerate(together):
+        one = [[values[i]] for values in (models, starts, references, noises, lates)]
+        alone = run_insertions(law, *one, **options)[0]
+        assert np.array_equal(found.states, alone.states)
+        assert np.array_equal(found.commands, alone.commands)
+        batch = run_batch(
+            law, models[i].parameters, starts[i], references[i], noise=noises[i], late=lates[i],
+            duration=len(noises[i]) * PERIOD, record=True, **options,
+        )  # fmt: skip
+        assert found.completed == len(noises[i]) == len(found.commands)
+        assert np.array_equal(found.goal, batch.goal)
+        # Several needles with each instruction: rounding, which the closed loop amplifies.
+        reached = np.abs(batch.trajectories[0]).max(axis=0) + 1e-12
+        assert_allclose(found.states / reached, batch.trajectories[0] / reached, atol=1e-9)
+        assert_allclose(found.commands, batch.commands[0], atol=1e-7)
+
+
+def test_insertion_ends_where_its_needle_leaves_its_range() -> None:
+    """States are kept up to there, and the other needles continue."""
+    law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
+    model, out = NeedleModel(NOMINAL), MinimumJerk(Setpoint(2e-3), -0.01, ReferenceLimits())
+    starts, options = [model.state_at(2e-3)] * 2, {'delay': 1, 'limit': 15.0, 'step': 2e-4}
+    rest = MinimumJerk(Setpoint(2e-3), 3e-3, ReferenceLimits())
+    found = run_insertions(
+        law, [model] * 2, starts, [out, rest], [np.zeros((1000, 3))] * 2, [0, 0], **options
+    )
+    batch = run_batch(law, NOMINAL, starts[0], out, duration=1.0, record=True, **options)
+    ended = found[0].completed
+    assert 0 < ended == batch.completed[0] < 1000
+    assert np.isfinite(found[0].states[ended]).all()
+    assert np.isnan(found[0].states[ended + 1 :]).all()
+    assert found[1].completed == 1000
+    alone = run_batch(law, NOMINAL, starts[1], rest, duration=1.0, record=True, **options)
+    assert_allclose(found[1].states[-1, 0], alone.states[0, 0], rtol=1e-9)
 
 
 def test_batch_is_independent_of_threads_and_step() -> None:

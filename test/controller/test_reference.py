@@ -99,6 +99,14 @@ def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
 
 
 @pytest.mark.requirement('S-023')
+@pytest.mark.parametrize(('velocity', 'target'), [(0.0, 0.05), (0.03, 0.05), (0.01, -0.05)])
+def test_samples_of_a_trapezoid_are_its_setpoints(velocity: float, target: float) -> None:
+    """To the bit, also before the start and after the end."""
+    motion = Trapezoid(Setpoint(0.02, velocity), target, ReferenceLimits())
+    times = np.linspace(-0.1, motion.duration + 0.1, 997)
+    assert np.array_equal(motion.sampled(times), [motion.at(time) for time in times.tolist()])
+
+
 def test_minimum_jerk_reaches_its_speed_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
