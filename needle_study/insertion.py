@@ -66,6 +66,7 @@ class InsertionStudy(control.ReferenceLimits):
 class _Insertion(NamedTuple):
     model: NeedleModel  #: the true needle
     states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
+    tip: FloatArray  #: tip deflection [m], shape (k + 1,)
     commands: FloatArray  #: command of each sample [N], shape (k,)
     forces: FloatArray  #: force that acts from each sample on [N], shape (k,)
     noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k, 2)
@@ -84,18 +85,13 @@ class _Insertion(NamedTuple):
         return np.asarray(-self.states[:, self.model.coordinates])
 
     @property
-    def tip(self) -> FloatArray:
-        """Tip deflection [m], shape (k + 1,)."""
-        return self.model.tip_deflections(self.states)
-
-    @property
     def measured(self) -> FloatArray:
         """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
         noise = np.concatenate([self.noise, np.zeros((1, 2))])[: len(self.states)]
         return np.asarray(np.stack([self.depth, self.velocity]) + noise.T)
 
     def until(self, end: int) -> '_Insertion':
-        cut = {name: getattr(self, name)[: end + 1] for name in ('states', 'noise', 'goal')}
+        cut = {name: getattr(self, name)[: end + 1] for name in ('states', 'tip', 'noise', 'goal')}
         return self._replace(commands=self.commands[:end], forces=self.forces[:end], **cut)
 
 
@@ -275,8 +271,9 @@ class InsertionScenario(Scenario):
         for model, noise, late, one in zip(models, noises, lates, found, strict=True):
             acting = np.concatenate([np.zeros(delay + late), one.commands])[: len(noise)]
             run = _Insertion(
-                model, one.states, one.commands, acting + noise[:, 2], noise[:, :2], one.goal,
-                0.0, float(one.completed < len(noise)),
+                model, one.states, model.tip_deflections(one.states), one.commands,
+                acting + noise[:, 2], noise[:, :2], one.goal, 0.0,
+                float(one.completed < len(noise)),
             ).until(one.completed)  # fmt: skip
             end = self._stop(run)
             yield run if end is None else run._replace(stopped=1.0, left=0.0).until(end)
@@ -328,7 +325,8 @@ class InsertionScenario(Scenario):
             count = len(pushes)
             done = min(round(batch.completed[k] * numbers.rate), count)
             yield _Insertion(
-                model, batch.states[k], pushes, forces[k], blur[:, :2],
+                model, batch.states[k], model.tip_deflections(batch.states[k]), pushes, forces[k],
+                blur[:, :2],
                 np.full(count + 1, nan), nan, float(done < count),
             ).until(done)  # fmt: skip
 
