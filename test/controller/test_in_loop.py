@@ -351,10 +351,11 @@ def test_insertions_together_equal_batches_of_one() -> None:
     ]
     rng = np.random.default_rng(2)
     noises = [1e-6 * rng.standard_normal((count, 3)) for count in (700, 400, 900)]
-    lates, options = [0, 1, 2], {'delay': 1, 'limit': 15.0, 'step': 3e-4}
+    lates = [0, 1, 2]
+    options: Any = {'delay': 1, 'limit': 15.0, 'step': 3e-4}
     together = run_insertions(law, models, starts, references, noises, lates, **options)
     for i, found in enumerate(together):
-        one = [[values[i]] for values in (models, starts, references, noises, lates)]
+        one: Any = [[values[i]] for values in (models, starts, references, noises, lates)]
         alone = run_insertions(law, *one, **options)[0]
         assert np.array_equal(found.states, alone.states)
         assert np.array_equal(found.commands, alone.commands)
@@ -374,7 +375,8 @@ def test_insertion_ends_where_its_needle_leaves_its_range() -> None:
     """States are kept up to there, and the other needles continue."""
     law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
     model, out = NeedleModel(NOMINAL), MinimumJerk(Setpoint(2e-3), -0.01, ReferenceLimits())
-    starts, options = [model.state_at(2e-3)] * 2, {'delay': 1, 'limit': 15.0, 'step': 2e-4}
+    starts = [model.state_at(2e-3)] * 2
+    options: Any = {'delay': 1, 'limit': 15.0, 'step': 2e-4}
     rest = MinimumJerk(Setpoint(2e-3), 3e-3, ReferenceLimits())
     found = run_insertions(
         law, [model] * 2, starts, [out, rest], [np.zeros((1000, 3))] * 2, [0, 0], **options

@@ -104,7 +104,7 @@ def test_tolerance_gives_the_samples_and_errors_of_single_runs(tolerance: float)
     """To the bit, for any number of workers; friction laws of several orders."""
     parameters = [preset('phantom', friction_law=law) for law in ('coulomb', 'stribeck')]
     states = np.array([NeedleModel(p).state_at(0.05, 5e-4) for p in parameters])
-    options = {'duration': 0.02, 'interval': 0.01, 'tolerance': tolerance}
+    options: Any = {'duration': 0.02, 'interval': 0.01, 'tolerance': tolerance}
     found = simulate_batch(parameters, states, 3.0, **options)
     for i, p in enumerate(parameters):
         alone = simulate(p, states[i], 3.0, **options)
@@ -119,7 +119,7 @@ def test_tolerance_with_torques_and_with_a_run_that_ends_early() -> None:
     """The rotation has no error; a run that leaves its range is compared up to there."""
     p = preset('phantom')
     states = np.array([NeedleModel(p).state_at(depth) for depth in (0.05, 1.5e-3)])
-    options = {'duration': 0.2, 'interval': 0.02}
+    options: Any = {'duration': 0.2, 'interval': 0.02}
     found = simulate_batch(p, states, -3.0, 1e-5, tolerance=1e-4, **options)
     with_step = simulate_batch(p, states, -3.0, 1e-5, step=1e-5, **options)
     assert_allclose(found.states[0, :, [1, 5]], with_step.states[0, :, [1, 5]], rtol=1e-12)
