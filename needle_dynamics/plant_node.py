@@ -49,10 +49,8 @@ _NO_FAULT = 'none'
 
 
 def _exhausted(plant_run: PlantRun) -> str:
-    return (
-        f'commands supplied more than {plant_run.constants.own.power_limit:g} J within a second '
-        '(power_limit); no force is applied until the energy is half of this'
-    )
+    limit = f'{plant_run.constants.own.power_limit:g} J within a second (power_limit)'
+    return f'commands supplied more than {limit}; no force is applied until it is half of this'
 
 
 class PlantNode(ModelNode):
@@ -305,9 +303,10 @@ class PlantNode(ModelNode):
         if self._run is None or not new:
             return
         self._trajectories.stopped = f'stopped: {reason}' if reason else ''
+        if Mode.STOPPED in (mode, before):
+            self._trajectories.end(self._trajectories.stopped or 'sent during a stop')
         if mode is Mode.STOPPED:
             self.get_logger().error(f'stopped: {reason}; no force or motion until ~/clear_stop')
-            self._trajectories.end(self._trajectories.stopped)
             self._run.halt()
         elif mode is Mode.RETRACTING:
             self._trajectories.end('the needle is retracted')
@@ -316,17 +315,13 @@ class PlantNode(ModelNode):
             self._trajectories.pause(withdraws=before is Mode.RETRACTING)
         if before is Mode.PAUSED:
             self._trajectories.resume()
-        elif before is Mode.STOPPED:
-            self._trajectories.end('it was sent during a stop')
         self._run.commands.stopped = mode is Mode.STOPPED
         self._run.held = mode in (Mode.PAUSED, Mode.RETRACTING)
         self.publish_diagnostics()
 
     def _end_retraction(self) -> None:
-        """Continue after a retraction: a user moves the needle."""
-        if self._mode is Mode.RETRACTING:
-            self._authority.run()
-            self._obey()
+        self._authority.run()
+        self._obey()
 
     # Services.
 
