@@ -13,8 +13,8 @@ from typing import Final
 
 from needle_dynamics import FloatArray
 from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
-from needle_study.distribution import KINDS
 import numpy as np
+from scipy.special import gammaincinv, ndtri
 
 _POSITIVE: Final = ('k_xx', 'k_zz')  #: Entries of the stiffness matrix that cannot be negative.
 
@@ -23,7 +23,7 @@ def draw_friction(repeats: int, seed: int) -> list[dict[str, float]]:
     """Sample the friction of each repeat around Table 1: values by its keys [N], [N s/m]."""
     quantiles = _hypercube(len(TABLE_1), repeats, np.random.default_rng(seed))
     drawn = [
-        KINDS['gamma'].frozen(mean, deviation).ppf(row)
+        _positive(row, np.array(mean), np.array(deviation))
         for row, (mean, deviation) in zip(quantiles, TABLE_1.values(), strict=True)
     ]
     return [dict(zip(TABLE_1, map(float, values), strict=True)) for values in np.transpose(drawn)]
@@ -42,9 +42,8 @@ def draw_stiffness(repeats: int, seed: int) -> list[dict[str, tuple[float, ...]]
         quantiles = _hypercube(len(TABLE_2), repeats, np.random.default_rng((seed, attempt)))
         drawn = {}
         for row, (entry, (means, deviations)) in zip(quantiles, TABLE_2.items(), strict=True):
-            kind = KINDS['gamma' if entry in _POSITIVE else 'normal']
-            distribution = kind.frozen(np.array(means), np.array(deviations))
-            drawn[entry] = distribution.ppf(row[:, np.newaxis])
+            distribution = _positive if entry in _POSITIVE else _normal
+            drawn[entry] = distribution(row[:, np.newaxis], np.array(means), np.array(deviations))
         shear = (drawn['k_xz'] + drawn['k_zx']) / 2.0
         if (drawn['k_xx'] * drawn['k_zz'] > shear**2).all():
             break
@@ -59,3 +58,12 @@ def _hypercube(entries: int, repeats: int, rng: np.random.Generator) -> FloatArr
     # scipy.stats.qmc does the same, but names its seed differently from release to release.
     strata = np.tile(np.arange(repeats), (entries, 1))
     return np.asarray((rng.permuted(strata, axis=1) + 0.5) / repeats)
+
+
+def _normal(quantile: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
+    return np.asarray(mean + deviation * ndtri(quantile))
+
+
+def _positive(quantile: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
+    """Return quantiles of the gamma distribution with this mean and standard deviation."""
+    return np.asarray(gammaincinv((mean / deviation) ** 2, quantile) * deviation**2 / mean)

@@ -33,7 +33,6 @@ MAY_IMPORT = {
         'needle_identification',
         'needle_insertion',
         'needle_ros',
-        'needle_study',
     },
     'benchmarks': {
         'needle_controller',
