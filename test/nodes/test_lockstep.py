@@ -342,6 +342,9 @@ def steer(
 
         def proceeds(sample: RunSample) -> bool:
             nonlocal end
+            # On a busy machine the first samples may arrive before the first status.
+            if 'steering' not in run.states:
+                return sample.time < 1.0
             status = run.states['steering'].status
             assert isinstance(status, SteeringStatus)
             if end == inf and status.phase is SteeringPhase.DONE:
