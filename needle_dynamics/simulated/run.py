@@ -77,7 +77,7 @@ class PlantRun:
         #: Joints that the latest `joint_commands` have moved.
         self.commanded: set[str] = set()
         self.held = False  #: Whether `joint_commands` move nothing: a pause or a retraction.
-        #: Joints that a stop or a withdrawal has moved away from their `joint_commands`.
+        #: Joints that ignore `joint_commands` since a stop or a withdrawal.
         self._apart: set[str] = set()
 
     # Commands.
@@ -96,25 +96,26 @@ class PlantRun:
             counts, refusal = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
             if counts and not refusal and commands.may_move(now) and not self.held:
                 for asked_for, within in asked.motions:
-                    goals = self._joined(asked_for)
-                    content = {
-                        'joints': list(goals),
-                        'times': [within],
-                        'positions': [list(goals.values())],
-                        'efforts': [[]],
-                    }
-                    if goals:
+                    if goals := self._joined(asked_for):
+                        content = {
+                            'joints': list(goals),
+                            'times': [within],
+                            'positions': [list(goals.values())],
+                            'efforts': [[]],
+                        }
                         self.perform(Event(MOTION, content))
-                    self.commanded |= {*goals}
+                        self.commanded |= {*goals}
                 self._joint_commands.accept(asked)
         except ParameterError as error:
             commands.refuse()
             return True, f'{JOINT_COMMANDS.name}: {error}; no force is applied'
         return counts, refusal
 
-    def _joined(self, goals: Mapping[str, float]) -> dict[str, float]:
-        """Return the goals without those of joints that are away from all their commands."""
+    def _joined(self, goals: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the goals of joints that do not ignore them; a goal at the joint ends this."""
         # A driver of ros2_control does not know a stop: its setpoint has moved on.
+        if not self._apart:
+            return goals
         at = self._positions()
         self._apart -= {
             name for name, goal in goals.items() if abs(goal - at.get(name, goal)) <= _JOINED

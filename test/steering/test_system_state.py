@@ -440,6 +440,8 @@ def test_stop_of_a_retraction_ends_it() -> None:
     # It brakes on its way: a robot that cannot stop at once would return into the tissue.
     velocity = (begin[0] - robot.tracked[-102][0]) / 1e-2
     assert np.diff(path[:, 0]).max() <= 1e-9
+    # Half of the braking time at 0.95 mm/s. The law takes the mean velocity of 50 ms, in which the
+    # withdrawal accelerates: 10 um less.
     assert begin[0] - held[0] == pytest.approx(0.1 * abs(velocity), abs=2e-5)
     robot.tick(300)
     assert_allclose(robot.at, held, atol=1e-9)
