@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from benchmarks.steering_nodes import (
     COMMANDED,
@@ -20,8 +20,9 @@ from benchmarks.steering_nodes import (
 )
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.simulated.executions import Executions
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.run import Event, follow, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_ros.contract import (
     BASE,
     BASE_WRENCH,
@@ -41,14 +42,6 @@ from needle_ros.wire import Reading
 import numpy as np
 
 
-class _Execution(NamedTuple):
-    """Path that some of its joints follow, and its start [ns]."""
-
-    path: JointPath
-    joints: frozenset[str]
-    begun: int
-
-
 class RobotNode(GraphNode):
     """
     Driver of the robot and the sensors, as `PlantNode` with its `PlantTrajectories`.
@@ -64,11 +57,7 @@ class RobotNode(GraphNode):
         self._moved = (INSERTION, *GUIDE_JOINTS) if moves_needle else GUIDE_JOINTS
         self._log = RequestLog({JOINT_TRAJECTORY: self._moved}, steady=graph.steady)
         self._waiting = WaitingRequests(self._log)
-        self._executions: list[_Execution] = []
-        self._held: list[_Execution] = []
-        self._paused: int | None = None  #: start of a pause [ns]
-        #: Time of the newest sample, 0 before the first [ns].
-        self._sampled = 0
+        self._executions = Executions(graph.run, self._moved)
         #: Largest force on the base along the needle [N].
         self.push = 0.0
         graph.run.begin()
@@ -88,8 +77,8 @@ class RobotNode(GraphNode):
                 self.push = max(self.push, abs(values[1]))
             if name in ROUTES:
                 self.graph.post(name, _reading(name, now, values), self.name)
-        self._sampled = now
-        if self._paused is None:
+        self._executions.sampled = now
+        if not self._executions.paused:
             self._waiting.execute(now + PERIOD, self.graph.run, 0.0)
 
     def take(self, topic: str, content: Any, now: int) -> None:
@@ -98,7 +87,7 @@ class RobotNode(GraphNode):
             self._follow(content, now)
         elif topic == JOINT_COMMANDS.name:
             run.command_joints(content, now)
-            self._forget(run.commanded)
+            self._executions.forget(run.commanded)
         elif self.graph.robot == HARDWARE:
             ((position,), *_) = content.values
             depth = SLIDE.sign * SLIDE.scale * (position - SLIDE.zero)
@@ -122,22 +111,14 @@ class RobotNode(GraphNode):
         path = JointPath(joints, times, positions, efforts=[[]] * len(times))
         act = partial(self._execute, path, joints)
         request = self._waiting.add(topic, move.stamp, joints, act)
-        sampled = self._sampled or now
-        only = None if self._paused is None else request
+        sampled = self._executions.sampled or now
+        only = request if self._executions.paused else None
         self._waiting.execute(sampled + PERIOD, self.graph.run, request.elapsed(sampled), only)
 
     def _execute(
-        self, path: JointPath, joints: tuple[str, ...], run: PlantRun, elapsed: float
+        self, path: JointPath, joints: tuple[str, ...], _run: PlantRun, elapsed: float
     ) -> None:
-        follow(path, joints, run, elapsed)
-        self._forget(joints)
-        begun = self._sampled - round(elapsed * NANOSECONDS)
-        self._executions.append(_Execution(path, frozenset(joints), begun))
-
-    def _forget(self, joints: Iterable[str]) -> None:
-        for paths in (self._executions, self._held):
-            kept = [one._replace(joints=one.joints - {*joints}) for one in paths]
-            paths[:] = [one for one in kept if one.joints]
+        self._executions.follow(path, joints, elapsed)
 
     def request(self, word: str, now: int) -> bool:
         success, _ = self.authority.request(word)
@@ -155,37 +136,17 @@ class RobotNode(GraphNode):
         if new and ends:
             self._log.supersede(now)
             self._waiting.end(f'the system is {mode.value}', Verdict.SUPERSEDED)
-            self._forget(self._moved)
+            self._executions.forget(self._moved)
         if new and mode is Mode.STOPPED:
             self._halt()
         elif new and mode is Mode.RETRACTING and self._is_plant:
             run.withdraw()
         elif new and mode is Mode.PAUSED:
-            self._pause(withdraws=before is Mode.RETRACTING and self._is_plant)
+            self._executions.pause(withdraws=before is Mode.RETRACTING and self._is_plant)
         if new and before is Mode.PAUSED:
-            self._resume()
+            self._executions.resume()
         run.commands.stopped = mode is Mode.STOPPED and self._is_plant
         run.held = mode in (Mode.PAUSED, Mode.RETRACTING) and self._is_plant
-
-    def _pause(self, *, withdraws: bool) -> None:
-        """Hold the joints that move; begin no motion."""
-        self._paused = self._sampled
-        end = self._sampled + PERIOD
-        self._held = [one for one in self._executions if one.path.end(one.begun) > end]
-        self._executions = []
-        joints = {name for one in self._held for name in one.joints}
-        if joints or withdraws:
-            self.graph.run.hold([name for name in self._moved if name in joints or withdraws])
-
-    def _resume(self) -> None:
-        """Follow the rest of the paths that a pause holds."""
-        begun, held = self._paused, self._held
-        self._paused, self._held = None, []
-        if begun is None:
-            return
-        for one in held:
-            path, elapsed = one.path.only(one.joints), (begun - one.begun) / NANOSECONDS
-            self._execute(path, tuple(path.joints), self.graph.run, elapsed)
 
     def stop(self, _now: int) -> None:
         self._halt()

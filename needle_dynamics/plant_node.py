@@ -312,9 +312,9 @@ class PlantNode(ModelNode):
             self._trajectories.end('the needle is retracted')
             self._run.withdraw()
         elif mode is Mode.PAUSED:
-            self._trajectories.pause(withdraws=before is Mode.RETRACTING)
+            self._trajectories.executions.pause(withdraws=before is Mode.RETRACTING)
         if before is Mode.PAUSED:
-            self._trajectories.resume()
+            self._trajectories.executions.resume()
         self._run.commands.stopped = mode is Mode.STOPPED
         self._run.held = mode in (Mode.PAUSED, Mode.RETRACTING)
         self.publish_diagnostics()

@@ -3,16 +3,17 @@
 
 from collections.abc import Callable, Collection
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
+from needle_dynamics.simulated.executions import Executions
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.joint_commands import moved_joints
-from needle_dynamics.simulated.run import follow, PlantRun
+from needle_dynamics.simulated.run import PlantRun
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import printable
 from needle_ros.requests import RequestLog, Verdict
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.timing import nanoseconds
 from needle_ros.trajectories import joint_values, JointPath
 from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.waiting_requests import WaitingRequest, WaitingRequests
@@ -20,14 +21,6 @@ from trajectory_msgs.msg import JointTrajectory
 
 _DEEPER: Final = 1e-4  #: Smallest motion of a resting needle that inserts it [m].
 _INACTIVE: Final = 'the plant is not active'
-
-
-class _Execution(NamedTuple):
-    """Path that some of its joints follow, and its start [ns]."""
-
-    path: JointPath
-    joints: frozenset[str]
-    begun: int
 
 
 class PlantTrajectories:
@@ -60,16 +53,11 @@ class PlantTrajectories:
         self.received = bool(self._moved)
         self.requests = RequestLog({topic: self._moved} if self.received else {})
         self._waiting = WaitingRequests(self.requests)
-        #: Stamp of the newest sample, 0 before the first, and period of the samples [ns].
-        self._sampled, self._period = 0, round(NANOSECONDS / constants.own.rate)
+        self.executions = Executions(plant_run, self._moved)
         self.rejected = 0
         self.stopped = ''
         #: Error of the plant, after which it takes no sample; '' without one.
         self._halted = ''
-        #: Paths under way, and those that a pause holds, since a sample [ns].
-        self._executions: list[_Execution] = []
-        self._held: list[_Execution] = []
-        self._paused: int | None = None
         self._action: TrajectoryAction | None = None
         if self.received:
             node.subscribe(topic, self._on_trajectory)
@@ -85,7 +73,7 @@ class PlantTrajectories:
 
     def begin(self) -> None:
         """Await the first sample of a plant that is active, or was reset."""
-        self._sampled, self._halted = 0, ''
+        self.executions.sampled, self._halted = 0, ''
 
     def destroy(self) -> None:
         """End all goals, and destroy the action."""
@@ -96,40 +84,7 @@ class PlantTrajectories:
         """Discard the trajectories sent until now, and end the goals, whose joints hold."""
         self.requests.supersede(self._simulated())
         self._waiting.end(reason, Verdict.SUPERSEDED)
-        self._forget(self._moved)
-
-    def pause(self, *, withdraws: bool = False) -> None:
-        """Hold the joints that move, or all if the plant withdraws; begin no motion."""
-        self._paused = self._sampled
-        self._held = [
-            one
-            for one in self._executions
-            if one.path.end(one.begun) > self._sampled + self._period
-        ]
-        joints = self._joints_held
-        self._executions = []
-        # At rest nothing changes: an indenter keeps its force.
-        if joints or withdraws:
-            self._run.hold([name for name in self._moved if name in joints or withdraws])
-
-    def resume(self) -> None:
-        """End a pause: follow the rest of the paths that it holds."""
-        begun, held = self._paused, self._held
-        self._paused, self._held = None, []
-        if begun is None:
-            return
-        for one in held:
-            path, elapsed = one.path.only(one.joints), (begun - one.begun) / NANOSECONDS
-            self._execute(path, tuple(path.joints), self._run, elapsed)
-
-    @property
-    def _joints_held(self) -> set[str]:
-        return {name for one in self._held for name in one.joints}
-
-    def _forget(self, joints: Collection[str]) -> None:
-        for paths in (self._executions, self._held):
-            kept = [one._replace(joints=one.joints - {*joints}) for one in paths]
-            paths[:] = [one for one in kept if one.joints]
+        self.executions.forget(self._moved)
 
     def halt(self, reason: str) -> None:
         """Discard all trajectories of a plant that cannot move, nor hold, until a reset."""
@@ -140,22 +95,19 @@ class PlantTrajectories:
     def displace(self, reason: str, joints: Collection[str]) -> None:
         """Discard the trajectories of joints that something else moves."""
         self._discard(joints, reason)
-        self._forget(joints)
+        self.executions.forget(joints)
         self.requests.end(reason, joints)
 
     def _discard(self, joints: Collection[str], reason: str) -> None:
         self._waiting.discard(reason, joints)
 
     def _execute(
-        self, path: JointPath, moved: tuple[str, ...], plant_run: PlantRun, elapsed: float
+        self, path: JointPath, moved: tuple[str, ...], _run: PlantRun, elapsed: float
     ) -> None:
         """Follow a path with some joints, at a time after its start [s]."""
         if self._is_inserted(path, moved):
             self._inserts()
-        follow(path, moved, plant_run, elapsed)
-        self._forget(moved)
-        begun = self._sampled - round(elapsed * NANOSECONDS)
-        self._executions.append(_Execution(path, frozenset(moved), begun))
+        self.executions.follow(path, moved, elapsed)
 
     def _is_inserted(self, path: JointPath, moved: Collection[str]) -> bool:
         """Whether a path moves a resting needle deeper; it still moves if `steering` brakes it."""
@@ -166,16 +118,16 @@ class PlantTrajectories:
         return end is None or end > plant.depth + _DEEPER
 
     def _hold(self, joints: Collection[str]) -> None:
-        self._forget(joints)
+        self.executions.forget(joints)
         self._run.hold([name for name in self._moved if name in joints])
 
     def sample(self, stamp: int) -> None:
         """Begin the trajectories that start before the next sample; ``stamp`` [ns] is the last."""
         if self._action is not None and self._action.moves:
-            self._action.update(stamp, self._run.followed(), self._joints_held)
-        self._sampled = stamp
-        if self._paused is None:
-            self._begin(stamp + self._period, 0.0)
+            self._action.update(stamp, self._run.followed(), self.executions.joints_held)
+        self.executions.sampled = stamp
+        if not self.executions.paused:
+            self._begin(stamp + self.executions.period, 0.0)
 
     def _begin(self, until: int, elapsed: float, only: WaitingRequest | None = None) -> None:
         """
@@ -183,7 +135,7 @@ class PlantTrajectories:
 
         During a pause only a new request is executed: `steering` brakes by one.
         """
-        only = None if self._paused is None else only
+        only = only if self.executions.paused else None
         for error in self._waiting.execute(until, self._run, elapsed, only):
             self._reject(str(error))
 
@@ -209,13 +161,17 @@ class PlantTrajectories:
             self.requests.reject(topic, stamp, _INACTIVE)
         else:
             # Not active, or before the first sample.
-            self._sampled = self._sampled if self._node.is_active and self._sampled else now
+            self.executions.sampled = (
+                self.executions.sampled
+                if self._node.is_active and self.executions.sampled
+                else now
+            )
             action = partial(self._execute, path, moved)
             request = self._waiting.add(topic, stamp, moved, action)
             # A stop waits for no sample.
             until = now + 1 if path.stops else 0
-            due = max(self._sampled + self._period, until)
-            self._begin(due, request.elapsed(self._sampled), request)
+            due = max(self.executions.sampled + self.executions.period, until)
+            self._begin(due, request.elapsed(self.executions.sampled), request)
         self.publish_answers()
 
     def _reject(self, reason: str) -> None:
