@@ -131,8 +131,7 @@ class Supervisor(StateMachine[ForceCommand]):
         return self._command(ForceCommand(now))
 
     def _begin(self, now: int) -> None:
-        self._waiting = WaitingRequests(self.requests)
-        self._time = now
+        self._waiting, self._time = WaitingRequests(self.requests), now
         self.safety.begin(now)
         self._depth, self._origin = None, -1
         self.requests.forget()
@@ -199,8 +198,7 @@ class Supervisor(StateMachine[ForceCommand]):
             return answer
         # Valid from the first sample after its stamp on, in any order of arrival.
         request = self._waiting.add(topic, stamp, (INSERTION,), act)
-        newest = self.safety.streams['joint_states'].last
-        since = newest if newest >= 0 else now
+        since = last if (last := self.safety.streams['joint_states'].last) >= 0 else now
         waits = self._active is not None and self.safety.stop is None
         self._execute_request((since if waits else stamp) + 1, request.elapsed(since))
         return answer
@@ -211,8 +209,7 @@ class Supervisor(StateMachine[ForceCommand]):
             return
         if self.authority.mode is Mode.RETRACTING and not self._targets:
             # The motion is from the node `steering`, not from a user.
-            why = 'the needle is retracted'
-            self.requests.answer(request.topic, request.stamp, Verdict.SUPERSEDED, why)
+            self.requests.answer(*request[:2], Verdict.SUPERSEDED, 'the needle is retracted')
             return
         try:
             if self._active is None:
@@ -355,7 +352,10 @@ class Supervisor(StateMachine[ForceCommand]):
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
             self.bending.take_encoders(stamp, measured)
-        return self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
+        answer = self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
+        # In lock-step the next sample may wait for the answer to a request of this time.
+        self._execute_request(stamp + 1)
+        return answer
 
     def estimate(self) -> None:
         """Estimate the load for the next command; the last command does not wait for it."""

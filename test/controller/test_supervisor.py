@@ -15,6 +15,7 @@ from needle_controller.controller import LAWS
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.requests import Verdict
 from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 from needle_ros.trajectories import JointPath, MOST_POINTS
 from needle_ros.wire import Reading
@@ -576,7 +577,7 @@ def test_force_above_eulers_load_gives_a_warning() -> None:
 
 @pytest.mark.parametrize('what', ['target', 'trajectory'])
 def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(what: str) -> None:
-    """The commands are equal if it arrives before or after the sample of its stamp."""
+    """The commands are equal; it is answered before the next sample, which may await that."""
 
     def run(before: int) -> list[ForceCommand | None]:
         loop, answers = Loop(target=None), []
@@ -591,6 +592,9 @@ def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(what: str) -> N
                     path = JointPath(['insertion'], [0.0, 1.0], [[0.02], [0.0205]])
                     loop.supervisor.trajectory(stamp, '', path, now)
             answers.append(loop.measure())
+            if k == 10 and before == 10:
+                (answer,) = loop.supervisor.requests.status().answers
+                assert answer.verdict is Verdict.ACCEPTED
         assert loop.said() == []
         return answers
 
