@@ -113,8 +113,10 @@ _GUIDE: Final = frozenset(GUIDE_JOINTS)
 
 NEEDLE, STEERING_CONSTANTS, _ = NEEDLES['bending_35mm']
 
-#: Speed of the insertion [m/s], and settings of the steering executive.
+#: Speed of the insertion [m/s], acceleration of the axial reference [m/s^2], and settings of the
+#: steering executive.
 SPEED: Final = 0.02
+ACCELERATION: Final = 1.0
 #: Four steps are too few to identify a skin.
 PRIOR: Final = SteeringPrior(skin=0.0)
 
@@ -139,6 +141,8 @@ _WORLD: Final = {
     'depth': 1e-3,
     'tip.noise': 1e-4,
     'guide.speed_limit': 0.1,
+    # A robot with position commands must be able to follow the reference.
+    'base.acceleration_limit': 2.0 * ACCELERATION,
     'step': 1e-3,
 }
 
@@ -407,7 +411,7 @@ _SOURCES: Final = dict.fromkeys((COMMAND, JOINT_STATES.name, BASE_WRENCH.name), 
 @lru_cache(maxsize=1)
 def _controller() -> Controller:
     """Return a controller at rest, to be copied: the check of its stability takes time."""
-    limits = ReferenceLimits(speed=2.0 * SPEED, acceleration=1.0)
+    limits = ReferenceLimits(speed=2.0 * SPEED, acceleration=ACCELERATION)
     return Controller(NEEDLE, settings=ControllerSettings(rate=RATE), limits=limits)
 
 
