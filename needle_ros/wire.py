@@ -181,9 +181,12 @@ class Template:
         self._format: _Format | None = None
 
     @property
-    def fixed(self) -> NDArray[np.intp]:
-        """Positions of the bytes that are equal in all messages of the template."""
-        return np.concatenate([np.arange(begin, end) for begin, end in self._fixed])
+    def fixed(self) -> NDArray[np.bool_]:
+        """Whether each byte is equal in all messages of the template."""
+        found = np.zeros(len(self._message), dtype=np.bool_)
+        for begin, end in self._fixed:
+            found[begin:end] = True
+        return found
 
     def _made(self) -> _Format:
         self._format = _Format(self._message, self.order, self._fixed, self.arrays)
@@ -310,7 +313,7 @@ def decode(
     stamps = np.zeros(len(begin), dtype=np.int64)
     values = np.full((len(begin), columns), np.nan)
     used = np.zeros(len(begin), dtype=np.bool_)
-    pending = np.arange(len(begin))
+    unread, pending = ~used, np.arange(len(begin))
     invalid, fault = 0, ''
     for number in count():
         if len(pending) == 0:
@@ -327,9 +330,9 @@ def decode(
         if number < _TEMPLATES:
             alike = pending[(end - begin)[pending] == len(message)]
         rows = np.lib.stride_tricks.sliding_window_view(data, len(message))[begin[alike]]
-        fixed = template.fixed
-        same = (rows[:, fixed] == message[fixed]).all(axis=1)
-        if not same.all():
+        differs = (rows != message) & template.fixed
+        if differs.any():
+            same = ~differs.any(axis=1)
             alike, rows = alike[same], rows[same]
         wanted = choice(template)
         if wanted is not None:
@@ -340,7 +343,8 @@ def decode(
             for k, position in enumerate(wanted):
                 if position >= 0:
                     values[alike, k] = _column(rows, position, f'{order}f8')
-        pending = np.setdiff1d(pending, alike, assume_unique=True)
+        unread[alike] = False
+        pending = pending[unread[pending]]
     read = np.flatnonzero(used)
     return Decoded(stamps[read], values[read], read, invalid, fault)
 

@@ -5,6 +5,7 @@ from array import array
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BytesIO
+from itertools import repeat
 from pathlib import Path
 import struct
 from typing import Any, Final
@@ -106,7 +107,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
                 body = compression.read_up_to(stream, length)
                 if opcode != Opcode.CHUNK:
                     loose += head + body
-                if opcode == Opcode.CHUNK or len(loose) > compression.BLOCK:
+                if loose and (opcode == Opcode.CHUNK or len(loose) > compression.BLOCK):
                     yield from _batches(bytes(loose), channels, tally)
                     loose.clear()
                 if opcode == Opcode.CHUNK:
@@ -159,15 +160,16 @@ def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int
     is_more = True
     while is_more:
         ends, is_more = array('q', [position]), False
-        with suppress(struct.error):
-            for _ in range(LARGEST_BATCH):
-                position += head + length_of(content, position + 1)[0]
-                if position > size:
-                    break
-                ends.append(position)
-            else:
-                is_more = True
+        add = ends.append
+        # The position after a damaged length is outside the content, or of 64 bits.
+        with suppress(struct.error, OverflowError):
+            for _ in repeat(None, LARGEST_BATCH):
+                (length,) = length_of(content, position + 1)
+                position += head + length
+                add(position)
+            is_more = True
         table = np.array(ends)
+        table = table[: np.searchsorted(table, size, 'right')]
         yield table[:-1] + head, table[1:]
 
 
