@@ -25,7 +25,6 @@ References
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 from math import exp, sqrt
 from typing import Final
 
@@ -85,12 +84,13 @@ def stretches(chosen: BoolArray) -> IntArray:
 
 def divided(used: BoolArray, length: int) -> Parts:
     """Divide the used samples, (n,), into parts of about `length`, if possible at least half."""
-    limits: list[tuple[int, int]] = []
-    for start, end in stretches(used).tolist():
-        count = max(1, round((end - start) / length))
-        cuts = [start + (end - start) * k // count for k in range(count + 1)]
-        limits += pairwise(cuts)
-    return Parts(np.array(limits, dtype=np.int_).reshape(-1, 2), float(length))
+    start, end = stretches(used).T
+    count = np.maximum(np.rint((end - start) / length), 1).astype(np.int_)
+    before = np.cumsum(count) - count
+    start, size, before, count = np.repeat([start, end - start, before, count], count, axis=1)
+    number = np.arange(len(start)) - before
+    cuts = [start + size * k // count for k in (number, number + 1)]
+    return Parts(np.column_stack(cuts), float(length))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -187,7 +187,7 @@ def regress(
     norms = np.linalg.norm(x, axis=0)
     norms[norms == 0.0] = 1.0
     x = x / norms
-    singular, directions = np.linalg.svd(x, full_matrices=False)[1:]
+    singular, directions = np.linalg.svd(np.linalg.qr(x, mode='r'))[1:]
     # Null directions are omitted; parameters without a component in them are still solved.
     basis, unknown = determinable(singular, directions)
     x = x @ basis
@@ -252,9 +252,10 @@ def _checked(
             f'regressors (n, k), response (n,) and used (n,) do not match: {x.shape}, {y.shape}, '
             f'{chosen.shape}'
         )
-    if not (np.isfinite(x[chosen]).all() and np.isfinite(y[chosen]).all()):
+    x, y = np.where(chosen[:, np.newaxis], x, 0.0), np.where(chosen, y, 0.0)
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ShapeError('regressors and response must be finite')
-    return np.where(chosen[:, np.newaxis], x, 0.0), np.where(chosen, y, 0.0), chosen
+    return x, y, chosen
 
 
 def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:

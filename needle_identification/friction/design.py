@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import ceil
 from typing import Final
 
@@ -31,7 +32,7 @@ _EFFECT: Final = 0.05  # smallest fraction of the full size of a term that count
 _LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Design:
     """Motion delayed by the lag of the force, and the samples of the regression, (n,) each."""
 
@@ -73,13 +74,20 @@ class Design:
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
         """Return the regressors of terms and of an estimated lag, shape (n, k)."""
+        if terms == self.signals.settings.terms:
+            return self._chosen
         return np.column_stack([self.columns(terms), self.lag_column])
+
+    @cached_property
+    def _chosen(self) -> FloatArray:
+        return np.column_stack([self.columns(self.signals.settings.terms), self.lag_column])
 
     def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
         """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
-        velocity = self.velocity - later * self.acceleration
-        depth = self.depth - later * self.velocity
+        velocity, depth = self.velocity, self.depth
+        if later:
+            velocity, depth = velocity - later * self.acceleration, depth - later * velocity
         time = signals.time - signals.time[0]
         motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh)
         return regressors(motion, terms, signals.settings)
@@ -159,7 +167,9 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     """Select samples in steady regimes, after the sensor filters with a lag [s] have settled."""
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
-    velocity, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))
+    velocity, acceleration = signals.undelayed
+    if lag:
+        velocity, acceleration = signals.motion(then), signals.motion(then, 1)
     depth = np.interp(then, time, signals.depth)
     regime = np.where(np.abs(velocity) > signals.moving_speed, np.sign(velocity), 0.0)
     change = np.ones(len(velocity), dtype=np.bool_)

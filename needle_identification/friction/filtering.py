@@ -45,6 +45,7 @@ class FilteredSignals:
     depth: FloatArray  # insertion depth [m]
     period: float  # after resampling [s]
     motion: BSpline  # velocity [m/s] as a function of time [s]
+    undelayed: tuple[FloatArray, FloatArray]  # velocity [m/s] and acceleration [m/s^2] at `time`
     lost: BoolArray  # in a gap of the recording, or saturated
     half_filter: int  # half the length of the filter [samples]
     margin: int  # reach of a change of the velocity in the force [samples]
@@ -97,12 +98,14 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
     response = _filtered_velocity(around, impulse, taps, 1, from_positions)
-    noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
+    velocity, acceleration = motion(grid), motion(grid, 1)
+    noise = _white_noise(raw, velocity, acceleration)
     return FilteredSignals(
         settings=settings,
         time=grid[::step],
         period=step * period,
         motion=motion,
+        undelayed=(velocity[::step], acceleration[::step]),
         force=_smooth(np.interp(grid, time, recording.force), taps)[::step],
         depth=np.asarray(np.interp(grid[::step], time, recording.depth)),
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
