@@ -113,8 +113,7 @@ def run_loop(
         if depths.shape[0] > 0:
             depths[k] = depth
         if states.shape[0] > 0:
-            for i in range(len(state)):
-                states[k, i] = state[i]
+            states[k] = state
         error = goal[k] - depth
         largest = max(largest, abs(error))
         squares += error * error

@@ -111,8 +111,7 @@ def run(
     # takes the states at the ends of the intervals; with a single row it is unused.
     keep = states.shape[0] > 1
     if keep:
-        for i in range(state.shape[0]):
-            states[0, i] = state[i]
+        states[0] = state
     for k in range(forces.shape[0]):
         inputs = Inputs(forces[k], torques[k], 0.0, False)
         left = advance_extrapolated(
@@ -121,8 +120,7 @@ def run(
         if left != 0.0:
             return k
         if keep:
-            for i in range(state.shape[0]):
-                states[k + 1, i] = state[i]
+            states[k + 1] = state
     return len(forces)
 
 
@@ -149,8 +147,7 @@ def run_refined(
     tissue, slowest, largest = 0.0, c.modes.modes[0, 0], 0.0
     for stiffness in c.layers.stiffnesses:
         tissue = max(tissue, stiffness)
-    for i in range(state.shape[0]):
-        states[0, i] = state[i]
+    states[0] = state
     for k in range(forces.shape[0]):
         inputs = Inputs(forces[k], torques[k], 0.0, False)
         rest, steps[k] = interval, interval
@@ -181,6 +178,5 @@ def run_refined(
             if left != 0.0:
                 return k, left
             rest = rest - span if taken < count else 0.0
-        for i in range(state.shape[0]):
-            states[k + 1, i] = state[i]
+        states[k + 1] = state
     return len(forces), 0.0

@@ -338,8 +338,7 @@ def run(
             waiting += 1
             load_lane(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
             if kept.shape[1] > 1:
-                for k in range(states.shape[1]):
-                    kept[i, 0, k] = states[i, k]
+                kept[i, 0] = states[i]
             which[n], at[n] = i, 0
             w[FORCE + n] = _input(trajectory.forces, i, 0)
             w[LEFT + n], w[INSIDE + n] = trajectory.interval, 1.0
@@ -385,8 +384,7 @@ def _next(
         return False
     at[i] += 1
     if kept.shape[1] > 1:
-        for k in range(len(state)):
-            kept[which, at[i], k] = state[k]
+        kept[which, at[i]] = state
     w[FORCE + i] = _input(trajectory.forces, which, min(at[i], trajectory.intervals - 1))
     w[LEFT + i], w[ACCELERATION + i] = time, 0.0
     return bool(at[i] < trajectory.intervals)

@@ -54,13 +54,9 @@ def insert_causes(
         entry = guides[0, j] + free * tilts[j] + free**3 / (3.0 * ei) * loads[0, j]
         path[j], force[j] = entry, entry_force * entry
         w[j], t[j] = (1.0 - w_b) * entry, -t_b * entry
-        tips[0, j] = w[j] + w_b * guides[0, j] + w_tilt * tilts[j] + c00 * loads[0, j]
-        forces[0, j] = (
-            force[j] + force_b * guides[0, j] + force_tilt * tilts[j] + w_b * loads[0, j]
-        )
     before = 1.0
-    for i in range(1, len(depths)):
-        h = depths[i] - depths[i - 1]
+    for i in range(len(depths)):
+        h = depths[i] - depths[max(i - 1, 0)]
         if h > 0.0:
             k = stiffness[i]
             e = element(ei, k, h)
