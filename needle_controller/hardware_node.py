@@ -7,19 +7,10 @@ from time import monotonic, sleep
 from typing import Any, Final, NamedTuple
 
 from builtin_interfaces.msg import Duration
+from needle_controller import hardware
 from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
-from needle_controller.hardware import (
-    BY_TYPE,
-    COMMAND_TYPES,
-    dynamic_reading,
-    EFFORT,
-    HardwareSettings,
-    Robot,
-    STAMPS,
-    STATE_TYPES,
-)
 from needle_controller.safety.limits import SafetyLimits
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, SENSOR
@@ -74,17 +65,17 @@ CONTRACT: Final = Topics(
 )
 
 
-def _readings(settings: HardwareSettings) -> tuple[tuple[Topic, str, str], ...]:
+def _readings(settings: hardware.HardwareSettings) -> tuple[tuple[Topic, str, str], ...]:
     """Return the topics of measurements in the contract, with name and type of the driver."""
     return (
-        (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
+        (contract.JOINT_STATES, settings.state_topic, hardware.STATE_TYPES[settings.state_type]),
         (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
     )
 
 
-def await_topics(node: BaseNode, settings: HardwareSettings) -> None:
+def await_topics(node: BaseNode, settings: hardware.HardwareSettings) -> None:
     """Wait for the discovery of the topics that are found by their type, for a limited time."""
-    types = [kind for _, name, kind in _readings(settings) if name == BY_TYPE]
+    types = [kind for _, name, kind in _readings(settings) if name == hardware.BY_TYPE]
     deadline = monotonic() + _DISCOVERY
     while not all(_published(node, one) for one in types) and monotonic() < deadline:
         sleep(_PAUSE)
@@ -111,11 +102,11 @@ class Driver:
     topic name or not exactly one topic of its type is a `ParameterError`.
     """
 
-    def __init__(self, node: BaseNode, settings: HardwareSettings) -> None:
-        self.robot = Robot(settings)
+    def __init__(self, node: BaseNode, settings: hardware.HardwareSettings) -> None:
+        self.robot = hardware.Robot(settings)
         self._node, self._settings = node, settings
         state, wrench = (self._found(*reading) for reading in _readings(settings))
-        kind = COMMAND_TYPES[settings.command_type]
+        kind = hardware.COMMAND_TYPES[settings.command_type]
         command = _named(contract.WRENCH_COMMAND, settings.command_topic, kind)
         self.topics = Topics(
             state, wrench, command, _of(contract.MEASURER, state), _of(contract.COMMANDER, command)
@@ -134,13 +125,13 @@ class Driver:
 
     def _found(self, topic: Topic, name: str, type_name: str) -> Topic:
         """Return the driver's topic; `BY_TYPE` selects the only topic of its type."""
-        if name != BY_TYPE:
+        if name != hardware.BY_TYPE:
             return _named(topic, name, type_name)
         found = _published(self._node, type_name)
         if len(found) != 1:
             raise ParameterError(
-                f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
-                f'other nodes publish, found {", ".join(found) or "none"}'
+                f'hardware: {hardware.BY_TYPE} for {topic.name} needs one topic of {type_name} '
+                f'that other nodes publish, found {", ".join(found) or "none"}'
             )
         return _named(topic, found[0], type_name)
 
@@ -156,7 +147,7 @@ class Driver:
         node, robot = self._node, self.robot
 
         def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
-            if self._settings.stamps == STAMPS[0]:
+            if self._settings.stamps == hardware.STAMPS[0]:
                 return take
             return lambda reading: take(reading._replace(stamp=node.now()))
 
@@ -175,7 +166,7 @@ class Driver:
             interfaces = [(one.interface_names, one.values) for one in message.interface_values]
             header = message.header
             take(
-                dynamic_reading(
+                hardware.dynamic_reading(
                     nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
                 )
             )
@@ -239,7 +230,7 @@ class Driver:
             return None
         if kind == 'float64_multi_array':
             return Float64MultiArray(data=values)
-        pushes = settings.command == EFFORT
+        pushes = settings.command == hardware.EFFORT
         if kind == 'joint_trajectory':
             # Without a stamp it begins at once; without velocities its end velocity is free.
             field = {'effort' if pushes else 'positions': values}

@@ -6,12 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
+from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class
-from needle_ros.contract import (
-    FOLLOW_JOINT_TRAJECTORY,
-    FOLLOW_JOINT_TRAJECTORY_TYPE,
-    JOINT_TRAJECTORY,
-)
 from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.requests import Acknowledgement, RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
@@ -82,14 +78,14 @@ class TrajectoryAction:
         self._canceled: list[ServerGoalHandle] = []
         self._updated = 0  #: Time of the last check of the goals [ns].
         try:
-            self._action = message_class(FOLLOW_JOINT_TRAJECTORY_TYPE, kind='action')
+            self._action = message_class(contract.FOLLOW_JOINT_TRAJECTORY_TYPE, kind='action')
         except MessageError:
             # Not among the wheels of ROS 2.
             return
         self._server = _GoalServer(
             node,
             self._action,
-            FOLLOW_JOINT_TRAJECTORY,
+            contract.FOLLOW_JOINT_TRAJECTORY,
             # Goals are executed by `update`.
             lambda _handle: self._action.Result(),
             handle_accepted_callback=self._on_goal,
@@ -123,7 +119,7 @@ class TrajectoryAction:
         execution = _Execution(handle, goal)
         stamp = nanoseconds(handle.request.trajectory.header.stamp) or self._now()
         report = partial(self._on_answer, execution)
-        goal.stamp = self._requests.watch(JOINT_TRAJECTORY, stamp, goal.joints, report)
+        goal.stamp = self._requests.watch(contract.JOINT_TRAJECTORY, stamp, goal.joints, report)
         if not self._running:
             self._updated = self._now()
         self._running[goal.stamp] = execution
@@ -162,7 +158,7 @@ class TrajectoryAction:
     def _end(self, execution: _Execution, reason: str) -> None:
         """End the execution of a goal; with a reason, also its motion."""
         goal = execution.goal
-        self._requests.unwatch(JOINT_TRAJECTORY, goal.stamp)
+        self._requests.unwatch(contract.JOINT_TRAJECTORY, goal.stamp)
         del self._running[goal.stamp]
         if reason and goal.moves:
             self._hold(goal.joints)
