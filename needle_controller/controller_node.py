@@ -99,16 +99,10 @@ class ControllerNode(ModelNode):
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('controller', **node_options)
-        self.declare_text('law', LAWS[0], f'one of {", ".join(LAWS)}', LAWS)
-        self.declare_text(
-            'reference.kind', 'trapezoid', f'one of {", ".join(REFERENCES)}', REFERENCES
-        )
-        self.declare_text(
-            'deflection_feedback',
-            FEEDBACKS[0],
-            f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)',
-            FEEDBACKS,
-        )
+        self.declare_text('law', LAWS[0], valid=LAWS)
+        self.declare_text('reference.kind', 'trapezoid', valid=REFERENCES)
+        feedbacks = f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)'
+        self.declare_text('deflection_feedback', FEEDBACKS[0], feedbacks, FEEDBACKS)
         self.declare_text(
             'steered',
             False,

@@ -240,13 +240,8 @@ def controllability_map(
             point = operating_point(model, depth, deflection, velocity)
             found = analyze(linearize(model, point, force, sliding=sliding))
             state, seen = found.state, found.observed
-            results[:, i, j] = (
-                state.rank,
-                state.distance,
-                seen.rank,
-                seen.margin,
-                found.output_gain,
-            )
+            ranks = (state.rank, state.distance, seen.rank, seen.margin)
+            results[:, i, j] = (*ranks, found.output_gain)
         if progress is not None:
             progress()
     return ControllabilityMap(

@@ -63,7 +63,7 @@ class RecorderNode(BaseNode):
         super().__init__('recorder', **node_options)
         self.declare_text('path', '', 'folder to record to; it must not exist')
         self.declare_text('topics', ['*'], 'topics to record; * selects all except hidden topics')
-        self.declare_text('compression', 'zstd', f'one of {", ".join(COMPRESSIONS)}', COMPRESSIONS)
+        self.declare_text('compression', 'zstd', valid=COMPRESSIONS)
         self._bag: BagWriter | None = None
         self._recordings = 0
         #: Summary of the latest recording.

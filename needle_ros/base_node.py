@@ -95,9 +95,8 @@ class BaseNode(ParameterNode):
         super().__init__(name, **node_options)
         self._get_now = self.get_clock().handle.get_now
         self.failure: str | None = None  #: Reason of the last refused transition.
-        self.failed = (
-            False  #: Whether the node failed at its task: its process ends with status 1.
-        )
+        #: Whether the node failed at its task: its process ends with status 1.
+        self.failed = False
         self.invalid: Counter[str] = Counter()  #: Number of invalid messages by topic.
         self._preparation = Preparation(self.preparation())
         self._life_cycle = LifeCycle(self, self._preparation, self._is_valid)

@@ -68,15 +68,16 @@ class ParameterNode(LifecycleNode):
         self,
         name: str,
         default: str | bool | list[str],
-        description: str,
+        description: str = '',
         valid: Collection[str] = (),
     ) -> None:
         """Declare a parameter that is not a number; empty ``valid`` allows any text."""
+        constraint = constraints({'valid': valid} if valid else {}, default)
         descriptor = ParameterDescriptor(
-            description=description,
+            description=description or constraint,
             # YAML 1.1 parses y as true; `text` converts it back.
             dynamic_typing=default in _READ_AS_BOOL,
-            additional_constraints=constraints({'valid': valid} if valid else {}, default),
+            additional_constraints=constraint,
         )
         self.declare_parameter(name, default, descriptor)
 

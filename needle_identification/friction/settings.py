@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_identification.estimation import ESTIMATORS
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, choice, positive
+from needle_ros.settings import check_choice, check_constants, choice, positive
 
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
@@ -69,8 +69,7 @@ class FrictionSettings:
         if not self.terms or len(set(self.terms)) < len(self.terms):
             raise ParameterError(f'terms must be distinct, at least one, got {list(self.terms)}')
         for term in self.terms:
-            if term not in TERMS:
-                raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
+            check_choice('terms', term, TERMS)
         if 'direction' in self.terms and not {'coulomb', 'viscous'} <= set(self.terms):
             raise ParameterError('the term direction needs the terms coulomb and viscous')
         if self.estimator == 'total' and not self.allows_total:

@@ -45,6 +45,7 @@ from needle_identification.steering.recording import readings, SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
 from needle_identification.steering.search import FREE, interval, Optimum, Search, shown, Tips
 from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice
 import numpy as np
 from scipy.special import stdtrit
 
@@ -67,10 +68,9 @@ class SteeringSettings:
 
     def __post_init__(self) -> None:
         for term in self.terms or ():
-            if term not in TERMS:
-                raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
-        if self.order is not None and self.order not in ORDERS:
-            raise ParameterError(f'order must be one of {", ".join(ORDERS)}, got {self.order!r}')
+            check_choice('terms', term, TERMS)
+        if self.order is not None:
+            check_choice('order', self.order, ORDERS)
         low, high = FREE
         if self.free_length is not None and not low <= self.free_length <= high:
             raise ParameterError(

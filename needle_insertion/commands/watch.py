@@ -10,8 +10,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import add_flag, add_quantity, print_each
+from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
 from needle_ros.errors import ParameterError
 from needle_ros.signals import ENDINGS
 
@@ -36,12 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shift = 'time added to those of OTHER (default: both start to move at the same time)'
     add_quantity(parser, '--shift', 's', shift)
-    parser.add_argument(
-        '--time',
-        choices=TIMES,
-        default=TIMES[0],
-        help='stamps of a recording: header of each message, or receive time (default header)',
-    )
+    add_time(parser)
     add_flag(parser, '--control', 'buttons: target, pause, retract, stop (default: view only)')
     parser.add_argument(
         '--host',

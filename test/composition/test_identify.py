@@ -100,7 +100,7 @@ def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--terms', 'coulomb,drag'], f'terms must be of {", ".join(TERMS)}'),
+        (['--terms', 'coulomb,drag'], f'terms must be one of {", ".join(TERMS)}'),
         (['--cutoff', '-1'], 'cutoff must be'),
         (['--force-axis', 'w'], "'w'"),
         (['--wrench-topic', '/force'], '/base_wrench'),

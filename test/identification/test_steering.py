@@ -393,7 +393,7 @@ def test_invalid_input_is_reported() -> None:
     with pytest.raises(ShapeError, match='depth must be >= 0'):
         replace(short, depth=np.array([0.0, -0.01, 0.0]))
     for wrong, words in (
-        ({'terms': ('wind',)}, "terms must be of tilt, frame, bevel, got 'wind'"),
+        ({'terms': ('wind',)}, "terms must be one of tilt, frame, bevel, got 'wind'"),
         ({'order': 'never'}, 'order must be one of together, guide first'),
         ({'free_length': 2.0}, r'free_length must be in \[0.001, 0.3\] m, got 2.0'),
     ):

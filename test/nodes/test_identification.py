@@ -161,7 +161,7 @@ def test_service_uses_the_current_bags(ros_graph: RosGraph, bags: list[str]) -> 
     [
         ({'bags': ['/no/such/bag']}, '/no/such/bag does not exist'),
         ({'friction.cutoff': 0.0}, 'friction.cutoff must be finite, > 0'),
-        ({'friction.terms': ['drag']}, 'friction.terms must be of coulomb'),
+        ({'friction.terms': ['drag']}, 'friction.terms must be one of coulomb'),
         ({'friction.cutof': 5.0}, "unknown parameter 'friction.cutof'; did you mean 'friction."),
         ({'stiffness.estimator': 'luck'}, 'stiffness.estimator must be one of'),
         ({'what': 'mass'}, "what must be one of friction, stiffness, got 'mass'"),
