@@ -142,7 +142,7 @@ _WORLD: Final = {
     'tip.noise': 1e-4,
     'guide.speed_limit': 0.1,
     # A robot with position commands must be able to follow the reference.
-    'base.acceleration_limit': 2.0 * ACCELERATION,
+    'base.acceleration_limit': ACCELERATION,
     'step': 1e-3,
 }
 
