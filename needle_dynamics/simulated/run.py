@@ -120,8 +120,10 @@ class PlantRun:
 
     def _joined(self, goals: Mapping[str, float]) -> Mapping[str, float]:
         """Return the goals of joints that do not ignore them; a goal at the joint ends this."""
-        # A driver of ros2_control does not know a stop: its setpoint has moved on.
         goals = {name: goal for name, goal in goals.items() if name not in self.held}
+        # A driver of ros2_control does not know a stop: its setpoint has moved on.
+        if not self._apart:
+            return goals
         at = self._positions()
         self._apart -= {
             name for name, goal in goals.items() if abs(goal - at.get(name, goal)) <= _JOINED
