@@ -22,7 +22,7 @@ from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.simulated.executions import Executions
 from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.run import Event, HELD, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_ros.contract import (
     BASE,
     BASE_WRENCH,
@@ -146,7 +146,7 @@ class RobotNode(GraphNode):
         if new and before is Mode.PAUSED:
             self._executions.resume()
         run.commands.stopped = mode is Mode.STOPPED and self._is_plant
-        run.held = HELD.get(mode, ()) if self._is_plant else ()
+        run.mode = mode if self._is_plant else Mode.RUNNING
 
     def stop(self, _now: int) -> None:
         self._halt()

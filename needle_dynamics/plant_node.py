@@ -23,7 +23,7 @@ from needle_dynamics.simulated.assembly import (
     SETTINGS,
 )
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
-from needle_dynamics.simulated.run import Event, HELD, PARAMETERS, PlantRun, RESET, TARE
+from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE
 from needle_ros import contract
 from needle_ros.base_node import steady_timer
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
@@ -316,7 +316,7 @@ class PlantNode(ModelNode):
         if before is Mode.PAUSED:
             self._trajectories.executions.resume()
         self._run.commands.stopped = mode is Mode.STOPPED
-        self._run.held = HELD.get(mode, ())
+        self._run.mode = mode
         self.publish_diagnostics()
 
     def _end_retraction(self) -> None:

@@ -6,14 +6,14 @@ An `Event` is an input other than a command. It takes effect from the next sampl
 performs it again.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import nan
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces, Commands
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
-from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS, moved_joints
+from needle_dynamics.simulated.joint_commands import moved_joints
 from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
 from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
@@ -30,13 +30,6 @@ MOTION: Final = 'motion'
 PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
-
-#: Joints that `joint_commands` do not move in a mode of the system; in a retraction they move the
-#: guide, which returns to its zero.
-HELD: Final[Mapping[Mode, Collection[str]]] = {
-    Mode.PAUSED: (INSERTION, *GUIDE_JOINTS),
-    Mode.RETRACTING: (INSERTION,),
-}
 
 _HALT: Final = 0.05  #: time in which joints come to rest at their positions [s]
 _JOINED: Final = 1e-4  #: distance from a command at which a joint follows again [m or rad]
@@ -83,7 +76,7 @@ class PlantRun:
         self._measured: list[Measurement] = []
         #: Joints that the latest `joint_commands` have moved.
         self.commanded: set[str] = set()
-        self.held: Collection[str] = ()  #: One of `HELD`.
+        self.mode = Mode.RUNNING  #: Mode of the system, for `joint_commands`.
         #: Joints that ignore `joint_commands` since a stop or a withdrawal.
         self._apart: set[str] = set()
 
@@ -101,7 +94,8 @@ class PlantRun:
         try:
             asked = self._joint_commands.read(reading, self._positions(), now)
             counts, refusal = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
-            if counts and not refusal and commands.may_move(now):
+            moves = commands.may_move(now) and self.mode is not Mode.PAUSED
+            if counts and not refusal and moves:
                 for asked_for, within in asked.motions:
                     if goals := self._joined(asked_for):
                         content = {
@@ -120,7 +114,9 @@ class PlantRun:
 
     def _joined(self, goals: Mapping[str, float]) -> Mapping[str, float]:
         """Return the goals of joints that do not ignore them; a goal at the joint ends this."""
-        goals = {name: goal for name, goal in goals.items() if name not in self.held}
+        if self.mode is Mode.RETRACTING:
+            # The plant withdraws the needle; the guide returns to its zero.
+            goals = {name: goal for name, goal in goals.items() if name != INSERTION}
         # A driver of ros2_control does not know a stop: its setpoint has moved on.
         if not self._apart:
             return goals

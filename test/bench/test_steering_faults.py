@@ -93,6 +93,7 @@ def test_robot_that_follows_its_reference_reverses_and_pauses(
 @pytest.mark.parametrize('robot', ROBOTS)
 def test_retraction_withdraws_the_needle_and_returns_the_guide(robot: str) -> None:
     graph = SteeringGraph(robot, continuous=False)
+    # Without measurements a target is rejected.
     for _ in range(round(0.3 * RATE)):
         graph.step()
     graph.target()

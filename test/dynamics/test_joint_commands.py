@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from needle_dynamics.simulated.joint_commands import JointCommands, JointSetpoints
 from needle_dynamics.simulated.run import Event, MOTION, PlantRun, RESET
 from needle_ros.errors import ParameterError
+from needle_ros.system_state import Mode
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import pytest
@@ -155,6 +156,21 @@ def test_setpoints_after_a_stop_are_followed_from_the_joint_on() -> None:
     drive(plant, 100, 1, setpoint(rest))
     # The position error decays with 20 1/s; a count more.
     assert drive(plant, 1500, 1, setpoint(0.06))[-1] == pytest.approx(0.06, abs=2e-6)
+
+
+def test_setpoint_of_a_pause_is_followed_after_it() -> None:
+    """Also one that does not change any more."""
+    plant = run(mode='robot')
+
+    def setpoint(now: int, _time: float) -> Reading:
+        return message(now, ('insertion',), (0.055,))
+
+    plant.mode = Mode.PAUSED
+    # The counts of the encoder are 1 um.
+    assert drive(plant, 300, 1, setpoint)[-1] == pytest.approx(0.05, abs=1e-6)
+    plant.mode = Mode.RUNNING
+    # The position error decays with 20 1/s; a count more.
+    assert drive(plant, 1500, 1, setpoint)[-1] == pytest.approx(0.055, abs=2e-6)
 
 
 @pytest.mark.parametrize('every', [1, 5, 10, 50])
