@@ -239,8 +239,8 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     assert (status, complained) == (0, ''), said
     before, *_, after = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
     assert float(before) == pytest.approx(20.0, abs=0.01), said
-    # In real time: beside four busy processes, where up to half of the commands are late, the stage
-    # was up to 0.4 mm from its target. A wrong unit or zero is off by more than 1 mm.
+    # In real time: beside four busy processes, where up to half of the commands are late, the
+    # stage was up to 0.4 mm from its target. A wrong unit or zero is off by more than 1 mm.
     assert float(after) == pytest.approx(22.0, abs=0.5)
     assert 'no measurements' not in said
 
