@@ -54,7 +54,9 @@ def measure(folder: Path, rate: float, duration: float) -> Answer:
     both, port = {**_NEEDLE, 'rate': rate}, free_port()
     given: Mapping[str, dict[str, object]] = {
         'recorder': {'path': str(folder / 'bag')},
-        'controller': {**both, 'retract_depth': _RETRACTED, 'steered': True},
+        'controller': {
+            **both, 'retract_depth': _RETRACTED, 'steered': True, 'deflection_feedback': 'none'
+        },
         'steering': _NEEDLE,
         'slicer': {'port': port},
         'plant': {**both, 'steered': True, 'depth': _RETRACTED},

@@ -37,6 +37,7 @@ from needle_dynamics.simulated.run import Event, PARAMETERS
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.contract import JOINT_STATES
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
 import numpy as np
@@ -132,6 +133,7 @@ class StalledLoop(Loop):
     def step(self, *_: Any) -> None:
         """Continue by a period."""
         self.now += self._period
+        waited = len(self._received)
         if not self._stalls('plant'):
             # Older samples are skipped: the needle has not moved then.
             oldest = self.now - round(_BACKLOG * NANOSECONDS)
@@ -140,9 +142,14 @@ class StalledLoop(Loop):
                 self._sample(stamp)
             self.run.commands.count_commanders(1)
         if not self._stalls('controller'):
-            while self._received:
-                name, message = self._received.popleft()
-                self._answer(self._take[name](self._ends[name][1](message), self.now), None)
+            received, self._received = [*self._received], deque(maxlen=_QUEUE)
+            for k, (name, message) in enumerate(received):
+                options = {}
+                if name == JOINT_STATES.name:
+                    newer = any(other == name for other, _ in received[k + 1 :])
+                    options = {'passed': k < waited and newer}
+                reading = self._ends[name][1](message)
+                self._answer(self._take[name](reading, self.now, **options), None)
             self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.depth = self.run.plant.depth
 

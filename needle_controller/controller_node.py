@@ -4,6 +4,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
+from functools import partial
 from math import nan
 import sys
 from time import sleep
@@ -166,12 +167,17 @@ class ControllerNode(ModelNode):
         # The driver of a robot takes ROS messages.
         command, robot = topics.command, self._driver is not None
         self._command = self.publisher(command).publish if robot else self.writer(command)
-        take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)
+        encoders = self._supervisor.encoders
+        states = (
+            self._passing(encoders, self._supervisor.estimate),
+            self._passing(partial(encoders, passed=True)),
+        )
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
-            self._driver.listen(take_state, take_wrench, self._check_inputs)
+            self._driver.listen(states, take_wrench, self._check_inputs)
         else:
-            self.listen(topics.state, take_state, self._check_inputs)
+            take_state, passed = states
+            self.listen(topics.state, take_state, self._check_inputs, passed)
             self.listen(topics.wrench, take_wrench, self._check_inputs)
         self.listen(
             contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs

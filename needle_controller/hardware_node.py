@@ -13,7 +13,7 @@ from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
 from needle_controller.safety.limits import SafetyLimits
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, message_class, SENSOR
+from needle_ros.base_node import BaseNode, message_class, SENSOR, waiting
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import ControllerStatus
@@ -139,11 +139,15 @@ class Driver:
 
     def listen(
         self,
-        take_state: Callable[[Reading], None],
+        states: tuple[Callable[[Reading], None], Callable[[Reading], None]],
         take_wrench: Callable[[Reading], None],
         matched: Callable[[int], None],
     ) -> None:
-        """Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`."""
+        """
+        Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`.
+
+        `states` take the newest joint states, and those that have waited before it.
+        """
         node, robot = self._node, self.robot
 
         def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
@@ -151,31 +155,38 @@ class Driver:
                 return take
             return lambda reading: take(reading._replace(stamp=node.now()))
 
-        take_state = stamped(take_state)
+        take_state, passed = map(stamped, states)
         if self._dynamic is None:
-            node.listen(self.topics.state, take_state, matched)
+            node.listen(self.topics.state, take_state, matched, passed)
         else:
-            self._listen_to_dynamic(take_state, matched)
+            self._listen_to_dynamic(take_state, passed, matched)
         take = stamped(take_wrench)
         node.listen(self.topics.wrench, lambda reading: take(robot.wrench(reading)), matched)
 
     def _listen_to_dynamic(
-        self, take: Callable[[Reading], None], matched: Callable[[int], None]
+        self,
+        take: Callable[[Reading], None],
+        passed: Callable[[Reading], None],
+        matched: Callable[[int], None],
     ) -> None:
-        def on_message(message: Any) -> None:
+        def converted(message: Any) -> Reading:
             interfaces = [(one.interface_names, one.values) for one in message.interface_values]
             header = message.header
-            take(
-                hardware.dynamic_reading(
-                    nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
-                )
+            return hardware.dynamic_reading(
+                nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
             )
+
+        def on_message(message: Any) -> None:
+            for newer in waiting(subscription):
+                passed(converted(message))
+                message = newer
+            take(converted(message))
 
         def on_match(event: Any) -> None:
             matched(event.total_count_change)
 
         events = SubscriptionEventCallbacks(matched=on_match)
-        self._node.create_subscription(
+        subscription = self._node.create_subscription(
             self._dynamic, self.topics.state.name, on_message, SENSOR, event_callbacks=events
         )
 

@@ -172,11 +172,9 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
         """Take a path, which starts at its stamp."""
-
-        def follow(controller: Controller, elapsed: float) -> None:
-            controller.follow_joints(path, elapsed)
-
-        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
+        answer = self._request(
+            JOINT_TRAJECTORY, stamp, frame, now, lambda one, late: one.follow_joints(path, late)
+        )
         if path.stops and stamp <= now:
             # A stop waits for no sample.
             self._execute_request(stamp + 1)
@@ -323,8 +321,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if line is not None:
             self.events.add(Severity.WARNING, line, kind)
 
-    def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
-        """Answer `joint_states`; a repeated message gets the same command, a late one none."""
+    def encoders(self, reading: Reading, now: int, passed: bool = False) -> ForceCommand | None:
+        """Answer `joint_states`; only check and observe one that a newer one has `passed`."""
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
@@ -352,6 +350,8 @@ class Supervisor(StateMachine[ForceCommand]):
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
             self.bending.take_encoders(stamp, measured)
+        if passed:
+            return None
         answer = self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
         # In lock-step the next sample may wait for the answer to a request of this time.
         self._execute_request(stamp + 1)

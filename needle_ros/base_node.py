@@ -2,7 +2,7 @@
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 import traceback
@@ -55,6 +55,13 @@ def key_values(values: Mapping[str, str]) -> list[KeyValue]:
 def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
     """Create a timer [s] that also runs while the ROS clock is stopped, or jumps."""
     return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def waiting(subscription: Subscription) -> Iterator[Any]:
+    """Take the messages that a subscription has received, in order."""
+    kind, raw = subscription.msg_type, subscription.raw
+    while (taken := subscription.handle.take_message(kind, raw)) is not None:
+        yield taken[0]
 
 
 def message_class(*type_names: str, kind: str = 'msg') -> Any:
@@ -177,11 +184,23 @@ class BaseNode(ParameterNode):
         topic: Topic,
         take: Callable[[Reading], None],
         matched: Callable[[int], None] | None = None,
+        passed: Callable[[Reading], None] | None = None,
     ) -> Subscription:
-        """Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0."""
+        """
+        Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0.
+
+        Messages that have waited in a busy node go to `passed`, if given, except for the newest.
+        """
         name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
+            if passed is not None:
+                for newer in waiting(subscription):
+                    hand(data, passed)
+                    data = newer
+            hand(data, take)
+
+        def hand(data: bytes, receive: Callable[[Reading], None]) -> None:
             try:
                 reading = read(data)
             except MessageError as error:
@@ -190,14 +209,14 @@ class BaseNode(ParameterNode):
                     f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
                 )
                 return
-            take(reading)
+            receive(reading)
 
         def on_match(event: Any) -> None:
             if matched is not None:
                 matched(event.total_count_change)
 
         events = SubscriptionEventCallbacks(matched=on_match)
-        return self.create_subscription(
+        subscription = self.create_subscription(
             message_class(topic.type_name),
             name,
             on_bytes,
@@ -205,6 +224,7 @@ class BaseNode(ParameterNode):
             raw=True,
             event_callbacks=events,
         )
+        return subscription
 
     def _after_change(self, _parameters: list[Parameter]) -> None:
         if self._configured:

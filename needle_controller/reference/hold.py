@@ -11,6 +11,8 @@ from needle_controller.reference.setpoint import Setpoint
 #: Longest gap in the measurements, and largest age of one, before the law restarts [s].
 _GAP, _PERIODS = 0.01, 2.5
 _ROUNDING: Final = 1.0 + 1e-6  #: Tolerance of an age of exactly one period.
+#: Number of measurements after a gap that may have waited, twice as many as a subscription keeps.
+_BURST: Final = 100
 #: Least response, as a fraction of the commanded force or of the velocity of the reference.
 _NOTHING: Final = 0.1
 #: Relative tolerance of a reported force: equal to a command, and constant; number of reports in a
@@ -31,7 +33,9 @@ class ReferenceHold:
         self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
         #: Age of the last measurement, or time since the previous one if that is longer [s].
         self._late = 0.0
-        self._usual: float | None = None  #: `_late` before a gap, while measurements are late.
+        #: `_late` before a gap while measurements are late, and their number since then.
+        self._usual: float | None = None
+        self._waited = 0
         #: Last forces [N], the oldest acts; tracking error at the last command [m]; whether the
         #: robot has reported a force, and a commanded force is missing.
         self._forces = deque([0.0], maxlen=delay + 2)
@@ -45,8 +49,10 @@ class ReferenceHold:
         # Measurements that are always late or rare are no gap. After one, those that have waited
         # are no later than usual in the end.
         before, self._late = self._late, max(time - guide.now, age)
+        begins = self._late > max(self._gap, _PERIODS * before)
+        self._waited = 0 if begins else self._waited + 1
         behind = self._usual is not None and age > _ROUNDING * self._usual
-        gap = behind or self._late > max(self._gap, _PERIODS * before)
+        gap = begins or (behind and self._waited < _BURST)
         self.missing = guide.waits
         if guide.waits or not guide.moves:
             self._forces.append(0.0)

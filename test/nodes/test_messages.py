@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain, pairwise
 from typing import Any
 
@@ -137,6 +137,31 @@ def test_node_parses_any_message(
     ros_graph.spin_until(
         lambda: any(one.invalid_messages == {'words': len(JUNK)} for one in reports), 'the count'
     )
+
+
+@pytest.mark.requirement('S-311')
+def test_busy_node_answers_only_the_newest_message(ros_graph: RosGraph) -> None:
+    """All messages are read in order; those behind which another one waits are passed."""
+    node, teller = ros_graph.add(PlantNode, start=False), ros_graph.node('teller')
+    answered: list[int] = []
+    passed: list[int] = []
+    order: list[int] = []
+
+    def to(taken: list[int]) -> Callable[[Reading], None]:
+        return lambda reading: (taken.append(reading.stamp), order.append(reading.stamp))[0]
+
+    topic = Topic(name='words', type_name=POINT, publisher='user', meaning='')
+    node.listen(topic, to(answered), passed=to(passed))
+    sender = teller.create_publisher(PointStamped, 'words', SENSOR)
+    ros_graph.spin_until(sender.get_subscription_count, 'the reader')
+    write = Template(POINT).serialize
+    for stamp in range(30):
+        sender.publish(write(stamp, 0.0, 0.0, 0.0))
+    ros_graph.spin_until(lambda: len(order) == 30, 'the messages')
+    assert order == [*range(30)]
+    # The executor was busy with publishing.
+    assert answered[-1] == 29
+    assert len(passed) > len(answered)
 
 
 def test_missing_message_type_is_reported() -> None:

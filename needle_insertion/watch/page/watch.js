@@ -6,7 +6,7 @@
 const find = (id) => document.getElementById(id);
 const mm = (value) => (value === null ? null : 1e3 * value);
 
-/* Period of text and numbers [ms]. */
+/* Period of text, numbers and charts [ms]. */
 const WORDS = 120;
 const LEVELS = ['fine', 'warning', 'error', 'silent'];
 const SIGNS = {fine: '●', warning: '▲', error: '■', silent: '○', none: '○'};
@@ -22,7 +22,7 @@ window.needleWatch = seen;
 
 let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
 let frame = null, playback = null, waiting = false, worded = 0, drawnAt = 0;
-let other = null, dragging = false, unseen = 0, saying = 0;
+let other = null, dragging = false, unseen = 0, saying = 0, changed = true;
 
 /* Text. */
 
@@ -226,16 +226,18 @@ function tellCursor() {
   put(find('span'), time === null ? of : `${of}: values at ${fixed(time, 3)} s`);
 }
 
-/* Text and numbers, at a readable rate. */
+/* Text, numbers and charts, at a readable rate. */
 function say() {
   clearTimeout(saying);
   saying = 0;
+  changed = false;
   worded = performance.now();
   QUANTITIES.forEach(show);
   tellNodes();
   tellAim();
   tellShape();
   tellCursor();
+  charts.draw(frame.time, scene.limits);
   if (playback) tellPlayback();
 }
 
@@ -246,8 +248,7 @@ function draw(now) {
   if (!frame) return;
   drawnAt = now;
   drawing.draw(scene, frame);
-  charts.draw(frame.time, scene.limits);
-  if (now - worded > WORDS) say();
+  if (changed || now - worded > WORDS) say();
   /* Text of the last frame, too. */
   else if (!saying) saying = setTimeout(say, WORDS);
   seen.drawn += 1;
@@ -255,7 +256,9 @@ function draw(now) {
   unseen = 0;
 }
 
-function later() {
+/* Draw soon; what the user has changed, in all parts. */
+function later(all = true) {
+  changed = changed || all;
   if (waiting) return;
   waiting = true;
   /* Two frames per second with prefers-reduced-motion. */
@@ -282,7 +285,7 @@ function take(message) {
   seen.frames += 1;
   unseen += 1;
   if (frame.row) charts.push(frame.row);
-  later();
+  later(false);
   return undefined;
 }
 
