@@ -45,7 +45,7 @@ _Status = TypeVar('_Status', bound=NodeStatus)
 #: Bar on the growth of memory [MB], and factor by which the latency may grow.
 _GROWTH, _SLOWER = 3.0, 1.1
 
-#: Part of the recording at its start and at its end whose latency is compared.
+#: Part of the recording whose latency is compared: after a warm-up as long, and at the end.
 _PART: Final = 0.1
 
 
@@ -91,7 +91,7 @@ def measure(folder: Path, rate: float, duration: float) -> Answer:
     stamps, latency = answers(folder / 'bag')
     missing = round(float(stamps[-1] - stamps[0]) * 1e-9 * rate) + 1 - len(stamps) - skipped
     part = max(1, round(_PART * len(latency)))
-    ends = latency[:part], latency[-part:]
+    ends = latency[part : 2 * part], latency[-part:]
     rows = [
         ('insertions', str(insertions.completed)),
         ('samples', str(len(stamps))),

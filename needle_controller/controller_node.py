@@ -53,7 +53,8 @@ FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the 
 
 class ControllerNode(ModelNode):
     """
-    Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
+    Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]); a busy
+    node answers the newest.
 
     ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths

@@ -14,7 +14,7 @@ import textwrap
 import time
 from types import FrameType
 
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.errors import NeedleError
 from needle_ros.network import LOCAL, RANGE, stay_local
 from needle_ros.parameter_files import sections, shared_names, unmatched_files
@@ -29,6 +29,8 @@ from rclpy.utilities import remove_ros_args
 
 #: Environment variable: a node ends with its parent process, of this process ID (1: any parent).
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
+
+_SIGNALS, _HOUR = 0.02, 3600.0  #: Period of the check for signals, and longest spin [s].
 
 _PR_SET_PDEATHSIG, _M_ARENA_MAX, _M_MMAP_THRESHOLD = 1, -8, -3
 
@@ -92,20 +94,24 @@ def _spin(node: BaseNode, stopping: Callable[[], bool]) -> int:
     """Spin a node until it is to stop or refused to start; return the exit status."""
     executor: Executor = EventsExecutor()
     executor.add_node(node)
-    status = 0
+    status, ended = 0, Future()
 
     def refuse() -> None:
         nonlocal status
         # Publish the reason on /diagnostics.
         node.publish_diagnostics()
         status = 2
+        ended.set_result(None)
 
+    # A signal is handled at the next callback.
+    steady_timer(node, _SIGNALS, lambda: ended.set_result(None) if stopping() else None)
     try:
         if node.get_parameter('autostart').value:
             node.begin(refuse)
-        while not stopping() and status == 0:
-            # Unlike spin_once, this call does not return to Python at each event.
-            executor.spin_until_future_complete(Future(), timeout_sec=0.02)
+        while not ended.done():
+            # Unlike spin_once, this call does not return to Python at each event. Each call loses
+            # an object, and without a timeout no signal is handled.
+            executor.spin_until_future_complete(ended, timeout_sec=_HOUR)
     finally:
         # Command zero force also after an error.
         node.stop()
