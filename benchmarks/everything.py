@@ -55,7 +55,10 @@ def measure(folder: Path, rate: float, duration: float) -> Answer:
     given: Mapping[str, dict[str, object]] = {
         'recorder': {'path': str(folder / 'bag')},
         'controller': {
-            **both, 'retract_depth': _RETRACTED, 'steered': True, 'deflection_feedback': 'none'
+            **both,
+            'retract_depth': _RETRACTED,
+            'steered': True,
+            'deflection_feedback': 'none',
         },
         'steering': _NEEDLE,
         'slicer': {'port': port},
