@@ -53,9 +53,9 @@ FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the 
 
 class ControllerNode(ModelNode):
     """
-    Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]); a busy
-    node answers the newest.
+    Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
+    A busy node answers the newest measurement.
     ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths
     are followed, and targets are executed by the node `steering`. The command is zero before the

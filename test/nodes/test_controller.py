@@ -491,8 +491,8 @@ def test_bumpless_transfer_of_law_and_gains(ros_graph: RosGraph) -> None:
         assert loop.node.set_parameters([Parameter(name, value=value)])[0].successful
         loop.until(lambda count=count: len(loop.forces) > count + 20, 'commands')
         sent = [(nanoseconds(m.header.stamp), m.wrench.force.y) for m in loop.forces[count - 1 :]]
-        # 3.6 N; the handover decays by 5 % of its value in a period of 5 ms. A busy controller does
-        # not answer each measurement.
+        # 3.6 N; the handover decays by 5 % of its value in a period of 5 ms. A busy controller
+        # does not answer each measurement.
         for (before, a), (after, b) in pairwise(sent):
             assert abs(b - a) <= 0.05 * sent[0][1] * (after - before) / 5e6
     assert loop.status.law == 'inverse_dynamics'
