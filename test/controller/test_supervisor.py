@@ -161,9 +161,9 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     measured = set()
     encoders = loop.supervisor.encoders
 
-    def remember(reading: Reading, now: int) -> ForceCommand | None:
+    def remember(reading: Reading, now: int, passed: bool = False) -> ForceCommand | None:
         measured.add(reading.stamp)
-        return encoders(reading, now)
+        return encoders(reading, now, passed)
 
     loop.supervisor.encoders = remember  # type: ignore[method-assign]
     limits = loop.supervisor.controller.settings

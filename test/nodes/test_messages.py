@@ -148,7 +148,11 @@ def test_busy_node_answers_only_the_newest_message(ros_graph: RosGraph) -> None:
     order: list[int] = []
 
     def to(taken: list[int]) -> Callable[[Reading], None]:
-        return lambda reading: (taken.append(reading.stamp), order.append(reading.stamp))[0]
+        def take(reading: Reading) -> None:
+            taken.append(reading.stamp)
+            order.append(reading.stamp)
+
+        return take
 
     topic = Topic(name='words', type_name=POINT, publisher='user', meaning='')
     node.listen(topic, to(answered), passed=to(passed))
