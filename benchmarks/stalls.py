@@ -143,13 +143,15 @@ class StalledLoop(Loop):
             self.run.commands.count_commanders(1)
         if not self._stalls('controller'):
             received, self._received = [*self._received], deque(maxlen=_QUEUE)
-            for k, (name, message) in enumerate(received):
-                options = {}
-                if name == JOINT_STATES.name:
-                    newer = any(other == name for other, _ in received[k + 1 :])
-                    options = {'passed': k < waited and newer}
+            newer = sum(name == JOINT_STATES.name for name, _ in received)
+            for name, message in received:
                 reading = self._ends[name][1](message)
-                self._answer(self._take[name](reading, self.now, **options), None)
+                options: tuple[int, ...] = ()
+                if name == JOINT_STATES.name:
+                    newer -= 1
+                    # The samples of a plant that was suspended are received one by one.
+                    options = (newer if waited > 0 else 0,)
+                self._answer(self._take[name](reading, self.now, *options), None)
             self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.depth = self.run.plant.depth
 

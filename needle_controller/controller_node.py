@@ -4,7 +4,6 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import fields
-from functools import partial
 from math import nan
 import sys
 from time import sleep
@@ -55,7 +54,8 @@ class ControllerNode(ModelNode):
     """
     Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
-    A busy node answers the newest measurement.
+    A busy node answers the measurements of the last 10 ms, or of 2.5 periods.
+
     ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths
     are followed, and targets are executed by the node `steering`. The command is zero before the
@@ -169,16 +169,16 @@ class ControllerNode(ModelNode):
         command, robot = topics.command, self._driver is not None
         self._command = self.publisher(command).publish if robot else self.writer(command)
         encoders = self._supervisor.encoders
-        states = (
-            self._passing(encoders, self._supervisor.estimate),
-            self._passing(partial(encoders, passed=True)),
-        )
+
+        def passed(reading: Reading, newer: int) -> None:
+            self._act(encoders(reading, self.now(), newer))
+
+        states = self._passing(encoders, self._supervisor.estimate), passed
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
             self._driver.listen(states, take_wrench, self._check_inputs)
         else:
-            take_state, passed = states
-            self.listen(topics.state, take_state, self._check_inputs, passed)
+            self.listen(topics.state, states[0], self._check_inputs, passed)
             self.listen(topics.wrench, take_wrench, self._check_inputs)
         self.listen(
             contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs

@@ -139,23 +139,23 @@ class Driver:
 
     def listen(
         self,
-        states: tuple[Callable[[Reading], None], Callable[[Reading], None]],
+        states: tuple[Callable[[Reading], None], Callable[[Reading, int], None]],
         take_wrench: Callable[[Reading], None],
         matched: Callable[[int], None],
     ) -> None:
         """
         Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`.
 
-        `states` take the newest joint states, and those that have waited before it.
+        `states` take the newest joint states, and earlier ones with the number of newer ones.
         """
         node, robot = self._node, self.robot
 
-        def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
+        def stamped(take: Callable[..., None]) -> Callable[..., None]:
             if self._settings.stamps == hardware.STAMPS[0]:
                 return take
-            return lambda reading: take(reading._replace(stamp=node.now()))
+            return lambda reading, *newer: take(reading._replace(stamp=node.now()), *newer)
 
-        take_state, passed = map(stamped, states)
+        take_state, passed = stamped(states[0]), stamped(states[1])
         if self._dynamic is None:
             node.listen(self.topics.state, take_state, matched, passed)
         else:
@@ -166,7 +166,7 @@ class Driver:
     def _listen_to_dynamic(
         self,
         take: Callable[[Reading], None],
-        passed: Callable[[Reading], None],
+        passed: Callable[[Reading, int], None],
         matched: Callable[[int], None],
     ) -> None:
         def converted(message: Any) -> Reading:
@@ -177,10 +177,10 @@ class Driver:
             )
 
         def on_message(message: Any) -> None:
-            for newer in waiting(subscription):
-                passed(converted(message))
-                message = newer
-            take(converted(message))
+            received = [message, *waiting(subscription)]
+            for newer in range(len(received) - 1, 0, -1):
+                passed(converted(received[-1 - newer]), newer)
+            take(converted(received[-1]))
 
         def on_match(event: Any) -> None:
             matched(event.total_count_change)

@@ -321,8 +321,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if line is not None:
             self.events.add(Severity.WARNING, line, kind)
 
-    def encoders(self, reading: Reading, now: int, passed: bool = False) -> ForceCommand | None:
-        """Answer `joint_states`; only check and observe one that a newer one has `passed`."""
+    def encoders(self, reading: Reading, now: int, newer: int = 0) -> ForceCommand | None:
+        """Answer `joint_states`; only check and observe it if too many newer ones wait."""
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
@@ -350,7 +350,7 @@ class Supervisor(StateMachine[ForceCommand]):
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
             self.bending.take_encoders(stamp, measured)
-        if passed:
+        if newer > controller.longest_queue:
             return None
         answer = self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
         # In lock-step the next sample may wait for the answer to a request of this time.

@@ -184,32 +184,30 @@ class BaseNode(ParameterNode):
         topic: Topic,
         take: Callable[[Reading], None],
         matched: Callable[[int], None] | None = None,
-        passed: Callable[[Reading], None] | None = None,
+        passed: Callable[[Reading, int], None] | None = None,
     ) -> Subscription:
         """
         Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0.
 
-        Messages that have waited in a busy node go to `passed`, if given, except for the newest.
+        `passed`, if given, takes a message for which newer ones already wait, and their number.
         """
         name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
-            if passed is not None:
-                for newer in waiting(subscription):
-                    hand(data, passed)
-                    data = newer
-            hand(data, take)
-
-        def hand(data: bytes, receive: Callable[[Reading], None]) -> None:
-            try:
-                reading = read(data)
-            except MessageError as error:
-                self.invalid[name] += 1
-                self.get_logger().error(
-                    f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
-                )
-                return
-            receive(reading)
+            received = [data] if passed is None else [data, *waiting(subscription)]
+            for newer in reversed(range(len(received))):
+                try:
+                    reading = read(received[-1 - newer])
+                except MessageError as error:
+                    self.invalid[name] += 1
+                    self.get_logger().error(
+                        f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
+                    )
+                    continue
+                if newer and passed is not None:
+                    passed(reading, newer)
+                else:
+                    take(reading)
 
         def on_match(event: Any) -> None:
             if matched is not None:

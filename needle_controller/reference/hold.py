@@ -30,7 +30,9 @@ class ReferenceHold:
     """
 
     def __init__(self, guide: ReferenceGenerator, period: float, delay: int) -> None:
-        self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
+        self._guide = guide
+        #: Longest gap [s].
+        self.gap = max(_GAP, _PERIODS * period) + delay * period
         #: Age of the last measurement, or time since the previous one if that is longer [s].
         self._late = 0.0
         #: `_late` before a gap while measurements are late, and their number since then.
@@ -49,7 +51,7 @@ class ReferenceHold:
         # Measurements that are always late or rare are no gap. After one, those that have waited
         # are no later than usual in the end.
         before, self._late = self._late, max(time - guide.now, age)
-        begins = self._late > max(self._gap, _PERIODS * before)
+        begins = self._late > max(self.gap, _PERIODS * before)
         self._waited = 0 if begins else self._waited + 1
         behind = self._usual is not None and age > _ROUNDING * self._usual
         gap = begins or (behind and self._waited < _BURST)
@@ -83,7 +85,7 @@ class ReferenceHold:
             return False
         if not (abs(reported - held) <= _SAME * size and time - last < _LOST):
             self._obeyed = 0
-        return self._obeyed >= _TRUSTED and time - last > self._gap
+        return self._obeyed >= _TRUSTED and time - last > self.gap
 
     def command(self, aim: Setpoint, depth: float, force: float, limit: float) -> None:
         """Process the command for a setpoint and insertion depth [m], and its limit [N]."""

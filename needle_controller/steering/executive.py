@@ -43,6 +43,10 @@ import numpy as np
 #: Changes from one message to the next that are implausible [m, rad].
 _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
+#: Tolerance of a joint during a measurement, as a multiple of its tolerance at arrival: a needle
+#: that settles at the limit does not end the insertion.
+_LEFT: Final = 1.5
+
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
 
 
@@ -311,8 +315,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if departure := motions.departure():
             return self._stop(departure, now)
         if self.phase is Phase.MEASURING:
-            line = f'during the measurement of the tip {motions.missed()}'
-            return self._stop(line, now) if motions.missed() else None
+            missed = motions.missed(tolerance=_LEFT)
+            line = f'during the measurement of the tip {missed}'
+            return self._stop(line, now) if missed else None
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)

@@ -143,9 +143,9 @@ class MotionControl:
         """Whether the needle is deeper than the end of its motion."""
         return bool(self.at[0] > self.goal[0] + LAGGING * self._settings.depth_tolerance)
 
-    def missed(self, which: BoolArray | None = None) -> str:
+    def missed(self, which: BoolArray | None = None, *, tolerance: float = 1.0) -> str:
         """Describe the joints (or given joints) that are not at their goal, '' if all are."""
-        far = np.abs(self.at - self.goal) > self._settings.tolerances
+        far = np.abs(self.at - self.goal) > tolerance * self._settings.tolerances
         far = far if which is None else which
         scaled = [(1.0, 'rad') if name == ROLL else (1e3, 'mm') for name in self._settings.joints]
         rows = zip(self._settings.joints, scaled, self.at, self.goal, far, strict=True)

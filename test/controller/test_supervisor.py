@@ -151,6 +151,20 @@ def test_stop_gives_zero_force_until_cleared(
     assert loop.supervisor.safety.stop == stop
 
 
+@pytest.mark.requirement('S-311')
+def test_busy_controller_answers_only_new_measurements() -> None:
+    """Of the last 10 ms, and the period of the delay; earlier ones are checked."""
+    loop = Loop()
+    loop.pushes()
+    for newer in (50, 12, 11, 0):
+        loop.now += PERIOD
+        reading = Reading(loop.now, '', ('insertion',), ((loop.depth,), (0.0,), ()))
+        answer = loop.supervisor.encoders(reading, loop.now, newer)
+        assert (answer is None) == (newer > 11)
+    jumped = Reading(loop.now + PERIOD, '', ('insertion',), ((nan,), (0.0,), ()))
+    assert loop.supervisor.encoders(jumped, loop.now + PERIOD).force == 0.0
+
+
 @pytest.mark.requirement('S-002', 'S-090')
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
 def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
@@ -161,9 +175,9 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     measured = set()
     encoders = loop.supervisor.encoders
 
-    def remember(reading: Reading, now: int, passed: bool = False) -> ForceCommand | None:
+    def remember(reading: Reading, now: int, newer: int = 0) -> ForceCommand | None:
         measured.add(reading.stamp)
-        return encoders(reading, now, passed)
+        return encoders(reading, now, newer)
 
     loop.supervisor.encoders = remember  # type: ignore[method-assign]
     limits = loop.supervisor.controller.settings

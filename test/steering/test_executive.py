@@ -196,6 +196,21 @@ def creeps(robot: Robot) -> None:
     robot.moves = moves
 
 
+def test_needle_at_the_limit_of_its_tolerance_is_measured() -> None:
+    """It arrives just within the tolerance, and settles just outside of it."""
+    robot = Robot()
+
+    def short(wanted: Any) -> Any:
+        off = 1.1 if robot.loop.phase is Phase.MEASURING else 0.9
+        wanted[0] = max(0.0, wanted[0] - off * SETTINGS.depth_tolerance)
+        return wanted
+
+    robot.moves = short
+    robot.steer()
+    assert robot.loop.fault == ''
+    assert robot.loop.phase is Phase.DONE
+
+
 @pytest.mark.requirement('S-122', 'S-123', 'S-126', 'S-127', 'S-130', 'S-131', 'S-132', 'S-162')
 @pytest.mark.parametrize(
     ('fault', 'said', 'deepest'),
