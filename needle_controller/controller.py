@@ -216,8 +216,6 @@ class Controller:
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
-        #: Number of measurements that may wait before it is a gap.
-        self.longest_queue = round(self._hold.gap / self.period)
         self._displacement = DisplacementMonitor(settings.jump, settings.longest_gap)
         self._last_depth: float | None = None
         self.relaxed = False  #: Whether the insertion force is zero although there is a target.

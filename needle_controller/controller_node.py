@@ -54,7 +54,7 @@ class ControllerNode(ModelNode):
     """
     Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
-    A busy node answers the measurements of the last 10 ms, or of 2.5 periods.
+    A busy node answers the newest measurement.
 
     ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths

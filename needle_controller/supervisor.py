@@ -322,7 +322,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self.events.add(Severity.WARNING, line, kind)
 
     def encoders(self, reading: Reading, now: int, newer: int = 0) -> ForceCommand | None:
-        """Answer `joint_states`; only check and observe it if too many newer ones wait."""
+        """Answer `joint_states`; only check and observe it if `newer` ones already wait."""
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
@@ -350,7 +350,7 @@ class Supervisor(StateMachine[ForceCommand]):
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
             self.bending.take_encoders(stamp, measured)
-        if newer > controller.longest_queue:
+        if newer:
             return None
         answer = self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
         # In lock-step the next sample may wait for the answer to a request of this time.
