@@ -163,6 +163,7 @@ def test_busy_controller_answers_only_the_newest_measurement() -> None:
         assert (answer is None) == (newer > 0)
 
 
+@pytest.mark.requirement('S-002', 'S-090')
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
 def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     happens: list[Callable[[Loop], ForceCommand | None]],
