@@ -37,7 +37,6 @@ from needle_dynamics.simulated.run import Event, PARAMETERS
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.contract import JOINT_STATES
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
 import numpy as np
@@ -133,7 +132,6 @@ class StalledLoop(Loop):
     def step(self, *_: Any) -> None:
         """Continue by a period."""
         self.now += self._period
-        waited = len(self._received)
         if not self._stalls('plant'):
             # Older samples are skipped: the needle has not moved then.
             oldest = self.now - round(_BACKLOG * NANOSECONDS)
@@ -142,16 +140,9 @@ class StalledLoop(Loop):
                 self._sample(stamp)
             self.run.commands.count_commanders(1)
         if not self._stalls('controller'):
-            received, self._received = [*self._received], deque(maxlen=_QUEUE)
-            newer = sum(name == JOINT_STATES.name for name, _ in received)
-            for name, message in received:
-                reading = self._ends[name][1](message)
-                options: tuple[int, ...] = ()
-                if name == JOINT_STATES.name:
-                    newer -= 1
-                    # The samples of a plant that was suspended are received one by one.
-                    options = (newer if waited > 0 else 0,)
-                self._answer(self._take[name](reading, self.now, *options), None)
+            while self._received:
+                name, message = self._received.popleft()
+                self._answer(self._take[name](self._ends[name][1](message), self.now), None)
             self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.depth = self.run.plant.depth
 

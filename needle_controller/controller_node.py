@@ -54,8 +54,6 @@ class ControllerNode(ModelNode):
     """
     Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
-    A busy node answers the newest measurement.
-
     ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
     `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths
     are followed, and targets are executed by the node `steering`. The command is zero before the
@@ -168,17 +166,12 @@ class ControllerNode(ModelNode):
         # The driver of a robot takes ROS messages.
         command, robot = topics.command, self._driver is not None
         self._command = self.publisher(command).publish if robot else self.writer(command)
-        encoders = self._supervisor.encoders
-
-        def passed(reading: Reading, newer: int) -> None:
-            self._act(encoders(reading, self.now(), newer))
-
-        states = self._passing(encoders, self._supervisor.estimate), passed
+        take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
-            self._driver.listen(states, take_wrench, self._check_inputs)
+            self._driver.listen(take_state, take_wrench, self._check_inputs)
         else:
-            self.listen(topics.state, states[0], self._check_inputs, passed)
+            self.listen(topics.state, take_state, self._check_inputs)
             self.listen(topics.wrench, take_wrench, self._check_inputs)
         self.listen(
             contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs

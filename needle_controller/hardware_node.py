@@ -13,7 +13,7 @@ from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
 from needle_controller.safety.limits import SafetyLimits
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, message_class, SENSOR, waiting
+from needle_ros.base_node import BaseNode, message_class, SENSOR
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import ControllerStatus
@@ -139,54 +139,43 @@ class Driver:
 
     def listen(
         self,
-        states: tuple[Callable[[Reading], None], Callable[[Reading, int], None]],
+        take_state: Callable[[Reading], None],
         take_wrench: Callable[[Reading], None],
         matched: Callable[[int], None],
     ) -> None:
-        """
-        Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`.
-
-        `states` take the newest joint states, and earlier ones with the number of newer ones.
-        """
+        """Subscribe to joint states, unconverted, and forces, converted; see `BaseNode.listen`."""
         node, robot = self._node, self.robot
 
-        def stamped(take: Callable[..., None]) -> Callable[..., None]:
+        def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
             if self._settings.stamps == hardware.STAMPS[0]:
                 return take
-            return lambda reading, *newer: take(reading._replace(stamp=node.now()), *newer)
+            return lambda reading: take(reading._replace(stamp=node.now()))
 
-        take_state, passed = stamped(states[0]), stamped(states[1])
+        take_state = stamped(take_state)
         if self._dynamic is None:
-            node.listen(self.topics.state, take_state, matched, passed)
+            node.listen(self.topics.state, take_state, matched)
         else:
-            self._listen_to_dynamic(take_state, passed, matched)
+            self._listen_to_dynamic(take_state, matched)
         take = stamped(take_wrench)
         node.listen(self.topics.wrench, lambda reading: take(robot.wrench(reading)), matched)
 
     def _listen_to_dynamic(
-        self,
-        take: Callable[[Reading], None],
-        passed: Callable[[Reading, int], None],
-        matched: Callable[[int], None],
+        self, take: Callable[[Reading], None], matched: Callable[[int], None]
     ) -> None:
-        def converted(message: Any) -> Reading:
+        def on_message(message: Any) -> None:
             interfaces = [(one.interface_names, one.values) for one in message.interface_values]
             header = message.header
-            return hardware.dynamic_reading(
-                nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
+            take(
+                hardware.dynamic_reading(
+                    nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
+                )
             )
-
-        def on_message(message: Any) -> None:
-            received = [message, *waiting(subscription)]
-            for newer in range(len(received) - 1, 0, -1):
-                passed(converted(received[-1 - newer]), newer)
-            take(converted(received[-1]))
 
         def on_match(event: Any) -> None:
             matched(event.total_count_change)
 
         events = SubscriptionEventCallbacks(matched=on_match)
-        subscription = self._node.create_subscription(
+        self._node.create_subscription(
             self._dynamic, self.topics.state.name, on_message, SENSOR, event_callbacks=events
         )
 

@@ -172,9 +172,11 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def trajectory(self, stamp: int, frame: str, path: JointPath, now: int) -> ForceCommand | None:
         """Take a path, which starts at its stamp."""
-        answer = self._request(
-            JOINT_TRAJECTORY, stamp, frame, now, lambda one, late: one.follow_joints(path, late)
-        )
+
+        def follow(controller: Controller, elapsed: float) -> None:
+            controller.follow_joints(path, elapsed)
+
+        answer = self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
         if path.stops and stamp <= now:
             # A stop waits for no sample.
             self._execute_request(stamp + 1)
@@ -321,8 +323,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if line is not None:
             self.events.add(Severity.WARNING, line, kind)
 
-    def encoders(self, reading: Reading, now: int, newer: int = 0) -> ForceCommand | None:
-        """Answer `joint_states`; only check and observe it if `newer` ones already wait."""
+    def encoders(self, reading: Reading, now: int) -> ForceCommand | None:
+        """Answer `joint_states`; a repeated message gets the same command, a late one none."""
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
@@ -350,8 +352,6 @@ class Supervisor(StateMachine[ForceCommand]):
                 return self._release_for('joint_states is beyond a limit', stamp)
             self._depth = measured.depth
             self.bending.take_encoders(stamp, measured)
-        if newer:
-            return None
         answer = self._answer(controller, stamp, measured, (now - stamp) / NANOSECONDS)
         # In lock-step the next sample may wait for the answer to a request of this time.
         self._execute_request(stamp + 1)

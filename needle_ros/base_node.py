@@ -2,7 +2,7 @@
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from importlib import import_module
 import traceback
@@ -55,13 +55,6 @@ def key_values(values: Mapping[str, str]) -> list[KeyValue]:
 def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
     """Create a timer [s] that also runs while the ROS clock is stopped, or jumps."""
     return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-
-def waiting(subscription: Subscription) -> Iterator[Any]:
-    """Take the messages that a subscription has received, in order."""
-    kind, raw = subscription.msg_type, subscription.raw
-    while (taken := subscription.handle.take_message(kind, raw)) is not None:
-        yield taken[0]
 
 
 def message_class(*type_names: str, kind: str = 'msg') -> Any:
@@ -184,37 +177,27 @@ class BaseNode(ParameterNode):
         topic: Topic,
         take: Callable[[Reading], None],
         matched: Callable[[int], None] | None = None,
-        passed: Callable[[Reading, int], None] | None = None,
     ) -> Subscription:
-        """
-        Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0.
-
-        `passed`, if given, takes a message for which newer ones already wait, and their number.
-        """
+        """Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0."""
         name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
-            received = [data] if passed is None else [data, *waiting(subscription)]
-            for newer in reversed(range(len(received))):
-                try:
-                    reading = read(received[-1 - newer])
-                except MessageError as error:
-                    self.invalid[name] += 1
-                    self.get_logger().error(
-                        f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
-                    )
-                    continue
-                if newer and passed is not None:
-                    passed(reading, newer)
-                else:
-                    take(reading)
+            try:
+                reading = read(data)
+            except MessageError as error:
+                self.invalid[name] += 1
+                self.get_logger().error(
+                    f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
+                )
+                return
+            take(reading)
 
         def on_match(event: Any) -> None:
             if matched is not None:
                 matched(event.total_count_change)
 
         events = SubscriptionEventCallbacks(matched=on_match)
-        subscription = self.create_subscription(
+        return self.create_subscription(
             message_class(topic.type_name),
             name,
             on_bytes,
@@ -222,7 +205,6 @@ class BaseNode(ParameterNode):
             raw=True,
             event_callbacks=events,
         )
-        return subscription
 
     def _after_change(self, _parameters: list[Parameter]) -> None:
         if self._configured:

@@ -13,7 +13,6 @@ _GAP, _PERIODS = 0.01, 2.5
 _ROUNDING: Final = 1.0 + 1e-6  #: Tolerance of an age of exactly one period.
 #: Number of measurements after a gap that may have waited, twice as many as a subscription keeps.
 _BURST: Final = 100
-_RECENT: Final = 20  #: Number of measurements whose least age is usual.
 #: Least response, as a fraction of the commanded force or of the velocity of the reference.
 _NOTHING: Final = 0.1
 #: Relative tolerance of a reported force: equal to a command, and constant; number of reports in a
@@ -32,10 +31,9 @@ class ReferenceHold:
 
     def __init__(self, guide: ReferenceGenerator, period: float, delay: int) -> None:
         self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
-        #: Ages of the last measurements, or times since the previous one if that is longer [s]. A
-        #: busy controller does not answer each measurement.
-        self._lates = deque([0.0], maxlen=_RECENT)
-        #: Usual age before a gap while measurements are late, and their number since then.
+        #: Age of the last measurement, or time since the previous one if that is longer [s].
+        self._late = 0.0
+        #: `_late` before a gap while measurements are late, and their number since then.
         self._usual: float | None = None
         self._waited = 0
         #: Last forces [N], the oldest acts; tracking error at the last command [m]; whether the
@@ -50,9 +48,8 @@ class ReferenceHold:
         guide, missing, (time, velocity, reported) = self._guide, self.missing, sample
         # Measurements that are always late or rare are no gap. After one, those that have waited
         # are no later than usual in the end.
-        before, late = min(self._lates), max(time - guide.now, age)
-        self._lates.append(late)
-        begins = late > max(self._gap, _PERIODS * before)
+        before, self._late = self._late, max(time - guide.now, age)
+        begins = self._late > max(self._gap, _PERIODS * before)
         self._waited = 0 if begins else self._waited + 1
         behind = self._usual is not None and age > _ROUNDING * self._usual
         gap = begins or (behind and self._waited < _BURST)

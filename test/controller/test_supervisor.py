@@ -151,18 +151,6 @@ def test_stop_gives_zero_force_until_cleared(
     assert loop.supervisor.safety.stop == stop
 
 
-@pytest.mark.requirement('S-311')
-def test_busy_controller_answers_only_the_newest_measurement() -> None:
-    """The others are observed, and get no command."""
-    loop = Loop()
-    loop.pushes()
-    for newer, depth in ((50, loop.depth), (0, loop.depth), (1, nan), (1, loop.depth)):
-        loop.now += PERIOD
-        reading = Reading(loop.now, '', ('insertion',), ((depth,), (0.0,), ()))
-        answer = loop.supervisor.encoders(reading, loop.now, newer)
-        assert (answer is None) == (newer > 0)
-
-
 @pytest.mark.requirement('S-002', 'S-090')
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
 def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
@@ -173,9 +161,9 @@ def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     measured = set()
     encoders = loop.supervisor.encoders
 
-    def remember(reading: Reading, now: int, newer: int = 0) -> ForceCommand | None:
+    def remember(reading: Reading, now: int) -> ForceCommand | None:
         measured.add(reading.stamp)
-        return encoders(reading, now, newer)
+        return encoders(reading, now)
 
     loop.supervisor.encoders = remember  # type: ignore[method-assign]
     limits = loop.supervisor.controller.settings

@@ -139,30 +139,6 @@ def test_node_parses_any_message(
     )
 
 
-@pytest.mark.requirement('S-311')
-def test_busy_node_is_told_how_many_messages_wait(ros_graph: RosGraph) -> None:
-    """All messages are read in order; one behind which others wait is passed with their number."""
-    node, teller = ros_graph.add(PlantNode, start=False), ros_graph.node('teller')
-    read: list[tuple[int, int]] = []
-    topic = Topic(name='words', type_name=POINT, publisher='user', meaning='')
-    node.listen(
-        topic,
-        lambda reading: read.append((reading.stamp, 0)),
-        passed=lambda reading, newer: read.append((reading.stamp, newer)),
-    )
-    sender = teller.create_publisher(PointStamped, 'words', SENSOR)
-    ros_graph.spin_until(sender.get_subscription_count, 'the reader')
-    write = Template(POINT).serialize
-    for stamp in range(30):
-        sender.publish(write(stamp, 0.0, 0.0, 0.0))
-    ros_graph.spin_until(lambda: len(read) == 30, 'the messages')
-    assert [stamp for stamp, _ in read] == [*range(30)]
-    # The executor was busy with publishing.
-    assert max(newer for _, newer in read) > 1
-    for (_, before), (_, after) in pairwise(read):
-        assert after == before - 1 or before == 0
-
-
 def test_missing_message_type_is_reported() -> None:
     """As an error of the suite, not as an ImportError."""
     with pytest.raises(MessageError, match='lab_msgs/msg/Thing is not installed'):
