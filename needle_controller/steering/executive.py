@@ -315,9 +315,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if departure := motions.departure():
             return self._stop(departure, now)
         if self.phase is Phase.MEASURING:
-            missed = motions.missed(tolerance=_LEFT)
-            line = f'during the measurement of the tip {missed}'
-            return self._stop(line, now) if missed else None
+            if missed := motions.missed(motions.away(_LEFT)):
+                return self._stop(f'during the measurement of the tip {missed}', now)
+            return None
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)

@@ -143,10 +143,13 @@ class MotionControl:
         """Whether the needle is deeper than the end of its motion."""
         return bool(self.at[0] > self.goal[0] + LAGGING * self._settings.depth_tolerance)
 
-    def missed(self, which: BoolArray | None = None, *, tolerance: float = 1.0) -> str:
+    def away(self, factor: float = 1.0) -> BoolArray:
+        """Return which joints are beyond a multiple of their tolerance from their goal."""
+        return np.asarray(np.abs(self.at - self.goal) > factor * self._settings.tolerances)
+
+    def missed(self, which: BoolArray | None = None) -> str:
         """Describe the joints (or given joints) that are not at their goal, '' if all are."""
-        far = np.abs(self.at - self.goal) > tolerance * self._settings.tolerances
-        far = far if which is None else which
+        far = self.away() if which is None else which
         scaled = [(1.0, 'rad') if name == ROLL else (1e3, 'mm') for name in self._settings.joints]
         rows = zip(self._settings.joints, scaled, self.at, self.goal, far, strict=True)
         return ' and '.join(

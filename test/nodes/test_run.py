@@ -219,7 +219,7 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     """The position is read with the topic, joint and units of the controller."""
     drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
     remaps = ['--ros-args', '-r', 'joint_states:=stage/states']
-    ros_graph.add(drivers['PositionRobot'], cli_args=remaps)
+    stage = ros_graph.add(drivers['PositionRobot'], cli_args=remaps)
     words = [
         f'-pcontroller.{name}={value}'
         for name, value in {
@@ -239,8 +239,10 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     assert (status, complained) == (0, ''), said
     before, *_, after = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
     assert float(before) == pytest.approx(20.0, abs=0.01), said
+    # The stage holds the position that it had at the end of the session; a motion has ended.
+    assert float(after) == pytest.approx(stage.position - 100.0, abs=0.1)
     # In real time: beside four busy processes, where up to half of the commands are late, the
-    # stage was up to 0.4 mm from its target. A wrong unit or zero is off by more than 1 mm.
+    # stage was up to 0.4 mm from its target, which is 2 mm from the start.
     assert float(after) == pytest.approx(22.0, abs=0.5)
     assert 'no measurements' not in said
 
