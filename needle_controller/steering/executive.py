@@ -315,12 +315,22 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if departure := motions.departure():
             return self._stop(departure, now)
         if self.phase is Phase.MEASURING:
-            if missed := motions.missed(motions.away(_LEFT)):
-                return self._stop(f'during the measurement of the tip {missed}', now)
-            return None
+            return self._check_rest(now)
         if motions.monitor.is_late(motions.at, stamp):
             return self._run(lambda _insertion: motions.repeat(now), now)
         return self._run(lambda insertion: insertion.follow(stamp, now), now)
+
+    def _check_rest(self, now: int) -> JointMotion | None:
+        """Check needle and guide during a tip measurement."""
+        left = self._motions.away(_LEFT)
+        if not left.any():
+            return None
+        line = f'during the measurement of the tip {self._motions.missed(left)}'
+        if left[1:].any() or self._motions.at[0] > self._motions.goal[0]:
+            return self._stop(line, now)
+        # Tissue pushes a needle back while it gets no force; the controller returns it.
+        self.events.add(Severity.WARNING, f'{line}; measured again at its goal')
+        return self._run(lambda insertion: insertion.measure_again(now), now)
 
     def _run(
         self, process: Callable[[SteppedInsertion], JointMotion | None], now: int

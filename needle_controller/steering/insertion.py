@@ -47,12 +47,18 @@ class SteppedInsertion:
 
     def resume(self, now: int) -> JointMotion | None:
         """Continue after a pause: move on, or measure again."""
-        self._rest = None
         if self.phase is not Phase.MEASURING:
+            self._rest = None
             return self._motions.resume(now)
-        self.phase = Phase.INSERTING if self.law.step else Phase.GUIDING
-        self._measured, self._motions.due = None, now
+        self._motions.due = now
+        self.measure_again(now)
         return None
+
+    def measure_again(self, now: int) -> None:
+        """Discard the measurement under way, and wait for rest at the goal."""
+        self._check_patience(self._motions.missed(), now)
+        self.phase = Phase.INSERTING if self.law.step else Phase.GUIDING
+        self._measured = self._rest = None
 
     def follow(self, stamp: int, now: int) -> JointMotion | None:
         """Process new positions of the joints: wait until needle and guide rest at their goal."""
@@ -63,10 +69,13 @@ class SteppedInsertion:
         if not missed:
             return self._arrive(stamp, now)
         self._rest = None
-        late = (stamp - motions.due) / NANOSECONDS
+        self._check_patience(missed, stamp)
+        return None
+
+    def _check_patience(self, missed: str, now: int) -> None:
+        late = (now - self._motions.due) / NANOSECONDS
         if late > self._settings.patience:
             raise SteeringFaultError(f'{missed}, {late:.1f} s late')
-        return None
 
     def _arrive(self, stamp: int, now: int) -> JointMotion | None:
         """Insert the needle after the guide, or wait for rest, then begin a measurement."""

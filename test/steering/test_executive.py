@@ -211,6 +211,36 @@ def test_needle_at_the_limit_of_its_tolerance_is_measured() -> None:
     assert robot.loop.phase is Phase.DONE
 
 
+def pushed_back(robot: Robot, measurements: int) -> None:
+    """Push the needle back by 1 mm in its first measurements, until they are discarded."""
+    seen = 0
+
+    def moves(wanted: Any) -> Any:
+        nonlocal seen
+        if robot.loop.phase is Phase.MEASURING and wanted[0] > 0.03 and seen < measurements:
+            seen += 1
+            wanted[0] -= 1e-3
+        return wanted
+
+    robot.moves = moves
+
+
+@pytest.mark.requirement('S-311')
+@pytest.mark.parametrize('settings', [SETTINGS, CONTINUOUS])
+def test_needle_that_tissue_pushes_back_is_measured_again(settings: ExecutiveSettings) -> None:
+    """As after a gap in the commands; a needle that leaves its goal each time is stopped."""
+    robot = Robot(settings)
+    pushed_back(robot, 3)
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    assert robot.miss < 4e-4
+    held = Robot(settings)
+    pushed_back(held, 1000)
+    held.steer()
+    assert held.loop.phase is Phase.STOPPED
+    assert 's late' in held.loop.fault
+
+
 @pytest.mark.requirement('S-122', 'S-123', 'S-126', 'S-127', 'S-130', 'S-131', 'S-132', 'S-162')
 @pytest.mark.parametrize(
     ('fault', 'said', 'deepest'),
