@@ -37,6 +37,7 @@ from needle_dynamics.simulated.run import Event, PARAMETERS
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.contract import NEWEST
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.trajectories import JointPath
 import numpy as np
@@ -54,9 +55,7 @@ WINDOW: Final = 0.01
 START, TARGET = 0.02, 0.05
 _DURATION: Final = 1.875 * (TARGET - START) / (0.999 * LIMIT)
 
-#: Samples that a suspended controller has not lost, and longest time that a suspended plant
-#: computes later [s].
-_QUEUE: Final = 50
+#: Longest time that a suspended plant computes later [s].
 _BACKLOG: Final = 0.05
 
 
@@ -90,6 +89,10 @@ class StalledLoop(Loop):
         Stamp [ns] and true insertion depth [m] of each sample.
     references : list of tuple
         Position and velocity of the reference in each command [m, m/s].
+    ages : list of int
+        Age of the sample of each command [ns].
+    busy : int
+        Number of periods that the controller needs for a sample; 1 if it takes all that wait.
 
     """
 
@@ -105,9 +108,11 @@ class StalledLoop(Loop):
         self.supervisor.activate(self.now, self.publishers)
         self.track: list[tuple[int, float]] = []
         self.references: list[tuple[float, ...]] = []
+        self.ages: list[int] = []
         self._ends_at = dict.fromkeys(VICTIMS, 0)
-        self._received: deque[tuple[str, bytes]] = deque(maxlen=_QUEUE)
+        self._received = {name: deque[bytes](maxlen=NEWEST.depth) for name in MEASURED}
         self._sampled = self.now
+        self.busy, self._turn = 1, 0
 
     def stall(self, victim: str, lasts: float) -> None:
         """Suspend a node, or lose the messages of a topic, for a time from now on [s]."""
@@ -140,26 +145,33 @@ class StalledLoop(Loop):
                 self._sample(stamp)
             self.run.commands.count_commanders(1)
         if not self._stalls('controller'):
-            while self._received:
-                name, message = self._received.popleft()
-                self._answer(self._take[name](self._ends[name][1](message), self.now), None)
+            self._turn += 1
+            if self._turn % self.busy == 0:
+                for _once in range(NEWEST.depth if self.busy == 1 else 1):
+                    self._take_next()
             self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.depth = self.run.plant.depth
+
+    def _take_next(self) -> None:
+        """Process the next message of each topic."""
+        for name, waiting in self._received.items():
+            if waiting:
+                reading = self._ends[name][1](waiting.popleft())
+                self._answer(self._take[name](reading, self.now), None)
 
     def _sample(self, stamp: int) -> None:
         self._sampled = stamp
         told = {name: values for name, _, values in self.run.take(stamp)}
         self.track.append((stamp, self.run.plant.depth))
         if not self._stalls('measurements'):
-            self._received += [
-                (name, self._written(name, Sent(stamp, told[name])))
-                for name in MEASURED
-                if name in told
-            ]
+            for name, waiting in self._received.items():
+                if name in told:
+                    waiting.append(self._written(name, Sent(stamp, told[name])))
 
     def _answer(self, answer: ForceCommand | None, _fault: object) -> None:
         if answer is None:
             return
+        self.ages.append(self.now - answer.stamp)
         if answer.reference:
             self.references.append(answer.reference)
         if not self._stalls('commands'):

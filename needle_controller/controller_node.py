@@ -23,7 +23,7 @@ from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
-from needle_ros.base_node import steady_timer
+from needle_ros.base_node import NEWEST, steady_timer
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.preparation import PreparationProgress
@@ -171,11 +171,10 @@ class ControllerNode(ModelNode):
         if self._driver is not None:
             self._driver.listen(take_state, take_wrench, self._check_inputs)
         else:
-            self.listen(topics.state, take_state, self._check_inputs)
-            self.listen(topics.wrench, take_wrench, self._check_inputs)
-        self.listen(
-            contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._check_inputs
-        )
+            self.listen(topics.state, take_state, self._check_inputs, NEWEST)
+            self.listen(topics.wrench, take_wrench, self._check_inputs, NEWEST)
+        take_tip = self._passing(self._supervisor.tip)
+        self.listen(contract.TIP_DEFLECTION, take_tip, self._check_inputs, NEWEST)
         self._reference = self.writer(contract.REFERENCE)
         self._tracking_error = self.writer(contract.TRACKING_ERROR)
         self.subscribe(contract.TARGET, self._on_target)

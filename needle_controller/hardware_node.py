@@ -13,7 +13,7 @@ from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
 from needle_controller.safety.limits import SafetyLimits
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, message_class, SENSOR
+from needle_ros.base_node import BaseNode, message_class, NEWEST
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import ControllerStatus
@@ -153,11 +153,13 @@ class Driver:
 
         take_state = stamped(take_state)
         if self._dynamic is None:
-            node.listen(self.topics.state, take_state, matched)
+            node.listen(self.topics.state, take_state, matched, NEWEST)
         else:
             self._listen_to_dynamic(take_state, matched)
         take = stamped(take_wrench)
-        node.listen(self.topics.wrench, lambda reading: take(robot.wrench(reading)), matched)
+        node.listen(
+            self.topics.wrench, lambda reading: take(robot.wrench(reading)), matched, NEWEST
+        )
 
     def _listen_to_dynamic(
         self, take: Callable[[Reading], None], matched: Callable[[int], None]
@@ -176,7 +178,7 @@ class Driver:
 
         events = SubscriptionEventCallbacks(matched=on_match)
         self._node.create_subscription(
-            self._dynamic, self.topics.state.name, on_message, SENSOR, event_callbacks=events
+            self._dynamic, self.topics.state.name, on_message, NEWEST, event_callbacks=events
         )
 
     def with_robot(self, status: ControllerStatus) -> ControllerStatus:

@@ -70,8 +70,9 @@ def message_class(*type_names: str, kind: str = 'msg') -> Any:
 
 
 #: QoS profiles of the subscriptions of the suite.
-LATCHED, COMMAND, SENSOR = (
-    profile(qos, request=True) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
+LATCHED, COMMAND, SENSOR, NEWEST = (
+    profile(qos, request=True)
+    for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR, contract.NEWEST)
 )
 
 _SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -177,8 +178,13 @@ class BaseNode(ParameterNode):
         topic: Topic,
         take: Callable[[Reading], None],
         matched: Callable[[int], None] | None = None,
+        qos: QoSProfile | None = None,
     ) -> Subscription:
-        """Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0."""
+        """
+        Subscribe to a topic by bytes; `matched` receives the number of new publishers, or 0.
+
+        ``qos`` is the requested QoS, by default that of the topic.
+        """
         name, read = topic.name, MessageReader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
@@ -201,7 +207,7 @@ class BaseNode(ParameterNode):
             message_class(topic.type_name),
             name,
             on_bytes,
-            profile(topic.qos, request=True),
+            qos or profile(topic.qos, request=True),
             raw=True,
             event_callbacks=events,
         )

@@ -60,6 +60,9 @@ REQUEST_AGE: Final = 5.0  #: Maximum age of a request [s]: three repetitions, an
 #: late sample. The depth holds a burst after a stall of the subscriber.
 SENSOR: Final = Qos('reliable or best effort', depth=50, lossy=True)
 
+#: Requested by a control loop, which answers the newest samples while it is busy.
+NEWEST: Final = SENSOR._replace(depth=2)
+
 COMMAND: Final = Qos('reliable')  #: Only the newest message matters.
 ALIVE: Final = Qos('lease of 0.5 s', lease=0.5)  #: No messages: liveliness of a publisher.
 LATCHED: Final = Qos(

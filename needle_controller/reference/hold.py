@@ -7,12 +7,13 @@ from typing import Final
 
 from needle_controller.reference.generator import ReferenceGenerator
 from needle_controller.reference.setpoint import Setpoint
+from needle_ros.contract import NEWEST
 
 #: Longest gap in the measurements, and largest age of one, before the law restarts [s].
 _GAP, _PERIODS = 0.01, 2.5
 _ROUNDING: Final = 1.0 + 1e-6  #: Tolerance of an age of exactly one period.
-#: Number of measurements after a gap that may have waited, twice as many as a subscription keeps.
-_BURST: Final = 100
+#: Number of measurements after a gap that may have waited, twice as many as a controller keeps.
+_BURST: Final = 2 * NEWEST.depth
 #: Least response, as a fraction of the commanded force or of the velocity of the reference.
 _NOTHING: Final = 0.1
 #: Relative tolerance of a reported force: equal to a command, and constant; number of reports in a

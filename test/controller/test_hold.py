@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from math import nan
 
 from benchmarks.loop import Loop, LoopFault, Sent
-from benchmarks.stalls import insert, LIMIT, Stall, StalledLoop, TARGET, VICTIMS
+from benchmarks.stalls import fastest, insert, LIMIT, Stall, StalledLoop, TARGET, VICTIMS
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Controller, Measurement, Setpoint
 from needle_controller.controller import LAWS
 from needle_dynamics import NeedleParameters
+from needle_ros.contract import NEWEST
 import numpy as np
 import pytest
 
@@ -185,6 +186,27 @@ def test_needle_continues_at_its_velocity_after_a_gap(law: str) -> None:
     # A law that assumes no force lets the needle slow down to a third of this.
     assert steps.min() > 0.9 * LIMIT
     assert steps.max() < 1.1 * LIMIT
+
+
+@pytest.mark.requirement('S-312')
+@pytest.mark.parametrize('busy', [2, 3])
+@pytest.mark.parametrize('law', LAWS)
+def test_busy_controller_answers_the_newest_measurements(law: str, busy: int) -> None:
+    """One that is too slow for the rate: the needle moves as with a fast one."""
+    loop = StalledLoop(law)
+    loop.busy = busy
+    for _ in range(20):
+        loop.step()
+    loop.follow(TARGET, 6.0)
+    for _ in range(8000):
+        loop.step()
+    # The samples that wait, and the one that is processed.
+    assert max(loop.ages) <= (NEWEST.depth + 1) * busy * PERIOD * 1e9
+    inward, outward = fastest(loop.track)
+    assert inward <= LIMIT * (1.0 + OVERSHOOT)
+    assert outward < 0.1 * LIMIT
+    assert abs(loop.depth - TARGET) < AT_REST
+    assert loop.supervisor.authority.reason == ''
 
 
 def command_velocity(follows: Sequence[tuple[float, ...]]) -> float:
