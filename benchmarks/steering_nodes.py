@@ -41,6 +41,8 @@ from needle_ros.contract import (
     JOINT_COMMANDS,
     JOINT_STATES,
     JOINT_TRAJECTORY,
+    NEWEST,
+    SENSOR,
     SYSTEM_STATE,
     TARGET,
     TIP_DEFLECTION,
@@ -104,8 +106,8 @@ ROUTES: Final = {
     **{f'{RESPONSE}{topic}': (USER,) for topic in CALLS},
 }
 
-#: Messages that a paused node keeps.
-_KEPT: Final = dict.fromkeys((BASE_WRENCH.name, TIP_DEFLECTION.name, JOINT_STATES.name), 50)
+#: Topics of measurements, and number of other messages of a topic that a paused node keeps.
+_MEASURED: Final = BASE_WRENCH.name, TIP_DEFLECTION.name, JOINT_STATES.name
 _KEPT_ELSE: Final = 10
 
 #: Joints of the guide.
@@ -184,8 +186,11 @@ class GraphNode(ABC):
     """
     A node: its messages, its part of the system state, and its answers to requests.
 
-    ``runs`` is whether it takes messages; a paused node keeps them until it is resumed.
+    ``runs`` is whether it takes messages; a paused node keeps them until it is resumed, at most
+    ``samples`` of a topic of measurements.
     """
+
+    samples = SENSOR.depth
 
     def __init__(self, graph: NodeNetwork, name: str) -> None:
         self.graph, self.name = graph, name
@@ -254,7 +259,7 @@ class GraphNode(ABC):
         self.kept.clear()
         for k, posted in enumerate(kept):
             after = sum(one.topic == posted.topic for one in kept[k + 1 :])
-            if after < _KEPT.get(posted.topic, _KEPT_ELSE):
+            if after < (self.samples if posted.topic in _MEASURED else _KEPT_ELSE):
                 self.receive(posted, now)
 
     def publish(self, *, again: bool = False) -> None:
@@ -269,6 +274,8 @@ class GraphNode(ABC):
 
 class SimulatedController(GraphNode):
     """Axial supervisor, as the node of the same name."""
+
+    samples = NEWEST.depth
 
     def _begin(self) -> None:
         graph, controller = self.graph, deepcopy(_controller())

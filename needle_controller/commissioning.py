@@ -236,7 +236,7 @@ class Commissioning:
         if lag > settings.lag + period:
             raise JobError(
                 f'the robot follows {lag:.3g} s late, hardware.commissioning.lag is '
-                f'{settings.lag:g} s: lower this delay, or the gains of the law for it'
+                f'{settings.lag:g} s: lower this delay, or allow it'
             )
         return lag
 

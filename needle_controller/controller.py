@@ -100,6 +100,14 @@ class ControllerSettings(CheckedSettings):
         return low, high
 
 
+class BaseState(NamedTuple):
+    """State of a needle base that the law controls, see `Admittance`."""
+
+    depth: float  #: insertion depth [m]
+    velocity: float  #: velocity [m/s]
+    waits: bool = False  #: whether it waits for the robot that follows it
+
+
 class Measurement(NamedTuple):
     """Readings of the encoders."""
 
@@ -110,6 +118,7 @@ class Measurement(NamedTuple):
     angular_velocity: float = 0.0  #: its velocity [rad/s]
     #: Axial force on the needle as reported by the robot [N]; NaN if not reported.
     force: float = nan
+    base: BaseState | None = None  #: state that the law controls, if it is not the measured one
 
     @classmethod
     def from_reading(cls, reading: Reading) -> Measurement:
@@ -384,15 +393,15 @@ class Controller:
             return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
             )
-        loop, depth, velocity = self._insertion, measured.depth, measured.velocity
-        sample = measured.time, velocity, measured.force
+        loop, sample = self._insertion, (measured.time, measured.velocity, measured.force)
+        base = measured.base or BaseState(measured.depth, measured.velocity)
         if self._hold.measure(sample, age, loop.law.axis.coulomb):
             if self._hold.missing:
                 loop.unwind()
             else:
                 # The robot holds the last force.
                 loop.stop(loop.last if isnan(measured.force) else measured.force)
-        now = self.guide.at(measured.time, depth, velocity)
+        now = self.guide.at(measured.time, base.depth, base.velocity)
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
         torque = 0.0
         if self.settings.rotation:
@@ -400,8 +409,8 @@ class Controller:
             torque = self._rotation.command(angle, measured.angular_velocity, rest)
         if self.relaxed:
             loop.unwind()
-        force = 0.0 if self.relaxed else loop.command(depth, velocity, ahead, load)
-        self._hold.command(now, depth, force, loop.limit)
+        force = 0.0 if self.relaxed else loop.command(base.depth, base.velocity, ahead, load)
+        self._hold.command(now, base.depth, force, 0.0 if base.waits else loop.limit)
         return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
 
     def _returned(self, measured: Measurement) -> str | None:

@@ -194,6 +194,7 @@ class Robot:
             speed=self.settings.speed,
             lead=self.settings.lead,
             depths=controller.settings.depths(controller.parameters),
+            delay=controller.delay,
         )
 
     def set_model(self, parameters: NeedleParameters) -> None:
@@ -248,7 +249,10 @@ class Robot:
                     angle, angular_velocity = positions[j], velocities[j]
         if isfinite(depth):
             self._depth = depth
-        return Measurement(time, depth, velocity, angle, angular_velocity, force)
+        base = None
+        if self._base is not None and settings.command == POSITION and isfinite(depth):
+            base = self._base.state(depth)
+        return Measurement(time, depth, velocity, angle, angular_velocity, force, base)
 
     def _find(self, joint: str, reading: Reading) -> int:
         names, positions = reading.names, reading.values[0]
