@@ -134,7 +134,7 @@ SLIDE: Final = HardwareSettings(
 )  # fmt: skip
 
 #: True needle: softer tissue than the nominal needle, a tilted guide and a bevel.
-_WORLD: Final = {
+WORLD: Final[dict[str, object]] = {
     'steered': True,
     'needle': 'bending_35mm',
     'model.tissue_stiffness': 0.8 * NEEDLE.tissue_stiffness,
@@ -143,7 +143,7 @@ _WORLD: Final = {
     'depth': 1e-3,
     'tip.noise': 1e-4,
     'guide.speed_limit': 0.1,
-    # A robot with position commands must be able to follow the reference.
+    # A robot with position commands can follow the reference.
     'base.acceleration_limit': ACCELERATION,
     'step': 1e-3,
 }
@@ -164,7 +164,7 @@ class NodeNetwork(ABC):
         self.robot, self.continuous = robot, continuous
         self.now = EPOCH
         mode = 'simulation' if robot == CONTRACT else 'robot'
-        self.run = PlantRun({**_WORLD, 'mode': mode})
+        self.run = PlantRun({**WORLD, 'mode': mode})
         self.nodes: dict[str, GraphNode] = {}
 
     def steady(self) -> float:

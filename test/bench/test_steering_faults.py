@@ -19,6 +19,7 @@ from benchmarks.steering_faults import (
 )
 from benchmarks.steering_graph import AIM, SteeringGraph
 from benchmarks.steering_nodes import (
+    ACCELERATION,
     CALLS,
     COMMANDED,
     DIRECT,
@@ -28,6 +29,7 @@ from benchmarks.steering_nodes import (
     ROBOTS,
     ROUTES,
     SETTINGS,
+    WORLD,
 )
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, RETRACT_DEPTH, STOP
 import numpy as np
@@ -71,7 +73,7 @@ def test_steered_cells_cover_messages_nodes_and_phases() -> None:
     assert requests == {(place, phase) for place in CALLS for phase in PHASES}
 
 
-@pytest.mark.requirement('S-302')
+@pytest.mark.requirement('S-302', 'S-313')
 @pytest.mark.parametrize(
     ('place', 'fault', 'phase', 'outcome'),
     [
@@ -79,10 +81,17 @@ def test_steered_cells_cover_messages_nodes_and_phases() -> None:
         ('response of resume at robot', f'first lost, then {PAUSE}', 'braking', 'paused'),
     ],
 )
-def test_robot_that_follows_its_reference_reverses_and_pauses(
-    place: str, fault: str, phase: str, outcome: str
+@pytest.mark.parametrize('acceleration', [0.5 * ACCELERATION, ACCELERATION, 2.0 * ACCELERATION])
+def test_position_robot_of_any_acceleration_reverses_and_pauses(
+    monkeypatch: pytest.MonkeyPatch,
+    place: str,
+    fault: str,
+    phase: str,
+    outcome: str,
+    acceleration: float,
 ) -> None:
-    """With half of the reference's acceleration it oscillates by several millimeters."""
+    """Also one that cannot follow the reference."""
+    monkeypatch.setitem(WORLD, 'base.acceleration_limit', acceleration)
     cell = SteeringCell(HARDWARE, False, place, fault, phase)
     found = measure(cell)
     assert found.outcome == outcome
