@@ -24,6 +24,7 @@ from needle_controller import (
     ControllerSettings,
     ForceCommand,
     HardwareSettings,
+    ReferenceLimits,
     Robot,
     SafetyLimits,
 )
@@ -230,12 +231,13 @@ def run(
     *,
     check: bool,
     duration: float = _DURATION,
+    speed: float = ReferenceLimits.speed,
     words: Mapping[float, str] | None = None,
 ) -> FirstMotionSession:
     """
     Run a session with a request of 10 mm after 1 s; without the check, as far as it goes.
 
-    `words` has further requests of a user by their times [s].
+    `speed` is that of the reference [m/s], and `words` has further requests of a user by their times [s].
     """
     later = dict(words or {})
     robot, now = one.robot(), 1_700_000_000 * NANOSECONDS
@@ -244,7 +246,7 @@ def run(
     try:
         adapter = Robot(HardwareSettings(**one.hardware))
         control = ControllerSettings(rate=one.rate, delay=float(one.delay))
-        controller = Controller(_PHANTOM, settings=control)
+        controller = Controller(_PHANTOM, settings=control, limits=ReferenceLimits(speed=speed))
         adapter.configure(controller)
         facts = CommissioningSettings(enabled=check, **one.facts)
         commissioning = Commissioning(facts, adapter, controller, SafetyLimits())

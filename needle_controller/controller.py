@@ -120,6 +120,11 @@ class Measurement(NamedTuple):
     force: float = nan
     base: BaseState | None = None  #: state that the law controls, if it is not the measured one
 
+    @property
+    def waits(self) -> bool:
+        """Whether the command waits for a robot that follows positions."""
+        return self.base is not None and self.base.waits
+
     @classmethod
     def from_reading(cls, reading: Reading) -> Measurement:
         """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
@@ -410,6 +415,7 @@ class Controller:
         if self.relaxed:
             loop.unwind()
         force = 0.0 if self.relaxed else loop.command(base.depth, base.velocity, ahead, load)
+        # A base that waits holds the reference, as a force at its limit does.
         self._hold.command(now, base.depth, force, 0.0 if base.waits else loop.limit)
         return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
 

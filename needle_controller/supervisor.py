@@ -398,7 +398,7 @@ class Supervisor(StateMachine[ForceCommand]):
         forces = self._last.force, measured.force, self.bending.load
         following, depth = self._following, measured.depth
         step = error[0] if controller.guide.steps else None
-        lost = following.update(stamp, depth, aim.velocity, *forces, step)
+        lost = following.update(stamp, depth, aim.velocity, *forces, step, measured.waits)
         fault = safety.guard.tracking(error[0]) or following.fault
         if (stopped := self._stop_for(fault, stamp)) is not None:
             return stopped

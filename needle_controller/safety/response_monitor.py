@@ -10,6 +10,7 @@ from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 
 _PATIENCE: Final = NANOSECONDS // 10  #: Time without response until the plant is lost [ns].
+_LONGEST: Final = NANOSECONDS  #: Time without motion of a robot that is behind its command [ns].
 _NOTHING: Final = 0.1  #: Least response, as a fraction of the commanded force or distance.
 _WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
@@ -165,6 +166,7 @@ class ResponseMonitor:
         self.fault: str | None = None
         self.notice: str | None = None
         self._mark: _Mark | None = None
+        self._behind: _Mark | None = None
         self._stall.forget()
 
     @property
@@ -180,13 +182,15 @@ class ResponseMonitor:
         reported: float,
         load: float = 0.0,
         step: float | None = None,
+        waits: bool = False,
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
         commanded and the reported force [N], NaN if there is none, the known load against the
-        force [N], and the distance [m] to a reference that steps: it rests while the needle moves.
+        force [N], the distance [m] to a reference that steps: it rests while the needle moves, and
+        whether the command waits for a robot that follows positions.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
@@ -195,6 +199,7 @@ class ResponseMonitor:
         else:
             # Far from a step, the needle must move as behind a moving reference.
             self.fault = self._stall.update(stamp, depth, step or rate, applied, load)
+        self.fault = self.fault or self._check_robot(stamp, depth, waits)
         self.lost = self._is_lost(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:
@@ -203,6 +208,20 @@ class ResponseMonitor:
                 'commanded'
             )
         return self.lost
+
+    def _check_robot(self, stamp: int, depth: float, waits: bool) -> str | None:
+        """Return why a robot that is behind its position command is blocked, or None."""
+        moved = 0.0 if self._behind is None else abs(depth - self._behind.depth)
+        if not waits:
+            self._behind = None
+        elif self._behind is None or moved > _NOTHING * self._stall.most:
+            self._behind = _Mark(stamp, depth)
+        elif stamp - self._behind.stamp > _LONGEST:
+            return (
+                f'the robot does not follow its position command: {1e3 * moved:.3g} mm in '
+                f'{_LONGEST / NANOSECONDS:g} s; it is blocked, or its encoders are frozen'
+            )
+        return None
 
     def _is_lost(
         self, stamp: int, depth: float, rate: float, commanded: float, reported: float

@@ -309,3 +309,33 @@ def test_invalid_facts_are_rejected_in_one_line(values: dict[str, Any], said: st
     with pytest.raises(ParameterError) as raised:
         from_values(CommissioningSettings, values, 'hardware.commissioning.')
     assert str(raised.value).startswith(f'hardware.commissioning.{said}')
+
+
+@pytest.mark.requirement('S-314')
+@pytest.mark.parametrize('kind', [Stage, Spindle])
+@pytest.mark.parametrize('frozen', [False, True])
+@pytest.mark.parametrize('speed', [1e-3, 1e-2])
+def test_position_robot_without_motion_stops_the_system(
+    kind: type[SimulatedRobot], speed: float, *, frozen: bool
+) -> None:
+    """Blocked, or with frozen encoders: it is ahead of them by the lead of 2 mm at most."""
+    one = correct(kind)
+    robot = one.robot()
+    end = robot.depth + 4e-3
+
+    class Faulty(kind):  # type: ignore[misc, valid-type]
+        def move(self, h: float) -> None:
+            if frozen or self.depth < end:
+                super().move(h)
+            else:
+                self.velocity = 0.0
+
+        def position(self, depth: float) -> float:
+            return float(super().position(min(depth, end) if frozen else depth))
+
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+    session = replace(one, robot=lambda: Faulty(**values))
+    found = run(session, check=False, duration=10.0, speed=speed)
+    assert 'encoders' in found.reason
+    # The position is constant within noise.
+    assert found.motion < 4e-3 + 2e-3 + 1e-4
