@@ -231,13 +231,14 @@ def run(
     *,
     check: bool,
     duration: float = _DURATION,
-    speed: float = ReferenceLimits.speed,
+    limits: ReferenceLimits | None = None,
     words: Mapping[float, str] | None = None,
 ) -> FirstMotionSession:
     """
     Run a session with a request of 10 mm after 1 s; without the check, as far as it goes.
 
-    `speed` is that of the reference [m/s], and `words` has further requests of a user by their times [s].
+    `limits` are those of the reference, and `words` has further requests of a user by their
+    times [s].
     """
     later = dict(words or {})
     robot, now = one.robot(), 1_700_000_000 * NANOSECONDS
@@ -246,7 +247,7 @@ def run(
     try:
         adapter = Robot(HardwareSettings(**one.hardware))
         control = ControllerSettings(rate=one.rate, delay=float(one.delay))
-        controller = Controller(_PHANTOM, settings=control, limits=ReferenceLimits(speed=speed))
+        controller = Controller(_PHANTOM, settings=control, limits=limits)
         adapter.configure(controller)
         facts = CommissioningSettings(enabled=check, **one.facts)
         commissioning = Commissioning(facts, adapter, controller, SafetyLimits())

@@ -20,6 +20,7 @@ from benchmarks.commissioning import (
     setup,
 )
 from benchmarks.robots import RATE, SimulatedRobot, Slide, Spindle, Stage, STEPS
+from needle_controller import ReferenceLimits
 from needle_controller.commissioning import CommissioningSettings
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values
@@ -335,7 +336,8 @@ def test_position_robot_without_motion_stops_the_system(
 
     values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
     session = replace(one, robot=lambda: Faulty(**values))
-    found = run(session, check=False, duration=10.0, speed=speed)
+    limits = ReferenceLimits(speed=speed)
+    found = run(session, check=False, duration=10.0, limits=limits)
     assert 'encoders' in found.reason
     # The position is constant within noise.
     assert found.motion < 4e-3 + 2e-3 + 1e-4
