@@ -20,9 +20,8 @@ from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.report.text import table
+from needle_insertion.graph.ros_graph import Graph, GraphError
+from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
 from needle_ros.requests import Verdict

@@ -23,8 +23,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection
 from benchmarks.watching import connections, page
 from needle_identification import Bag
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_ros.contract import JOINT_STATES, WRENCH_COMMAND
 from needle_ros.status import NodeStatus, PlantStatus, SteeringPhase, SteeringStatus

@@ -19,9 +19,9 @@ from typing import Final
 from benchmarks.pairs import Pair
 from geometry_msgs.msg import WrenchStamped
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.base_node import COMMAND
-from needle_ros.realtime import set_priority
+from needle_ros.process import set_priority
 import numpy as np
 
 LONGEST: Final = 5e-3  #: Longest permitted time between two commands [s].

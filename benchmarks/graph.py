@@ -30,8 +30,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.pairs import Figures, Pair, PAIRS, TARGETS
 from geometry_msgs.msg import WrenchStamped
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 from sensor_msgs.msg import JointState

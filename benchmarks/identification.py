@@ -29,7 +29,7 @@ from needle_identification import (
     read_friction_recording,
 )
 from needle_identification.bags.messages import encode, message_type
-from needle_identification.recordings.series import LARGEST
+from needle_identification.recordings.samples import MOST_SAMPLES
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
@@ -271,8 +271,9 @@ def _told(
             ('length', 'messages', 'size', 'time', 'per second', 'peak memory', 'for the bag'),
             memories,
             'From a bag to a result with `needle_identification`, once, in one process each. '
-            f'"For the bag" is the peak less the peak before the bag is read. At most {LARGEST} '
-            'samples of a topic are kept. A longer topic is averaged to fewer samples.',
+            '"For the bag" is the peak less the peak before the bag is read. At most '
+            f'{MOST_SAMPLES} samples of a topic are kept. A longer topic is averaged to fewer '
+            'samples.',
         ),
     ]
     others = [one['seconds'] for name, one in found.items() if name not in (OURS, OUR_READING)]

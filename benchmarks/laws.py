@@ -32,7 +32,7 @@ from needle_controller import (
     run_batch,
     Setpoint,
 )
-from needle_controller.reference.trapezoid import Trapezoid
+from needle_controller.reference.path import Trapezoid
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 

@@ -12,8 +12,7 @@ import time
 from typing import Any, Final, TypeAlias
 
 from geometry_msgs.msg import PointStamped
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
+from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph, GraphError
 from needle_ros.base_node import COMMAND, LATCHED
 from needle_ros.timing import nanoseconds
 from rclpy.qos import QoSProfile

@@ -22,10 +22,9 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.live.operator import Operator
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import message_class, profile
 from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus

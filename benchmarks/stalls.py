@@ -35,7 +35,7 @@ from needle_controller.steering.motion import smooth
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.run import Event, PARAMETERS
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.contract import NEWEST
 from needle_ros.timing import NANOSECONDS, nanoseconds

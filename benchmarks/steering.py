@@ -18,9 +18,8 @@ from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw,
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw
-from needle_controller.steering.limits import SIMULATION_LIMITS
-from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringPrior
 from needle_controller.steering.simulation import GroundTruth, sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.needles import NEEDLES

@@ -31,7 +31,7 @@ from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.steering.motion import JointMotion
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NEEDLES
-from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
+from needle_dynamics.simulated.commands import GUIDE_JOINTS
 from needle_dynamics.simulated.run import PlantRun
 from needle_ros.contract import (
     BASE,

@@ -20,9 +20,8 @@ from benchmarks.steering_nodes import (
 )
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.simulated.executions import Executions
-from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
+from needle_dynamics.simulated.commands import GUIDE_JOINTS
+from needle_dynamics.simulated.run import Event, Executions, PlantRun, TRAJECTORY
 from needle_ros.contract import (
     BASE,
     BASE_WRENCH,
@@ -33,11 +32,10 @@ from needle_ros.contract import (
     JOINT_TRAJECTORY,
     TIP_DEFLECTION,
 )
-from needle_ros.requests import Acknowledgement, RequestLog, Verdict
+from needle_ros.requests import Acknowledgement, RequestLog, Verdict, WaitingRequests
 from needle_ros.system_state import Mode
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import JointPath
-from needle_ros.waiting_requests import WaitingRequests
 from needle_ros.wire import Reading
 import numpy as np
 

@@ -15,8 +15,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Tick
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from needle_insertion.graph.node_process import GraphError, NodeProcess
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError, NodeProcess
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status
 from sensor_msgs.msg import JointState

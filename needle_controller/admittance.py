@@ -5,7 +5,7 @@ from collections import deque
 from typing import Final
 
 from needle_controller.controller import BaseState
-from needle_controller.laws.axis import Axis
+from needle_controller.laws.law import Axis
 from needle_ros.timing import NANOSECONDS
 
 _LONGEST: Final = 2.0  #: Longest step, in periods: missing samples are not made up for.

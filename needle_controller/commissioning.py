@@ -8,12 +8,12 @@ from math import nan
 
 from needle_controller.controller import Controller, ControllerOutput, Measurement
 from needle_controller.hardware import POSITION, Robot, STAMPS
-from needle_controller.laws.axis import Axis
+from needle_controller.laws.law import Axis
 from needle_controller.reference.setpoint import Setpoint
-from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.safety import SafetyLimits
 from needle_controller.safety.timing_monitor import RateMonitor
-from needle_ros.axes import AXES
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.quantities import AXES
 from needle_ros.settings import check_constants, constant, flag
 from needle_ros.status import CommissioningPhase
 from needle_ros.timing import NANOSECONDS

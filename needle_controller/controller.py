@@ -8,17 +8,19 @@ from dataclasses import dataclass
 from math import isfinite, isnan, nan
 from typing import Final, NamedTuple, TypeAlias
 
-from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
-from needle_controller.laws.axis import Axis, require_complete
-from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.laws.law import Law, SampledLoop
-from needle_controller.laws.pid import Pid, PidGains
-from needle_controller.reference.generator import ReferenceGenerator
-from needle_controller.reference.hold import ReferenceHold
+from needle_controller.laws.law import Axis, Law, require_complete, SampledLoop
+from needle_controller.laws.sampled import (
+    Adaptive,
+    AdaptiveGains,
+    InverseDynamics,
+    InverseDynamicsGains,
+    Pid,
+    PidGains,
+)
+from needle_controller.reference.generator import ReferenceGenerator, ReferenceHold
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
-from needle_controller.safety.displacement_monitor import DisplacementMonitor
-from needle_controller.stability import check_stability, Limit, MARGIN
-from needle_controller.uncertainty import Uncertainty
+from needle_controller.safety.input_monitor import DisplacementMonitor
+from needle_controller.stability import check_stability, Limit, MARGIN, Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import INSERTION
 from needle_ros.errors import ParameterError

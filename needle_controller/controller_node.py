@@ -18,17 +18,18 @@ from needle_controller.hardware_node import await_topics, CONTRACT, Driver
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.generator import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
-from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.safety import SafetyLimits
+from needle_controller.stability import Uncertainty
 from needle_controller.supervisor import Supervisor
-from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.base_node import NEWEST, steady_timer
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
-from needle_ros.preparation import PreparationProgress
+from needle_ros.life_cycle_node import PreparationProgress
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
+from needle_ros.settings import is_number
 from needle_ros.status import ControllerStatus, Diagnosis
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.system_state_node import SystemStateTopics
@@ -94,7 +95,6 @@ class ControllerNode(ModelNode):
         'needle_dynamics.compiled.friction',
         'needle_dynamics.compiled.integrals',
         'needle_dynamics.compiled.normal_modes',
-        'needle_dynamics.compiled.oscillator',
     )
 
     def __init__(self, **node_options: Any) -> None:
@@ -234,8 +234,7 @@ class ControllerNode(ModelNode):
         if _RETRACT not in changes and value == RETRACT_DEPTH:
             # The default is limited to the range of the needle.
             return min(max(RETRACT_DEPTH, low), high)
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not low <= value <= high:
+        if not is_number(value) or not low <= value <= high:
             raise ParameterError(f'{_RETRACT} must be in [{low:g}, {high:g}] m, got {value!r}')
         return float(value)
 

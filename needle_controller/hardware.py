@@ -9,11 +9,11 @@ from typing import Final
 from needle_controller.admittance import Admittance
 from needle_controller.controller import Controller, Measurement
 from needle_controller.force_command import ForceCommand
-from needle_controller.laws.axis import Axis
+from needle_controller.laws.law import Axis
 from needle_dynamics import NeedleParameters
-from needle_ros.axes import AXES, signed_axis
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import AXES, signed_axis
 from needle_ros.settings import check_constants, choice, constant, flag, positive, text
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading

@@ -11,7 +11,7 @@ from needle_controller import hardware
 from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.controller import Controller
 from needle_controller.force_command import ForceCommand
-from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.safety import SafetyLimits
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, NEWEST
 from needle_ros.contract import Topic

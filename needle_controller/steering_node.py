@@ -10,16 +10,13 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
-from needle_controller.steering.insertion_record import SteeringRecord
+from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
 from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
-from needle_controller.steering.prior import SteeringPrior
-from needle_controller.steering.record_file import RecordFile
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
-from needle_controller.steering.settings import ExecutiveSettings
-from needle_dynamics.compiled_node import CompiledNode
-from needle_dynamics.model_node import declare_needle
+from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
+from needle_dynamics.model_node import CompiledNode, declare_needle
 from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
@@ -36,7 +33,7 @@ from needle_ros.status import Diagnosis, node_of, SteeringStatus
 from needle_ros.system_state import Authority
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS, nanoseconds
-from needle_ros.trajectory_client_node import TrajectoryClient
+from needle_ros.trajectory_action_node import TrajectoryClient
 from needle_ros.wire import Reading
 import numpy as np
 from rclpy.duration import Duration

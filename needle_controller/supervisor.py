@@ -11,23 +11,20 @@ from needle_controller.force_command import ForceCommand
 from needle_controller.hardware import Robot, STAMPS
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
-from needle_controller.safety.guard import buckling_warning
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
-from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.response_monitor import ResponseMonitor
-from needle_controller.safety.safety import FaultKind, Safety
+from needle_controller.safety.safety import buckling_warning, FaultKind, Safety, SafetyLimits
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.contract import BASE, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
-from needle_ros.requests import Verdict
+from needle_ros.requests import RequestAction, Verdict, WaitingRequests
 from needle_ros.status import ControllerPhase, ControllerStatus
 from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import JointPath
-from needle_ros.waiting_requests import RequestAction, WaitingRequests
 from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'

@@ -13,13 +13,13 @@ from needle_ros.lazy import lazy_names
 if TYPE_CHECKING:
     from needle_dynamics.analysis import analyze as analyze
     from needle_dynamics.arrays import FloatArray as FloatArray
-    from needle_dynamics.buckling import euler_loads as euler_loads
     from needle_dynamics.compiled.friction import FRICTION_LAWS as FRICTION_LAWS
     from needle_dynamics.errors import InsertionDepthError as InsertionDepthError
     from needle_dynamics.errors import ToleranceError as ToleranceError
     from needle_dynamics.friction import add_friction_law as add_friction_law
     from needle_dynamics.friction import Friction as Friction
     from needle_dynamics.linearization import linearize as linearize
+    from needle_dynamics.model import euler_loads as euler_loads
     from needle_dynamics.model import NeedleModel as NeedleModel
     from needle_dynamics.modes import mode_shapes as mode_shapes
     from needle_dynamics.modes import ModeShapes as ModeShapes
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from needle_dynamics.needles import NEEDLES as NEEDLES
     from needle_dynamics.parameters import FORMULATIONS as FORMULATIONS
     from needle_dynamics.parameters import NeedleParameters as NeedleParameters
+    from needle_dynamics.parameters import Tissue as Tissue
     from needle_dynamics.simulated.batch import simulate_batch as simulate_batch
     from needle_dynamics.simulated.integrator import Integrator as Integrator
     from needle_dynamics.simulated.trajectory import simulate as simulate
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from needle_dynamics.steering.needle import SteeredNeedle as SteeredNeedle
     from needle_dynamics.steering.parameters import bending_length as bending_length
     from needle_dynamics.steering.parameters import SteeringParameters as SteeringParameters
-    from needle_dynamics.tissue import Tissue as Tissue
     from needle_ros.errors import NeedleError as NeedleError
     from needle_ros.errors import ParameterError as ParameterError
     from needle_ros.errors import ShapeError as ShapeError

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Display of results in terminals and notebooks: line of text, table, figure and DataFrame."""
+"""Display in terminals and notebooks: results as text, table, figure, DataFrame; progress."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from html import escape
 import re
-from typing import Any, Final, TYPE_CHECKING
+from typing import Any, Final, TYPE_CHECKING, TypeAlias
 
 from needle_ros.errors import missing_extra
 import numpy as np
@@ -23,6 +25,9 @@ _SHOWN: Final = {'m': ('mm', 1e3), 'm/s': ('mm/s', 1e3), 'rad': ('deg', 180.0 / 
 _MOST_ROWS: Final = 20  #: largest number of rows of a table that is shown completely
 #: End of the name of a component.
 _AXIS: Final = re.compile(r'([._][xyzw]|_measured|_fitted|\[?\d+\]?)$')
+
+#: True for a progress bar, or a function that is called after each run.
+Progress: TypeAlias = bool | Callable[[], object]
 
 
 class Displayed:
@@ -120,3 +125,20 @@ def _range(values: NDArray[Any]) -> tuple[float, ...]:
 def _cell(value: Any) -> str:
     # Zero without its sign.
     return f'{value + 0.0:.6g}' if isinstance(value, float) else escape(str(value))
+
+
+@contextmanager
+def progress_of(
+    progress: Progress | None, total: int, unit: str
+) -> Iterator[Callable[[], object]]:
+    """Yield the function to call after each of a number of runs."""
+    if callable(progress):
+        yield progress
+    elif progress:
+        # Widgets in a notebook, text elsewhere.
+        from tqdm.auto import tqdm
+
+        with tqdm(total=total, unit=f' {unit}', leave=False) as bar:
+            yield bar.update
+    else:
+        yield lambda: None

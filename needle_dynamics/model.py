@@ -6,13 +6,14 @@ The generalized coordinates are q = [d, theta, q1, ..., qn] and the state is X =
 eight numbers for n = 2. d is the length of needle outside the tissue and decreases during
 insertion; the insertion force f_y is positive into the tissue. The formulation `complete` has
 every term of the Euler-Lagrange equations of T - V, equation (12). The formulation `as_printed`
-is the final form in the source, which omits the row of d and the terms from dG/dt.
+is the final form in the source, which omits the row of d and the terms from dG/dt. `euler_loads`
+are the buckling loads of the part outside the tissue.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
+from math import inf, isfinite, pi
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -23,13 +24,15 @@ from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.friction import Friction
 from needle_dynamics.modes import mode_shapes, ModeShapes
-from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.tissue import Tissue
+from needle_dynamics.parameters import NeedleParameters, Tissue
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
 ROUNDING: Final = 1e-12  #: rounding tolerance of an insertion depth, relative to the needle length
+
+#: First root of tan(x) = x: column clamped at one end and pinned at the other.
+_PINNED: Final = 4.493409457909064
 
 
 class _Instant(NamedTuple):
@@ -286,3 +289,45 @@ class NeedleModel:
     def energy(self, state: ArrayLike, time: float = 0.0) -> float:
         """Return the total energy T + V [J]."""
         return self.kinetic_energy(state) + self.potential_energy(state, time)
+
+
+class EulerLoads(NamedTuple):
+    """Euler buckling loads of the part outside the tissue, clamped at the base [N]."""
+
+    free: float  #: free end, as before the tip has entered
+    pinned: float  #: pinned at the entry point: rotation is free, lateral displacement is zero
+
+
+def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
+    """
+    Return the Euler buckling loads of the part of the needle outside the tissue.
+
+    A needle guide shortens the part that can buckle; it is not modeled.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        The needle.
+    depth : float
+        Insertion depth [m].
+
+    Returns
+    -------
+    EulerLoads
+        Both loads [N]; infinite if the needle is fully inserted.
+
+    Examples
+    --------
+    >>> from needle_dynamics import euler_loads, NeedleParameters
+    >>> loads = euler_loads(NeedleParameters.preset('phantom'), 0.02)
+    >>> print(f'{loads.free:.1f} N, {loads.pinned:.1f} N')
+    1.9 N, 16.0 N
+
+    """
+    if not 0.0 <= depth < inf:
+        raise InsertionDepthError(f'insertion depth must be finite and >= 0, got {depth!r} m')
+    outside = parameters.length - depth
+    if outside <= 0.0:
+        return EulerLoads(inf, inf)
+    stiffness = parameters.bending_stiffness / outside**2
+    return EulerLoads(0.25 * pi**2 * stiffness, _PINNED**2 * stiffness)

@@ -12,10 +12,10 @@ from typing import Any, Final, NamedTuple
 
 from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE, PRESETS
 from needle_dynamics.steering.parameters import STEEL, SteeringParameters, tissue_of
-from needle_ros.documents import read_document
 from needle_ros.errors import ParameterError
+from needle_ros.files import read_document
 from needle_ros.quantities import quantity
-from needle_ros.settings import from_values, unknown_name
+from needle_ros.settings import from_values, is_number, unknown_name
 
 #: Needle of new commands, studies and environments, and of the node `steering`.
 DEFAULT_NEEDLE: Final = 'bending_35mm'
@@ -67,8 +67,7 @@ def of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
         quantity(value, 'm') if isinstance(value := values.get(name, 0.0), str) else value
         for name in DIAMETERS
     )
-    numbers = isinstance(outer, (int, float)) and isinstance(inner, (int, float))
-    if not (numbers and 0.0 <= inner < outer):
+    if not (is_number(outer) and is_number(inner) and 0.0 <= inner < outer):
         raise ParameterError(
             'outer_diameter and inner_diameter must be 0 <= inner < outer [m], got '
             f'{outer!r} and {inner!r}'

@@ -10,11 +10,8 @@ from typing import Any
 
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.needles import usable_needle
-from needle_dynamics.plant_commanders_node import PlantCommanders
-from needle_dynamics.plant_display_node import PlantDisplay
-from needle_dynamics.plant_reports_node import SampleReports
-from needle_dynamics.plant_samples_node import SamplePublishers
-from needle_dynamics.plant_trajectories_node import PlantTrajectories
+from needle_dynamics.plant_inputs_node import PlantCommanders, PlantTrajectories
+from needle_dynamics.plant_outputs_node import PlantDisplay, SamplePublishers, SampleReports
 from needle_dynamics.simulated.assembly import (
     build_sample_clock,
     defaults_of,

@@ -16,8 +16,8 @@ from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
     from needle_identification.bags.bag import Bag as Bag
-    from needle_identification.bags.table import read_bag as read_bag
-    from needle_identification.bags.table import TopicTable as TopicTable
+    from needle_identification.bags.bag import read_bag as read_bag
+    from needle_identification.bags.bag import TopicTable as TopicTable
     from needle_identification.bags.writer import BagWriter as BagWriter
     from needle_identification.errors import IdentificationError as IdentificationError
     from needle_identification.errors import RecordingError as RecordingError
@@ -46,10 +46,10 @@ if TYPE_CHECKING:
         IndentationRecording as IndentationRecording,
     )
     from needle_identification.recordings.recording import Recording as Recording
+    from needle_identification.recordings.recording import SensorRecording as SensorRecording
     from needle_identification.result import write_result as write_result
-    from needle_identification.sensor.estimate import SensorEstimate as SensorEstimate
     from needle_identification.sensor.identify import identify_sensor as identify_sensor
-    from needle_identification.sensor.recording import SensorRecording as SensorRecording
+    from needle_identification.sensor.identify import SensorEstimate as SensorEstimate
     from needle_identification.steering.estimate import SteeringEstimate as SteeringEstimate
     from needle_identification.steering.identify import identify_steering as identify_steering
     from needle_identification.steering.identify import SteeringSettings as SteeringSettings
@@ -57,11 +57,11 @@ if TYPE_CHECKING:
         read_steering_recording as read_steering_recording,
     )
     from needle_identification.steering.recording import SteeringRecording as SteeringRecording
-    from needle_identification.stiffness.estimate import LevelEstimate as LevelEstimate
-    from needle_identification.stiffness.estimate import StiffnessEstimate as StiffnessEstimate
-    from needle_identification.stiffness.estimate import StiffnessSummary as StiffnessSummary
-    from needle_identification.stiffness.estimate import summarize_stiffness as summarize_stiffness
     from needle_identification.stiffness.identify import identify_stiffness as identify_stiffness
-    from needle_identification.stiffness.settings import StiffnessSettings as StiffnessSettings
+    from needle_identification.stiffness.identify import LevelEstimate as LevelEstimate
+    from needle_identification.stiffness.identify import StiffnessEstimate as StiffnessEstimate
+    from needle_identification.stiffness.identify import StiffnessSummary as StiffnessSummary
+    from needle_identification.stiffness.identify import summarize_stiffness as summarize_stiffness
+    from needle_identification.stiffness.plateaus import StiffnessSettings as StiffnessSettings
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -8,8 +8,7 @@ import sys
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.estimation.formatting import measured
+from needle_identification.estimation.estimate import measured, Statistic, statistic
 from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary, summarize
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.recursive import LiveFriction
@@ -20,19 +19,19 @@ from needle_identification.recordings.reading import (
     read_indentation_recording,
 )
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.stiffness.estimate import (
+from needle_identification.stiffness.identify import (
+    identify_stiffness,
     StiffnessEstimate,
     StiffnessSummary,
     summarize_stiffness,
 )
-from needle_identification.stiffness.identify import identify_stiffness
-from needle_identification.stiffness.settings import StiffnessSettings
+from needle_identification.stiffness.plateaus import StiffnessSettings
 from needle_ros import contract
-from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.base_node import BaseNode
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
+from needle_ros.quantities import AXES, signed, signed_axis
 from needle_ros.requests import no_answer
 from needle_ros.run_node import run
 from needle_ros.settings import CheckedSettings, constant, positive

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import Statistic
-from needle_identification.estimation.formatting import between, suffix, UNKNOWN
+from needle_identification.estimation.estimate import between, Statistic, suffix, UNKNOWN
 from needle_identification.friction.estimate import FrictionSummary
-from needle_identification.sensor.estimate import SensorEstimate
+from needle_identification.sensor.identify import SensorEstimate
 from needle_identification.steering.estimate import SteeringEstimate
-from needle_identification.stiffness.estimate import StiffnessSummary
-from needle_ros.axes import AXES
+from needle_identification.stiffness.identify import StiffnessSummary
 from needle_ros.files import write_whole
+from needle_ros.quantities import AXES
 import yaml
 
 NODES: Final = ('plant', 'controller')  #: nodes that use the result

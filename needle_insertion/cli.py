@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn
 
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, missing_ros, NeedleError
-from needle_ros.signals import ENDINGS
+from needle_ros.process import ENDINGS
 
 #: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
 COMMANDS: Final[Mapping[str, str]] = {

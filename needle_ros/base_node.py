@@ -13,10 +13,9 @@ from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import MessageError, NeedleError, printable
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.life_cycle_node import LifeCycle
+from needle_ros.life_cycle_node import imports, LifeCycle, Preparation, PreparationProgress
 from needle_ros.parameter_node import ParameterNode
-from needle_ros.preparation import imports, Preparation, PreparationProgress
-from needle_ros.realtime import HIGHEST, set_priority
+from needle_ros.process import HIGHEST, set_priority
 from needle_ros.status import Diagnosis, HARDWARE, NodeStatus, STALE, TASK
 from needle_ros.wire import MessageReader, Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quantities with units as text, such as ``4mm``, ``3N`` and ``20 s``, and targets of the tip."""
+"""Parse text: quantities with units, such as ``4mm`` and ``20 s``, targets, and signed axes."""
 
 from collections.abc import Mapping
 from math import isfinite, pi
@@ -31,6 +31,8 @@ EXAMPLES: Final = {unit: example.split()[-1] for unit, (_, example, _) in _KINDS
 
 #: Help text of a target.
 TARGET_HELP: Final = 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm; m without a unit'
+
+AXES: Final = ('x', 'y', 'z')  #: Axes of a frame, in the order of message fields.
 
 
 def accepted_units(unit: str) -> str:
@@ -66,3 +68,16 @@ def target(text: str) -> tuple[float, float, float]:
         raise ParameterError(f'{text!r} is not a target: {TARGET_HELP}')
     x, y, z = found
     return x, y, z
+
+
+def signed(text: str) -> tuple[float, str]:
+    """Split a name into its sign (1 or -1, from a leading ``-``) and the rest."""
+    return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
+
+
+def signed_axis(text: str, what: str) -> tuple[float, str]:
+    """Split an axis, such as ``-x``, into sign and name; reject names other than x, y, z."""
+    sign, axis = signed(text)
+    if axis not in AXES:
+        raise ParameterError(f'{what} must be x, y, z, -x, -y or -z, got {text!r}')
+    return sign, axis

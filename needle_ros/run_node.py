@@ -17,8 +17,8 @@ from types import FrameType
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.errors import NeedleError
 from needle_ros.network import LOCAL, RANGE, stay_local
-from needle_ros.parameter_files import sections, shared_names, unmatched_files
-from needle_ros.signals import ENDINGS
+from needle_ros.parameter_node import sections, shared_names, unmatched_files
+from needle_ros.process import ENDINGS
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor

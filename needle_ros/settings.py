@@ -9,7 +9,7 @@ from importlib import import_module
 from math import inf, isfinite
 from pathlib import Path
 import sys
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeGuard, TypeVar
 
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import accepted_units, quantity
@@ -23,8 +23,6 @@ _NAMES: Final = {
     bool: 'true or false', str: 'text', list: 'a list of text', tuple: 'a list of numbers',
     int: 'a number', float: 'a number',
 }  # fmt: skip
-
-_LARGEST_INTEGER: Final = 10**300  #: Larger integers cannot be converted to float.
 
 
 def constant(
@@ -130,10 +128,26 @@ def check_choice(name: str, value: object, valid: Collection[str]) -> None:
         raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is a finite integer or float; a Boolean is not a number."""
+    # Larger integers cannot be converted to float.
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
+
+
+def check_whole(name: str, value: object, low: int, high: int) -> None:
+    """Raise `ParameterError` if a value is not an integer in a range."""
+    if not (isinstance(value, int) and is_number(value) and low <= value <= high):
+        raise ParameterError(f'{name} must be an integer from {low} to {high}, got {value!r}')
+
+
 def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ParameterError(f'{name} must be a number, got {value!r}')
-    if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+    if isinstance(value, int) and not is_number(value):
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
     too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
     infinite = not isfinite(value) and not (meta['unlimited'] and value == inf)
@@ -204,8 +218,7 @@ def _as_number(name: str, value: Any, unit: str) -> Any:
         except ParameterError as error:
             units = f', or text with a unit of {accepted_units(unit)}' if unit != '1' else ''
             raise ParameterError(f'{name} must be a number{units}, got {value!r}') from error
-    is_integer = isinstance(value, int) and not isinstance(value, bool)
-    return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
+    return float(value) if isinstance(value, int) and is_number(value) else value
 
 
 def unknown_name(name: str, valid: Iterable[str]) -> str:

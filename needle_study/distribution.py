@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantity
-from needle_ros.settings import find_class
+from needle_ros.settings import find_class, is_number
 import numpy as np
 from scipy import stats
 
@@ -203,11 +203,6 @@ def from_table(name: str, given: Any, folder: Path) -> Any:
         raise ParameterError(f'{name}: {file} cannot be read: {error}') from error
 
 
-def is_number(value: Any) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return number and abs(value) <= _LARGEST
-
-
 def _numbers(name: str, given: Any, *units: str) -> tuple[float, ...]:
     """Return numbers in SI units, by default without a unit; the last unit is for all others."""
     if not isinstance(given, Sequence) or isinstance(given, str):
@@ -217,7 +212,7 @@ def _numbers(name: str, given: Any, *units: str) -> tuple[float, ...]:
         numbers = [quantity(one, unit) if isinstance(one, str) else one for one, unit in each]
     except ParameterError as error:
         raise ParameterError(f'{name}: {error}') from error
-    if not all(map(is_number, numbers)):
+    if not all(is_number(one) and abs(one) <= _LARGEST for one in numbers):
         raise ParameterError(
             f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
         )

@@ -9,10 +9,9 @@ from typing import Any, Final, NamedTuple
 import needle_controller as control
 from needle_controller.controller import LAW_OF
 from needle_controller.in_loop.sampled import run_insertions
-from needle_controller.laws.axis import require_complete
-from needle_controller.laws.law import Law
-from needle_controller.safety.guard import Guard
-from needle_controller.uncertainty import Uncertainty
+from needle_controller.laws.law import Law, require_complete
+from needle_controller.safety.safety import Guard
+from needle_controller.stability import Uncertainty
 from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_ros import contract

@@ -10,9 +10,9 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
-from needle_controller.steering.limits import SIMULATION_LIMITS, SteeringLimits
+from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
-from needle_dynamics.simulated.tip_errors import TipErrorParameters
+from needle_dynamics.simulated.tip_sensor import TipErrorParameters
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError

@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
 
 from needle_dynamics import FloatArray
-from needle_dynamics.display import Displayed, new_figure, shown
-from needle_dynamics.progress import Progress, progress_of
-from needle_ros.documents import DocumentError, read_document
+from needle_dynamics.display import Displayed, new_figure, Progress, progress_of, shown
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice, find_class
+from needle_ros.files import DocumentError, read_document
+from needle_ros.settings import check_choice, check_whole, find_class, is_number
 from needle_study.designs import BELOW, DESIGNS, INSIDE, RandomDesign, SobolDesign
-from needle_study.distribution import Distribution, distribution, from_table, is_number
+from needle_study.distribution import Distribution, distribution, from_table
 from needle_study.scenario import check_names, mapping, Scenario, SCENARIOS
 import numpy as np
 
@@ -194,9 +193,8 @@ def build_study(document: Any) -> Study:
 
 def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
     value = document.get(key, 1)
-    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= _MOST:
-        raise ParameterError(f'{key} must be a whole number from {low} to {_MOST}, got {value!r}')
-    return value
+    check_whole(key, value, low, _MOST)
+    return int(value)
 
 
 def _factor(given: Any, names: Sequence[str]) -> FloatArray:

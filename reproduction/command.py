@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from needle_insertion.commands.common import check_folder, make_folder
 from needle_insertion.progress import ProgressLine
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 
 #: Results to choose from.
 RESULTS: Final = (

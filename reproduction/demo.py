@@ -21,9 +21,8 @@ from needle_identification import (
 )
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report import identify_figures
-from needle_insertion.report.content import Picture
+from needle_insertion.report.content import Picture, table
 from needle_insertion.report.page import write_page
-from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError
 from reproduction.campaign import Campaign
 from reproduction.content import Check, CHECK_HEADS

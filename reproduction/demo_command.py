@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     check_folder(options.output)
     with ProgressLine('demo', brief=True):
-        from needle_insertion.compilation import compile_nodes
+        from needle_insertion.commands.compile import compile_nodes
         from reproduction import demo
 
     compile_nodes()

@@ -17,8 +17,8 @@ from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.progress import ProgressLine
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import JobError
+from needle_ros.files import DocumentError, read_document
 from needle_ros.timing import seconds
 import numpy as np
 from rclpy.duration import Duration

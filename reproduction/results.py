@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.content import filled, table
 from needle_insertion.report.page import write_page
 from needle_insertion.report.paper_tables import TABLE_1, TABLE_2
-from needle_insertion.report.text import filled, table
 from reproduction import claims, controllability, figures, mismatch, needle_constants
 from reproduction.campaign import Campaign
 from reproduction.content import ReportSection

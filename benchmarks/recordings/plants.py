@@ -24,8 +24,7 @@ from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.needles import NEEDLES
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import SteeringRecording
-from needle_identification.steering.prediction import rms_of
-from needle_identification.steering.search import Search, Tips
+from needle_identification.steering.search import rms_of, Search, Tips
 import numpy as np
 
 #: Order of guide motion and insertion of the recordings, and of the simulated insertion.

@@ -12,9 +12,8 @@ from benchmarks.page import PageSection
 from benchmarks.recordings.plants import BeamMedium, Medium, recorded_plant, ResponseMedium
 from needle_controller.steering.law import build_law, SteeringFaultError, SteeringLaw, TipEstimate
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw, OutOfReachError
-from needle_controller.steering.limits import SteeringLimits
-from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import FloatArray
 from needle_dynamics.needles import DEFAULT_NEEDLE, NEEDLES

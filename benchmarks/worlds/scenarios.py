@@ -29,9 +29,8 @@ from benchmarks.worlds.sensors import (
 from benchmarks.worlds.stiffness_field import draw_field, StiffnessField
 from benchmarks.worlds.world import draw_wander, DrawnConstants, IndependentNeedle
 from needle_controller.steering.law import GuideSetpoint
-from needle_controller.steering.limits import SteeringLimits
-from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_controller.steering.simulation import SteeringPlant
 from needle_dynamics import FloatArray
 from needle_dynamics.steering.needle import SteeredNeedle

@@ -14,7 +14,7 @@ from math import pi, sqrt
 from typing import Final, TypeAlias
 
 from needle_dynamics import FloatArray
-from needle_dynamics.simulated.tip_errors import SlowNoise
+from needle_dynamics.simulated.tip_sensor import SlowNoise
 import numpy as np
 
 #: Sensor as `simulate_steering` takes it.

@@ -12,8 +12,7 @@ from typing import NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import inlined
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals
-from needle_dynamics.compiled.normal_modes import modal_stiffness, normal_modes, NormalModes
-from needle_dynamics.compiled.oscillator import swing
+from needle_dynamics.compiled.normal_modes import modal_stiffness, normal_modes, NormalModes, swing
 from needle_dynamics.compiled.step import CompiledNeedle
 from needle_dynamics.compiled.tissue import layer_at
 import numpy as np

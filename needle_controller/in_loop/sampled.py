@@ -13,11 +13,11 @@ from needle_controller.compiled.loop import run_lanes, run_loop
 from needle_controller.controller import ControllerOutput, Measurement
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
+from needle_controller.reference.path import Trapezoid
 from needle_controller.reference.setpoint import Reference
-from needle_controller.reference.trapezoid import Trapezoid
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.lanes import LANES
-from needle_dynamics.progress import Progress, progress_of
+from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.simulated.batch import (
     lane_constants,
     lane_groups,

@@ -15,7 +15,10 @@ A late tip sample is processed at its time: the filter keeps a history and repea
 there. The result equals the result of a filter without late samples.
 """
 
-from dataclasses import replace
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import ceil, inf, isfinite, nan
 from operator import index
 from typing import Final, NamedTuple
@@ -29,8 +32,7 @@ from needle_controller.compiled.filter import (
     replay,
     SAMPLE,
 )
-from needle_controller.laws.axis import require_complete
-from needle_controller.observer.consistency import Consistency
+from needle_controller.laws.law import require_complete
 from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import FloatArray, InsertionDepthError, NeedleModel, NeedleParameters
 from needle_dynamics.model import ROUNDING
@@ -38,6 +40,7 @@ from needle_ros.errors import NeedleError, ParameterError, ShapeError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtri
 
 _EVEN: Final = 0.01  #: Relative deviation of encoder stamps from the period that is ignored.
 _NEAR: Final = 0.1  #: Relative tolerance of the filter rate as a multiple of the sample rate.
@@ -45,6 +48,40 @@ NEAREST: Final = 0.5  #: Largest stamp difference of a wrench and its encoder sa
 _WAITING: Final = 16  #: Largest number of wrenches that wait for their encoder sample.
 _OVERLAP: Final = 0.1  #: Relative overlap of exposures above which a tip sample is a duplicate.
 _LARGEST: Final = 1e6  #: Largest plausible measurement; squares of larger ones overflow [SI].
+
+
+@lru_cache(maxsize=64)
+def _far(degrees: int) -> float:
+    """Return the ratio that is exceeded by chance with a probability of 1e-6."""
+    return float(chdtri(degrees, 1e-6)) / degrees
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Consistency:
+    """Consistency of errors with their variances: mean normalized squared error."""
+
+    ratio: float  #: mean squared error over variance per degree of freedom; 1 if consistent
+    low: float  #: lower end of the 95 % band of chi^2 for the ratio
+    high: float  #: upper end
+    degrees: int  #: degrees of freedom; with 0 the ratio is nan
+
+    @classmethod
+    def of(cls, total: float, degrees: int) -> Consistency:
+        """Compute ratio and band of a sum of NIS, or of NEES with 2 n degrees for each run."""
+        if degrees == 0:
+            return cls(ratio=nan, low=0.0, high=inf, degrees=0)
+        low, high = (float(chdtri(degrees, tail)) / degrees for tail in (0.975, 0.025))
+        return cls(ratio=float(total) / degrees, low=low, high=high, degrees=degrees)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the ratio is too large, by chance with a probability of 1e-6."""
+        return self.degrees > 0 and self.ratio > _far(self.degrees)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the ratio is within the band; true without measurements."""
+        return self.degrees == 0 or self.low <= self.ratio <= self.high
 
 
 class _Encoders(NamedTuple):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Input monitor: check stamp, frame and values of the messages of a topic."""
+"""Input monitor: check stamp, frame and values of messages, and displacements."""
 
 from collections import Counter
 from collections.abc import Sequence
-from math import isfinite
+from math import exp, isfinite
 from operator import gt, sub
 from typing import Final, NamedTuple
 
@@ -18,8 +18,9 @@ DROPPED: Final = 'dropped'
 #: Changes above noise level after which a sensor is noisy, and identical readings are a fault.
 _LIVELY: Final = 10
 
-
 _ROUNDING: Final = 2  #: Stamps are rounded to nanoseconds [ns].
+
+_MEMORY: Final = 2.0  #: Time over which positions and velocities are compared [s].
 
 
 class Refusal(NamedTuple):
@@ -152,3 +153,53 @@ class InputMonitor:
             out_of_order=self.counts[DROPPED],
             rejected={kind: n for kind, n in self.counts.items() if kind not in counted},
         )
+
+
+class DisplacementMonitor:
+    """
+    Compare the displacement between two measurements with their velocities.
+
+    `jump` is the largest inconsistent displacement [m], at once or within the last seconds, and
+    `longest` the longest time between two measurements that can be compared [s].
+    """
+
+    def __init__(self, jump: float, longest: float) -> None:
+        self._jump, self._longest = jump, longest
+        self.forget()
+
+    def forget(self) -> None:
+        #: Time [s], insertion depth [m] and velocity [m/s] of the last measurement.
+        self._last: tuple[float, float, float] | None = None
+        #: Displacement unexplained by the velocities of the last seconds [m].
+        self._unexplained = 0.0
+
+    def gap(self, time: float) -> float:
+        """Return the time since the last measurement [s] if it is too long or negative; else 0."""
+        elapsed = time - self._last[0] if self._last is not None else 0.0
+        return 0.0 if 0.0 <= elapsed <= self._longest else elapsed
+
+    def fault(self, time: float, depth: float, velocity: float) -> str | None:
+        """Add a measurement; return why its displacement is inconsistent, or None."""
+        gap, before, self._last = self.gap(time), self._last, (time, depth, velocity)
+        if before is None or gap:
+            self._unexplained = 0.0
+            return None
+        last, old, earlier = before
+        elapsed, moved = time - last, depth - old
+        rest = moved - 0.5 * (earlier + velocity) * elapsed
+        if not abs(rest) <= self._jump:
+            # The position jumped; the next measurements may be consistent.
+            self._unexplained = 0.0
+            return (
+                f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at velocities of '
+                f'{earlier:.6g} and {velocity:.6g} m/s'
+            )
+        unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
+        # Clipped, so that the fault ends as soon as position and velocity agree again.
+        self._unexplained = min(max(unexplained, -self._jump), self._jump)
+        if abs(unexplained) > self._jump:
+            return (
+                f'insertion and its velocity contradict each other: {1e3 * abs(unexplained):.3g} '
+                f'mm too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
+            )
+        return None

@@ -5,7 +5,7 @@ from math import copysign, isnan
 from typing import Final, NamedTuple
 
 from needle_controller.controller import ControllerSettings
-from needle_controller.laws.axis import Axis
+from needle_controller.laws.law import Axis
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 

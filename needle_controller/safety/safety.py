@@ -1,24 +1,209 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs of a controller, the latched stop, and duplicate publishers."""
+"""Inputs of a controller, limits of measurements, the latched stop, duplicate publishers."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
+from math import hypot, isnan, nan
+from operator import le
 from typing import Final
 
-from needle_controller.controller import ControllerSettings
-from needle_controller.safety.guard import Guard
+from needle_controller.controller import ControllerSettings, Measurement
 from needle_controller.safety.input_monitor import InputMonitor
-from needle_controller.safety.limits import SafetyLimits
-from needle_dynamics import NeedleParameters
+from needle_dynamics import euler_loads, NeedleParameters
 from needle_ros.contract import BASE, ENTRY
+from needle_ros.settings import CheckedSettings, constant, flag, positive
 from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, RateCounter
+
+_IN_A_ROW: Final = 2  #: Readings in a row that violate a limit: one may be a sensor fault.
+
+#: By topic: quantity, unit and name of the limit of each reading.
+_READINGS: Final = {
+    'joint_states': (
+        ('insertion speed', 'm/s', 'speed'), ('angle', 'rad', 'angle'),
+        ('angular speed', 'rad/s', 'angular_speed'),
+    ),
+    'reference': (('tracking error', 'm', 'tracking_error'),),
+    'base_wrench': (
+        ('axial force', 'N', 'axial_load'), ('lateral force', 'N', 'lateral_load'),
+        ('moment', 'N m', 'moment_load'), ('torque about the needle', 'N m', 'torsion_load'),
+    ),
+    'tip_deflection': (
+        ('tip deflection', 'm', 'tip_deflection'),
+        ('distance of the tip from the depth range', 'm', 'tip_deflection'),
+    ),
+}  # fmt: skip
 
 _VITAL: Final = ('wrench_command', 'joint_states')  #: Topics that need exactly one publisher.
 _LATE: Final = 0.5  #: Fraction of messages out of order for a warning.
 _MIXED: Final = 0.9  #: Fraction of messages out of order for a stop.
 _FEW: Final = 10.0  #: Least rate for both [Hz].
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyLimits(CheckedSettings):
+    """
+    Limits of the measurements; beyond them the controller stops until ``~/clear_stop``.
+
+    The range of the paper's force sensor is 100 N and 5 N m. Friction keeps the needle of the
+    presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has almost no friction.
+    """
+
+    speed: float = positive(0.1, 'm/s', 'largest insertion speed, in both directions')
+    tracking_error: float = positive(
+        0.01, 'm', 'largest distance of the needle from the reference'
+    )
+    depth_tolerance: float = constant(
+        2e-3, 'm', 'allowed insertion depth beyond lowest_depth and highest_depth'
+    )
+    angular_speed: float = positive(
+        100.0, 'rad/s', 'largest angular speed of the base, in both directions'
+    )
+    angle: float = positive(1000.0, 'rad', 'largest angle of the base, in both directions')
+    tip_deflection: float = positive(
+        0.05,
+        'm',
+        'largest deflection of the tip in any direction, and distance of its depth '
+        'from the range of depths',
+    )
+    axial_load: float = positive(
+        30.0, 'N', 'largest axial force on the force sensor, in both directions'
+    )
+    lateral_load: float = positive(
+        10.0, 'N', 'largest lateral force on the force sensor, in any direction'
+    )
+    moment_load: float = positive(
+        1.0, 'N m', 'largest bending moment on the force sensor, in any direction'
+    )
+    torsion_load: float = positive(
+        1.0, 'N m', 'largest torque about the needle on the force sensor, in both directions'
+    )
+    tip_jump: float = positive(
+        0.02, 'm', 'change of tip_deflection between two samples that is a sensor fault'
+    )
+    lateral_jump: float = positive(
+        5.0, 'N', 'change of the lateral force between two samples that is a sensor fault'
+    )
+    moment_jump: float = positive(
+        0.5, 'N m', 'change of the moment between two samples that is a sensor fault'
+    )
+    sensor_timeout: float = positive(
+        1.0,
+        's',
+        'age at which base_wrench and tip_deflection are stale; time without a '
+        'reading, or without a change of a noisy reading, that is reported',
+        high=3600.0,
+    )
+    sensors_required: bool = flag(
+        False, 'stop when base_wrench or tip_deflection, which the observer expects, are stale; '
+        'else the observer continues without them',
+    )  # fmt: skip
+
+
+def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:
+    """Return a warning if a force [N] bends the part outside of the tissue, without a guide."""
+    most = euler_loads(parameters, max(depth, 0.0)).pinned
+    if force <= most:
+        return None
+    return (
+        f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the tissue: "
+        'without a guide it buckles; lower force_limit'
+    )
+
+
+def _measured(value: float) -> float:
+    return 0.0 if isnan(value) else value
+
+
+class Guard:
+    """
+    Compare measurements with the limits; two readings in a row beyond a limit violate it.
+
+    ``depths`` are the least and largest insertion depth to control [m]. Each check returns the
+    description of a violated limit, or None.
+    """
+
+    def __init__(self, limits: SafetyLimits, depths: tuple[float, float]) -> None:
+        #: Limits of `_READINGS`.
+        self._limits = {
+            'joint_states': (limits.speed, limits.angle, limits.angular_speed),
+            'reference': (limits.tracking_error,),
+            'base_wrench': (
+                limits.axial_load, limits.lateral_load, limits.moment_load, limits.torsion_load
+            ),
+            'tip_deflection': (limits.tip_deflection, limits.tip_deflection),
+        }  # fmt: skip
+        low, high = depths
+        self._depths = low - limits.depth_tolerance, high + limits.depth_tolerance
+        #: By topic: description of the limit, and readings in a row beyond it.
+        self._beyond: dict[str, tuple[str, int]] = {}
+
+    def _hold(self, topic: str, *values: float) -> str | None:
+        limits = self._limits[topic]
+        # Written so that NaN is beyond every limit.
+        if all(map(le, map(abs, values), limits)):
+            self._beyond.pop(topic, None)
+            return None
+        compared = zip(values, limits, _READINGS[topic], strict=True)
+        value, limit, (quantity, unit, name) = next(
+            one for one in compared if not abs(one[0]) <= one[1]
+        )
+        return self._count(
+            topic,
+            f'{quantity} {value:.6g} {unit} is beyond the limit of {limit:g} {unit} '
+            f'(safety.{name})',
+        )
+
+    def _count(self, topic: str, line: str) -> str | None:
+        count = self._beyond.get(topic, ('', 0))[1] + 1
+        self._beyond[topic] = line, count
+        return line if count >= _IN_A_ROW else None
+
+    def is_beyond(self, topic: str) -> bool:
+        """Return whether the last reading of a topic is beyond a limit, also a single reading."""
+        return topic in self._beyond
+
+    def encoders(self, measured: Measurement) -> str | None:
+        """Check insertion depth, angle and their velocities."""
+        low, high = self._depths
+        depth = measured.depth
+        if not low <= depth <= high:
+            return self._count(
+                'joint_states',
+                f'insertion depth {depth:.6g} m is outside [{low:g}, {high:g}] m '
+                '(lowest_depth, highest_depth, safety.depth_tolerance)',
+            )
+        return self._hold(
+            'joint_states', measured.velocity, measured.angle, measured.angular_velocity
+        )
+
+    def tracking(self, error: float) -> str | None:
+        """Check the distance from the reference [m]."""
+        return self._hold('reference', error)
+
+    def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
+        """Check force [N] and torque [N m] along x, y (needle) and z; NaN counts as zero."""
+        x, axial, z = map(_measured, force)
+        around_x, torsion, around_z = map(_measured, torque)
+        lateral, moment = hypot(x, z), hypot(around_x, around_z)
+        return self._hold('base_wrench', axial, lateral, moment, torsion)
+
+    def tip(self, deflection: float, depth: float = nan, lateral: float = 0.0) -> str | None:
+        """Check the position of the tip along z, y and x [m]; NaN if it is not measured."""
+        low, high = self._depths
+        outside = max(_measured(low - depth), _measured(depth - high), 0.0)
+        across = hypot(deflection, _measured(lateral))
+        return self._hold('tip_deflection', across, outside)
+
+    def forget(self, topic: str) -> None:
+        """Discard the last reading of a topic."""
+        self._beyond.pop(topic, None)
+
+    @property
+    def violated(self) -> str | None:
+        """Description of the last reading beyond a limit; None without one."""
+        return next((line for line, _ in self._beyond.values()), None)
 
 
 class FaultKind(Enum):

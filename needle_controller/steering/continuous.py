@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Continuous insertion: the needle moves without rest, and the guide follows its depth."""
 
-from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.guarded_law import GuardedLaw, TipMeasurements
 from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import BRAKING, LAGGING, MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.timing import NANOSECONDS
 import numpy as np

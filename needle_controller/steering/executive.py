@@ -21,12 +21,10 @@ from needle_controller.steering.insertion_record import PlannedInsertion, Record
 from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.motion_control import MotionControl
+from needle_controller.steering.motion_control import MotionControl, Retraction
 from needle_controller.steering.planner import describe_target, InsertionPlanner
 from needle_controller.steering.planning import Job, StartJob
-from needle_controller.steering.prior import SteeringPrior
-from needle_controller.steering.retraction import Retraction
-from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stepped insertion: guide and needle move in turn, with a measurement at rest after each step."""
 
-from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.guarded_law import GuardedLaw, TipMeasurements
 from needle_controller.steering.law import GuideSetpoint, SteeringFaultError
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl, STILL
 from needle_controller.steering.settings import ExecutiveSettings
-from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics.arrays import FloatArray
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.timing import NANOSECONDS

@@ -1,25 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of a steered insertion, from which a restarted executive resumes it."""
+"""Record of a steered insertion and its file, from which a restarted executive resumes it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+import json
+import os
+from pathlib import Path
+from threading import Lock
 from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.motion_control import LAGGING
+from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import FloatArray
-from needle_ros.errors import JobError, MessageError
+from needle_ros.errors import JobError, MessageError, ParameterError
+from needle_ros.files import write_whole
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import Authority
 import numpy as np
 
 _STEEPEST: Final = 0.5  #: Largest slope of the path of a tip.
 _SAME: Final = 1e-9  #: Tolerance of a computed setpoint [m, rad].
+
+_LONGEST: Final = 0.05  #: Longest time that a callback waits for the disk [s].
 
 
 class PlannedInsertion(NamedTuple):
@@ -149,3 +157,73 @@ class RecordKeeper:
             ended=ended,
             state=state,
         )
+
+
+class RecordFile:
+    """
+    The record of a node on a domain, and the source of its measurements.
+
+    The source identifies the process of the robot: with another one, the needle may be another.
+    Threads read and write, so that a disk without a response delays a callback by 0.05 s at most.
+    """
+
+    def __init__(self, node: str, domain: int) -> None:
+        home = Path(os.environ.get('ROS_HOME') or Path.home() / '.ros')
+        name = node.strip('/').replace('/', '.')
+        self._path = home / 'needle_insertion' / f'{name}.{domain}.json'
+        self._lock = Lock()
+        #: Newest content that the thread has not begun to write, and the thread while it writes.
+        self._next: bytes | None = None
+        self._writer: ThreadJob[None] | None = None
+
+    def write(self, record: str, source: str) -> None:
+        """
+        Replace the file, or raise `ParameterError`.
+
+        A file that is not replaced within 0.05 s is an error, too; its thread continues.
+        """
+        with self._lock:
+            self._next = json.dumps({'source': source, 'record': record}).encode()
+            if self._writer is None:
+                self._writer = ThreadJob(self._write)
+            writer = self._writer
+        if not writer.wait(_LONGEST):
+            raise ParameterError(f'{self._path} is not written within {_LONGEST:g} s')
+        writer.result()
+
+    def _write(self, _progress: Any) -> None:
+        """Write the newest content until there is none; raise the error of the last one."""
+        failed: ParameterError | None = None
+        while True:
+            with self._lock:
+                content, self._next = self._next, None
+                if content is None:
+                    self._writer = None
+                    break
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(self._path, content)
+                failed = None
+            except OSError as error:
+                failed = ParameterError(f'{self._path} cannot be written: {error.strerror}')
+            except ParameterError as error:
+                failed = error
+        if failed is not None:
+            raise failed
+
+    def read(self) -> tuple[SteeringRecord, str] | None:
+        """Return the record and its source; None without a file, `MessageError` if invalid."""
+        reader = ThreadJob(self._read)
+        if not reader.wait(_LONGEST):
+            raise MessageError(f'{self._path} is not read within {_LONGEST:g} s')
+        return reader.result()
+
+    def _read(self, _progress: Any) -> tuple[SteeringRecord, str] | None:
+        try:
+            content = json.loads(self._path.read_bytes())
+            record = SteeringRecord.from_values(json.loads(content['record']))
+            return record, str(content['source'])
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise MessageError(f'{self._path} cannot be read: {error}') from error

@@ -10,9 +10,8 @@ from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion_record import PlannedInsertion, SteeringRecord
 from needle_controller.steering.law import build_law, SteeringLaw
 from needle_controller.steering.planning import Job, Progress, StartJob
-from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import ExecutiveSettings
+from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters

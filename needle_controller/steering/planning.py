@@ -6,7 +6,7 @@ from threading import Thread
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from needle_ros.errors import JobError
-from needle_ros.realtime import leave_realtime
+from needle_ros.process import leave_realtime
 
 _Result = TypeVar('_Result')
 

@@ -33,7 +33,7 @@ from math import ceil
 from typing import Final
 
 from needle_controller.compiled.hypotheses import HypothesisResponses, StatePrior
-from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.cutting_needle import Steered
 from needle_dynamics.compiled.superposition import insert_causes

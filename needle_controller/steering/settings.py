@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps, tip measurements and limits of a steered insertion, as parameters."""
+"""Settings of steering, as parameters: prior uncertainty, limits, steps of an insertion."""
 
 from dataclasses import dataclass, fields
-from math import sqrt
+from math import inf, sqrt
 from typing import Final
 
-from needle_controller.steering.limits import SteeringLimits
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
-from needle_ros.settings import constant, flag
+from needle_ros.settings import check_constants, CheckedSettings, constant, flag, same_field
 from needle_ros.system_state import RETRACT_DEPTH
 import numpy as np
 
@@ -17,6 +17,73 @@ _PER_STEP: Final = 4.0  #: Least number of guide commands within a step.
 
 #: Joints that are moved; roll only if turns are allowed.
 JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringLimits:
+    """
+    Length of the steps, and limits of the guide setpoints of a steering law.
+
+    The defaults are for a robot: a force on tissue and a motion without a limit are never implied.
+    """
+
+    step_length: float = constant(
+        5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
+    )
+    guide_limit: float = constant(
+        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
+    )
+    guide_step: float = constant(
+        2e-3, 'm', 'largest change of the guide from one step to the next along x and along z',
+        open_low=True, unlimited=True,
+    )  # fmt: skip
+    load_limit: float = constant(
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; the '
+        'reachable set is computed without it',
+        open_low=True, unlimited=True,
+    )  # fmt: skip
+    turns: int = constant(0, '1', 'allowed number of turns of the needle', whole=True)
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        object.__setattr__(self, 'turns', int(self.turns))
+
+
+#: Default limits of simulations; these two differ from the node: a simulated guide has time for
+#: any motion between two steps, and its force harms no tissue.
+SIMULATION_LIMITS: Final = SteeringLimits(guide_step=inf, load_limit=inf)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringPrior(CheckedSettings):
+    """Prior uncertainty of needle, tissue, guide, path and sensor."""
+
+    spread: float = constant(
+        0.3, '1', 'relative uncertainty of the bending length; 0: bending length and skin known',
+        high=0.9,
+    )  # fmt: skip
+    skin: float = constant(
+        0.06, 'm',
+        'largest stiffness of the skin relative to that of the tissue; 0: the nominal one',
+    )  # fmt: skip
+    tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
+    frame: float = constant(
+        0.06, 'rad', 'standard deviation of the rotation between the frames of guide and sensor'
+    )
+    bevel: float = constant(0.3, 'N', 'standard deviation of the lateral load of the bevel')
+    offset: float = constant(1e-3, 'm', 'standard deviation of the origin of the sensor')
+    path_noise: float = constant(
+        1e-4, 'rad^2/m', 'least growth of the variance of the path direction per length; up to '
+        '100 times as much is considered', open_low=True,
+    )  # fmt: skip
+    path_noise_length: float = same_field(SteeringParameters, 'path_noise_length')
+    noise: float = constant(
+        4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
+    )
+    drift: float = constant(
+        5e-4, 'm', 'standard deviation of a slow error of the tip sensor; 0, one and three times '
+        'as much is considered',
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,10 +10,10 @@ from time import perf_counter
 from typing import NamedTuple
 
 from needle_controller.steering.law import GuideSetpoint, SteeringLaw
-from needle_controller.steering.prior import SteeringPrior
+from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.simulated.tip_errors import TipErrorParameters, TipErrors
+from needle_dynamics.simulated.tip_sensor import TipErrorParameters, TipErrors
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_ros.settings import constant

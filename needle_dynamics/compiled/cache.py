@@ -88,7 +88,7 @@ class _Compiled:
     @property
     def is_kept(self) -> bool:
         """Whether the machine code for the annotated types is on disk."""
-        from needle_dynamics.compiled.signatures import argument_types
+        from needle_dynamics.compiled.boxed import argument_types
         from numba.core.registry import cpu_target
 
         target = cpu_target.target_context
@@ -96,8 +96,7 @@ class _Compiled:
 
     def prepare(self) -> None:
         """Load or compile the function for the annotated types."""
-        from needle_dynamics.compiled.boxed import prepare_box
-        from needle_dynamics.compiled.signatures import argument_types
+        from needle_dynamics.compiled.boxed import argument_types, prepare_box
 
         found = argument_types(self.py_func)
         for one in found:

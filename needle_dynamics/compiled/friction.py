@@ -8,12 +8,11 @@ branch there; simulation, linearization and inverse dynamics use it. A new const
 of a law of a user (`needle_dynamics.friction.add_friction_law`) is the address of its function.
 """
 
-from math import exp, inf, log1p, sqrt, tanh
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from math import exp, expm1, inf, log1p, sqrt, tanh
+from typing import Any, cast, Final, NamedTuple
 
 from needle_dynamics.compiled.cache import compiled, inlined_kernel, kernel
-from needle_dynamics.compiled.oscillator import glide
-from needle_dynamics.compiled.own_law import own_level
 
 #: Names of the laws; the index is the number of the law.
 FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
@@ -24,6 +23,40 @@ COULOMB, STRIBECK, TANH = range(3)
 #: Coulomb friction under a smooth law.
 _CHANGE, _SMOOTH_CHANGE = 1e-3, 1e-2
 _SHORTEST: Final = 2e-3  #: shortest part that is divided, over the step
+
+
+class _Call:
+    """Call of a C function, for compiled functions; Numba is imported at the first compilation."""
+
+    _type: Any = None
+
+    @property
+    def _numba_type_(self) -> Any:
+        self._type = self._type or _call_type()
+        return self._type
+
+
+def _call_type() -> Any:
+    from numba import types
+    from numba.core.cgutils import ir
+    from numba.core.registry import cpu_target
+    from numba.extending import intrinsic
+
+    def call(_context: Any, _address: Any, _coulomb: Any, _speed: Any) -> Any:
+        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            number = ir.DoubleType()
+            law = ir.FunctionType(number, [number, number]).as_pointer()
+            return builder.call(builder.inttoptr(arguments[0], law), arguments[1:])
+
+        return types.float64(types.int64, types.float64, types.float64), generate
+
+    made = intrinsic(call)
+    cpu_target.typing_context.refresh()
+    return cpu_target.typing_context.resolve_value_type(made)
+
+
+#: Dry friction [N] of the law at an address, from Coulomb friction [N] and speed [m/s].
+own_level: Final = cast(Callable[[int, float, float], float], _Call())
 
 
 class FrictionConstants(NamedTuple):
@@ -80,6 +113,26 @@ def friction_force(f: FrictionConstants, velocity: float, drive: float) -> float
     if velocity > 0.0:
         return dry + f.viscous * velocity
     return f.withdrawal * (f.viscous * velocity - dry)
+
+
+@kernel
+def decay_means(x: float) -> tuple[float, float]:
+    """Return two means of exp(-x r) for x >= 0, without cancellation at small x."""
+    # The mean over r in [0, 1], (1 - exp(-x)) / x, and the integral over r in [0, 1] of the mean
+    # over [0, r] times r, (x - 1 + exp(-x)) / x^2.
+    if x < 1e-4:
+        # Taylor: the next terms are below 1e-13.
+        return 1.0 - x * (0.5 - x / 6.0), 0.5 - x * (1.0 / 6.0 - x / 24.0)
+    mean = -expm1(-x) / x
+    return mean, (1.0 - mean) / x
+
+
+@compiled
+def glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
+    """Solve u_dot = a - b u for a time t [s], exactly; return velocity and displacement."""
+    x = b * t
+    mean, ramp = decay_means(x)
+    return u * (1.0 - x * mean) + a * t * mean, t * (u * mean + a * t * ramp)
 
 
 @compiled

@@ -118,7 +118,7 @@ def _sine_cosine(x: float) -> tuple[float, float]:
 
 @inlined
 def _decay_means(x: float) -> tuple[float, float]:
-    """Return `oscillator.decay_means` without branches: series of x / 32, doubled five times."""
+    """Return `friction.decay_means` without branches: series of x / 32, doubled five times."""
     z = -min(x, _DECAYED) / 32.0
     ramp = _F14 + z * (_F15 + z * (_F16 + z * (_F17 + z * (_F18 + z * _F19))))
     ramp = _F8 + z * (_F9 + z * (_F10 + z * (_F11 + z * (_F12 + z * (_F13 + z * ramp)))))

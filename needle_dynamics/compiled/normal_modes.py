@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Normal modes of the inserted part at a frozen depth.
+Normal modes of the inserted part at a frozen depth, and their motion.
 
 In their coordinates a, with q = N a, the modal mass is the identity and the stiffness is diagonal:
 N^T rho A G N = 1 and N^T (E I_y H + k_a G) N = omega^2.
 """
 
+from math import cos, exp, expm1, sin, sqrt
 from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray, Matrix, Vector
@@ -81,6 +82,26 @@ def normal_modes(
     for k in range(n):
         backward(factor, modes.shapes[:, k])
     copy(stiffness, modes.inverse)
+
+
+@compiled
+def swing(damping: float, square: float, t: float) -> tuple[float, float, float, float]:
+    """Solve x_ddot + damping x_dot + square x = 0 for a time t [s], exactly."""
+    # Returns pp, pv [s], vp [1/s], vv: after t, x is pp x + pv v, and v is vp x + vv v.
+    half = 0.5 * damping
+    apart = square - half * half
+    if apart >= 0.0:
+        w = sqrt(apart)
+        fall = exp(-half * t)
+        pv = fall * (sin(w * t) / w if w > 0.0 else t)
+        pp = fall * cos(w * t) + half * pv
+        return pp, pv, -square * pv, pp - damping * pv
+    # Two real poles, the slow pole in a form without cancellation.
+    r = sqrt(-apart)
+    fast = -(half + r)
+    slow = square / fast
+    pv = exp(slow * t) * -expm1(-2.0 * r * t) / (2.0 * r)
+    return exp(slow * t) - slow * pv, pv, -square * pv, exp(slow * t) + fast * pv
 
 
 @kernel

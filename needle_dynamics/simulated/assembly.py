@@ -11,19 +11,25 @@ from needle_dynamics.model import NeedleModel
 from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.commands import JointCommands
 from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.integrator import Integrator
-from needle_dynamics.simulated.joint_commands import JointCommands
-from needle_dynamics.simulated.measured import SimulatedPlant
-from needle_dynamics.simulated.plant import Plant
+from needle_dynamics.simulated.plant import Plant, SimulatedPlant
 from needle_dynamics.simulated.steered import GuideParameters, SteeredPlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_dynamics.steering.insertion import Insertion
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.sample_clock import SampleClock
-from needle_ros.settings import check_choice, check_constants, constant, from_values, positive
+from needle_ros.settings import (
+    check_choice,
+    check_constants,
+    check_whole,
+    constant,
+    from_values,
+    positive,
+)
 
 #: Modes: needle under force commands, needle moved by a robot, indenter.
 MODES: Final = ('simulation', 'robot', 'indenter')
@@ -116,8 +122,7 @@ class PlantConstants:
             given = {**asdict(defaults_of(prefix, needle)), **given}
             made[prefix.rstrip('.') or 'own'] = from_values(type(defaults), given, prefix)
         seed = values.get('seed', 1)
-        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= LARGEST_SEED:
-            raise ParameterError(f'seed must be an integer from 0 to 2^62, got {seed!r}')
+        check_whole('seed', seed, 0, LARGEST_SEED)
         steered = values.get('steered', False)
         if not isinstance(steered, bool):
             raise ParameterError(f'steered must be true or false, got {steered!r}')

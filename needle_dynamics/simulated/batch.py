@@ -12,10 +12,10 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
+from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, floats, refined
 from needle_ros.errors import ParameterError, ShapeError

@@ -9,7 +9,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.force_sensor import sense, straight
 from needle_ros.errors import JobError, ParameterError, ShapeError
-from needle_ros.settings import check_constants, constant, positive
+from needle_ros.settings import check_constants, check_whole, constant, positive
 import numpy as np
 
 MOST_FILTERS: Final = 6  #: number of filters of the sensor, in cascade
@@ -80,15 +80,7 @@ class ForceSensorParameters:
                 raise ParameterError(
                     f'{item.name} must be one number or three, x y z, got {list(value)}'
                 )
-        chosen = self.filter
-        if (
-            isinstance(chosen, bool)
-            or not isinstance(chosen, int)
-            or not (0 <= chosen <= MOST_FILTERS)
-        ):
-            raise ParameterError(
-                f'filter must be an integer from 0 (none) to {MOST_FILTERS}, got {chosen!r}'
-            )
+        check_whole('filter', self.filter, 0, MOST_FILTERS)
 
     @property
     def cutoffs(self) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.measured import AT_REST, Measurement, SimulatedPlant
+from needle_dynamics.simulated.plant import AT_REST, Measurement, SimulatedPlant
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, positive

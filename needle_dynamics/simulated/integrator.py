@@ -19,6 +19,7 @@ from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
+from needle_ros.settings import is_number
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -181,8 +182,6 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
 
 def checked_step(step: float) -> float:
     """Check a longest step [s] and return it as a float."""
-    if isinstance(step, bool) or not isinstance(step, (int, float)):
-        raise ParameterError(f'step must be a number, got {step!r}')
-    if not SHORTEST_STEP <= step < inf:
+    if not is_number(step) or step < SHORTEST_STEP:
         raise ParameterError(f'step must be finite and >= {SHORTEST_STEP:g} s, got {step!r} s')
     return float(step)

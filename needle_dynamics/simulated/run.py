@@ -3,18 +3,17 @@
 Run of a simulated plant: samples and events, shared by the node and the replay.
 
 An `Event` is an input other than a command. It takes effect from the next sample on, and a replay
-performs it again.
+performs it again. `Executions` are the paths under way, which a pause holds.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import nan
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
-from needle_dynamics.simulated.commands import AppliedForces, Commands
+from needle_dynamics.simulated.commands import AppliedForces, Commands, moved_joints
 from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
-from needle_dynamics.simulated.joint_commands import moved_joints
-from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
+from needle_dynamics.simulated.plant import Measurement, SimulatedPlant
 from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
 from needle_ros.errors import ParameterError
 from needle_ros.system_state import Mode, RETRACT_DEPTH
@@ -252,3 +251,65 @@ def follow(path: JointPath, moved: Sequence[str], plant_run: PlantRun, elapsed: 
     joints, times, positions, _, efforts = path.after(elapsed)
     content = {'joints': joints, 'times': times, 'positions': positions, 'efforts': efforts}
     plant_run.perform(Event(TRAJECTORY, content))
+
+
+class _Execution(NamedTuple):
+    """Path that some of its joints follow, and its start [ns]."""
+
+    path: JointPath
+    joints: frozenset[str]
+    begun: int
+
+
+class Executions:
+    """
+    Paths under way of the joints ``moved``; a pause holds the rest of each.
+
+    `sampled` is the stamp of the newest sample [ns], 0 before the first.
+    """
+
+    def __init__(self, plant_run: PlantRun, moved: Collection[str]) -> None:
+        self._run, self._moved = plant_run, moved
+        self.sampled = 0
+        self.period = round(NANOSECONDS / plant_run.constants.own.rate)
+        self._running: list[_Execution] = []
+        self._held: list[_Execution] = []
+        self._paused: int | None = None  #: start of the pause [ns]
+
+    @property
+    def paused(self) -> bool:
+        return self._paused is not None
+
+    @property
+    def joints_held(self) -> set[str]:
+        return {name for one in self._held for name in one.joints}
+
+    def follow(self, path: JointPath, joints: Collection[str], elapsed: float) -> None:
+        """Follow a path with some joints, at a time after its start [s]."""
+        follow(path, tuple(joints), self._run, elapsed)
+        self.forget(joints)
+        begun = self.sampled - round(elapsed * NANOSECONDS)
+        self._running.append(_Execution(path, frozenset(joints), begun))
+
+    def forget(self, joints: Collection[str]) -> None:
+        """Discard the paths of joints that something else moves."""
+        for paths in (self._running, self._held):
+            kept = [one._replace(joints=one.joints - {*joints}) for one in paths]
+            paths[:] = [one for one in kept if one.joints]
+
+    def pause(self, *, withdraws: bool = False) -> None:
+        """Hold the joints that move, or all if the plant withdraws; begin no motion."""
+        self._paused, end = self.sampled, self.sampled + self.period
+        self._held = [one for one in self._running if one.path.end(one.begun) > end]
+        self._running, joints = [], self.joints_held
+        # At rest nothing changes: an indenter keeps its force.
+        if joints or withdraws:
+            self._run.hold([name for name in self._moved if name in joints or withdraws])
+
+    def resume(self) -> None:
+        """End a pause: follow the rest of the paths that it holds."""
+        begun, held = self._paused, self._held
+        self._paused, self._held = None, []
+        for one in held:
+            path = one.path.only(one.joints)
+            self.follow(path, path.joints, ((begun or 0) - one.begun) / NANOSECONDS)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid, PUSHES
+from needle_dynamics.simulated.commands import GUIDE_JOINTS
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.joint_commands import GUIDE_JOINTS
-from needle_dynamics.simulated.measured import AT_REST, MeasuredShape, Measurement, NeedlePlant
+from needle_dynamics.simulated.plant import AT_REST, MeasuredShape, Measurement, NeedlePlant
 from needle_dynamics.simulated.tip_sensor import TipSensor
 from needle_dynamics.steering.insertion import Insertion
 from needle_ros.contract import (

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cut import insert, NO_FORCES
+from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.progress import Progress, progress_of
 from needle_dynamics.simulated.batch import number_of_runs, thread_count
 from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering

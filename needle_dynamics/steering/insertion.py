@@ -13,6 +13,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import Placement, SteeredNeedle
 from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
+from needle_ros.settings import is_number
 import numpy as np
 
 DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
@@ -93,7 +94,7 @@ class Insertion(Displayed):
         step: float = DEFAULT_AXIS_STEP,
         seed: int = 0,
     ) -> None:
-        if isinstance(step, bool) or not isinstance(step, (int, float)) or not 0.0 < step < inf:
+        if not is_number(step) or step <= 0.0:
             raise ParameterError(f'step must be positive and finite, got {step!r} s')
         #: Lateral model of the needle.
         self.needle = SteeredNeedle(needle, steering, seed=seed)

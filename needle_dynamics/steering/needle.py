@@ -33,6 +33,7 @@ from needle_dynamics.steering.parameters import (
     turning_load,
 )
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import is_number
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -353,7 +354,7 @@ class SteeredNeedle(Displayed):
 
 
 def _finite(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not isfinite(value):
+    if not is_number(value):
         raise ParameterError(f'{name} must be a finite number, got {value!r}')
     return float(value)
 

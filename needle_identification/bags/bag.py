@@ -1,22 +1,106 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read topics and messages of bags, also of incomplete or damaged bags."""
+"""Read topics, messages and columns of bags, also of incomplete or damaged bags."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from heapq import heappop, heappush
 from pathlib import Path
+import re
 import sqlite3
 from typing import Any, Final, NamedTuple
 
-from needle_identification.bags.batch import MessageBatch, Tally
-from needle_identification.bags.compression import Budget
-from needle_identification.bags.files import files_of, form_of
+from needle_dynamics.display import Displayed
+from needle_identification.bags.compression import Budget, COMPRESSED
 from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
 from needle_identification.bags.sqlite_file import sqlite_batches
-from needle_identification.bags.topics import BagTopic
+from needle_identification.bags.topics import BagTopic, MessageBatch, Tally
 from needle_identification.errors import RecordingError
+from needle_ros.errors import printable
+from needle_ros.files import DocumentError, LARGEST, read_document
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+from numpy.typing import NDArray
+
+METADATA: Final = 'metadata.yaml'  #: lists the other files, written at the end
+LOST: Final = 'messages lost'  #: key of the metadata for the messages that the recorder lost
+
+_FORMS: Final = ('.mcap', '.db3', '.bag')
+
+_VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1'
 
 _WINDOW: Final = 2**22  # size of the buffer for sorting messages by receive time [bytes]
+
+_MOST: Final = 64  #: largest number of elements of a sequence that are columns of their own
+_LABELS: Final = ('name', 'names', 'joint_names')  # names of elements of other fields
+
+
+def form_of(file: Path) -> str:
+    """Return the storage format by file name: ``.mcap``, ``.db3``, ``.bag`` (ROS 1), or ''."""
+    suffix = _uncompressed(file).suffix
+    return suffix if suffix in _FORMS else ''
+
+
+def _uncompressed(file: Path) -> Path:
+    return file.with_suffix('') if file.suffix in COMPRESSED else file
+
+
+def files_of(path: Path) -> tuple[list[Path], list[str]]:
+    """List the files of a bag in the order of recording, and its missing or foreign files."""
+    if not path.exists():
+        raise RecordingError(f'{path} does not exist; {_VALID}')
+    if path.is_file():
+        if not form_of(path):
+            raise RecordingError(f'{path} is not a recording; {_VALID}')
+        return [path], []
+    # Sort part_10 after part_9.
+    inside = path.iterdir() if path.is_dir() else ()
+    found = sorted(filter(Path.is_file, inside), key=lambda file: [len(file.name), file.name])
+    by_form = {form: [file for file in found if form_of(file) == form] for form in _FORMS}
+    chosen = next(filter(None, by_form.values()), [])
+    if not chosen:
+        other = min(path.glob(f'*/{METADATA}'), default=None)
+        hint = _VALID if other is None else f'name those inside, such as {other.parent}'
+        raise RecordingError(f'{path} holds no recording; {hint}')
+    names, losses = None, [f'no readable {METADATA}: the recording was not closed']
+    try:
+        names, lost = _metadata(path)
+    except DocumentError as error:
+        losses = [f'{METADATA} {error}']
+    except (OSError, UnicodeDecodeError, KeyError, TypeError):
+        # Missing, or of an unknown structure.
+        pass
+    if names is None:
+        # The parts of one recording differ only in a number at the end of the name.
+        if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
+            raise RecordingError(
+                f'{path} holds several recordings; name them, such as {chosen[0]}; {losses[0]}'
+            )
+        return chosen, losses
+    there = {file.name for file in chosen}
+    losses = [f'the recorder lost {lost}'] if lost else []
+    losses += [f'{name} is missing' for name in names if name not in there]
+    if there.isdisjoint(names):
+        return chosen, losses
+    losses += [
+        f'{file.name} is not part of the recording by {METADATA}, left out'
+        for file in chosen
+        if file.name not in names
+    ]
+    return [path / name for name in names if name in there], losses
+
+
+def _metadata(folder: Path) -> tuple[list[str], str]:
+    """Return the files listed in the metadata of a bag, and its lost messages."""
+    with (folder / METADATA).open(encoding='utf-8') as stream:
+        document = read_document(stream.read(LARGEST + 1))
+    information = document['rosbag2_bagfile_information']
+    paths = information['relative_file_paths']
+    if not isinstance(paths, list):
+        raise TypeError('relative_file_paths is not a list')
+    own = information.get('custom_data') or {}
+    lost = printable(str(own.get(LOST, ''))) if isinstance(own, dict) else ''
+    return list(dict.fromkeys(Path(str(name)).name for name in paths)), lost
 
 
 def _ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
@@ -174,3 +258,100 @@ def read_topic(path: Path | str, topic: str) -> list[tuple[int, Any]]:
     except RecordingError as error:
         raise RecordingError(f'{path}: message {len(messages)} of {topic} {error}') from error
     return messages
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TopicTable(Displayed):
+    """Messages of a topic by field; ``table[name]`` is a column."""
+
+    topic: str  #: full name
+    #: Fields, shape (n,) each: ``time [s]`` since the first message, by the header if it has a
+    #: stamp, and receive time; then the fields, such as ``wrench.force.y``.
+    values: Mapping[str, NDArray[Any]]
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        try:
+            return self.values[name]
+        except KeyError:
+            raise KeyError(f'{name!r}; valid: {", ".join(self.values)}') from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
+
+    def __repr__(self) -> str:
+        time = self.values['time [s]']
+        return f'<TopicTable {self.topic}: {len(time)} messages in {time[-1] - time[0]:.4g} s>'
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return dict(self.values)
+
+
+def read_bag(path: Path | str, topic: str) -> TopicTable:
+    """
+    Read one topic of a bag as arrays, of any message type that ROS 2 Jazzy or the bag defines.
+
+    Elements of sequences are columns, such as ``data[0]``, and ``position.insertion`` if the
+    message names them. A missing number is NaN. Sequences with more than 64 elements, such as
+    images, are arrays in one column.
+
+    Parameters
+    ----------
+    path : Path or str
+        As in `Bag`.
+    topic : str
+        Name, with or without the first slash.
+
+    Returns
+    -------
+    TopicTable
+        Columns, with `to_dataframe` and `plot`.
+
+    Examples
+    --------
+    >>> table = read_bag('bags/friction_01', '/joint_states')
+    >>> table['position.insertion'].shape == table['time [s]'].shape
+    True
+
+    """
+    name = f'/{topic.removeprefix("/")}'
+    messages = read_topic(path, name)
+    received = np.array([time for time, _ in messages], dtype=np.int64)
+    rows = [dict(_leaves('', message)) for _, message in messages]
+    names = dict.fromkeys(key for row in rows for key in row)
+    found = {key: _column([row.get(key) for row in rows]) for key in names}
+    stamps = found.get('header.stamp', received)
+    if not stamps.any():
+        # The driver does not stamp. Simulated time begins at zero.
+        stamps = received
+    time = (stamps - stamps[:1]) / NANOSECONDS
+    return TopicTable(name, {'time [s]': time, 'received [ns]': received, **found})
+
+
+def _leaves(name: str, value: Any, labels: Sequence[str] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the numbers and texts in a message, with their names; times in ns."""
+    if is_dataclass(value):
+        parts = {p.name: getattr(value, p.name) for p in fields(value) if p.name != '__msgtype__'}
+        if [*parts] == ['sec', 'nanosec']:
+            yield name, parts['sec'] * NANOSECONDS + parts['nanosec']
+            return
+        found = next((part for part in _LABELS if isinstance(parts.get(part), list)), '')
+        for part, inner in parts.items():
+            whole = f'{name}.{part}' if name else part
+            yield from _leaves(whole, inner, parts.get(found, ()))
+    elif isinstance(value, (list, np.ndarray)) and len(value) <= _MOST:
+        named = labels if len(labels) == len(value) else ()
+        for k, one in enumerate(value):
+            yield from _leaves(f'{name}.{named[k]}' if named else f'{name}[{k}]', one)
+    else:
+        yield name, value
+
+
+def _column(values: list[Any]) -> NDArray[Any]:
+    """Return values of one field as an array; NaN for a missing number."""
+    known = [one for one in values if one is not None]
+    if all(isinstance(one, (bool, int, float, np.number)) for one in known):
+        complete = len(known) == len(values)
+        return np.array(values if complete else [np.nan if v is None else v for v in values])
+    result = np.empty(len(values), dtype=object)
+    result[:] = values
+    return result

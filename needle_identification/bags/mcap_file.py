@@ -16,8 +16,14 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 from needle_identification.bags import compression
-from needle_identification.bags.batch import LARGEST_BATCH, LATEST, MessageBatch, Tally
-from needle_identification.bags.topics import BagTopic, make_topic
+from needle_identification.bags.topics import (
+    BagTopic,
+    LARGEST_BATCH,
+    LATEST,
+    make_topic,
+    MessageBatch,
+    Tally,
+)
 from needle_identification.errors import RecordingError
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view

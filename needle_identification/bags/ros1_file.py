@@ -9,9 +9,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
 from needle_identification.bags.compression import Budget, DAMAGED, decompress
-from needle_identification.bags.topics import make_topic
+from needle_identification.bags.topics import (
+    grouped,
+    LARGEST_BATCH,
+    make_topic,
+    MessageBatch,
+    Tally,
+)
 from needle_identification.errors import RecordingError
 from rosbags.convert.converter import generate_message_converter
 from rosbags.rosbag1 import Reader, ReaderError

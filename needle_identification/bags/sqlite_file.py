@@ -11,9 +11,15 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 from urllib.parse import quote
 
-from needle_identification.bags.batch import grouped, LARGEST_BATCH, MessageBatch, Tally
 from needle_identification.bags.compression import BLOCK, COMPRESSED, factor, open_file, read_up_to
-from needle_identification.bags.topics import BagTopic, make_topic
+from needle_identification.bags.topics import (
+    BagTopic,
+    grouped,
+    LARGEST_BATCH,
+    make_topic,
+    MessageBatch,
+    Tally,
+)
 from needle_identification.errors import RecordingError
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')

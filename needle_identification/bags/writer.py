@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
-from needle_identification.bags.files import LOST, METADATA
+from needle_identification.bags.bag import LOST, METADATA
 from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.errors import RecordingError

@@ -1,15 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter estimates from one recording, and their mean over several recordings."""
+"""Parameter estimates from one recording, their mean over several, their text and display."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, nan, sqrt
-from typing import TypeVar
+from math import floor, inf, isfinite, log10, nan, sqrt
+from typing import Any, Final, TYPE_CHECKING, TypeAlias, TypeVar
 
+from needle_dynamics.display import Displayed, new_figure
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.formatting import measured
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
+
+if TYPE_CHECKING:
+    # Take half a second to import.
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+UNKNOWN: Final = 'not determined by the data'  #: text for a parameter
+_SMALLEST_ERROR: Final = 1e-9  # smallest error that limits the digits
+_MOST: Final = 6  # largest number of parameters in a line of text
+
+
+def measured(value: float, error: float, unit: str = '') -> str:
+    """Format a value with its error, such as ``0.56043 ± 0.00051 N``; else `UNKNOWN`."""
+    if not isfinite(value):
+        return UNKNOWN
+    form = _format(error)
+    text = f' ± {error:{form if form.endswith("f") else ".2g"}}' if isfinite(error) else ''
+    return f'{value:{form}}{text}{suffix(unit)}'
+
+
+def rounded(value: float, error: float, unit: str = '') -> str:
+    """Format a value without its error, rounded to significant digits; or `UNKNOWN`."""
+    return f'{value:{_format(error)}}{suffix(unit)}' if isfinite(value) else UNKNOWN
+
+
+def spread(deviation: float) -> str:
+    """Format a standard deviation with three digits; `UNKNOWN` if not finite."""
+    return rounded(deviation, 0.1 * deviation)
+
+
+def between(interval: tuple[float, float]) -> str:
+    """Format an interval, such as ``0.559 to 0.562``; `UNKNOWN` if not finite."""
+    low, high = interval
+    if not (isfinite(low) and isfinite(high)):
+        return UNKNOWN
+    form = _format((high - low) / 4.0)
+    return f'{low:{form}} to {high:{form}}'
+
+
+def _format(error: float) -> str:
+    if not _SMALLEST_ERROR < error < inf:
+        return '.6g'
+    return f'.{max(1 - floor(log10(error)), 0)}f'
+
+
+def suffix(unit: str) -> str:
+    """Return a unit for the end of a number; none of a pure number."""
+    return '' if unit in ('', '1') else f' {unit}'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -92,11 +143,72 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     values = np.array([parameter.value for parameter in known])
     deviation = float(values.std(ddof=1)) if count > 1 else None
     within = float(np.mean([parameter.error**2 for parameter in known]))
-    between = (deviation or 0.0) ** 2
-    error = sqrt(max(within, between) / count)
-    half_width = error * (float(stdtrit(count - 1, 0.975)) if between > within else 2.0)
+    beyond = (deviation or 0.0) ** 2
+    error = sqrt(max(within, beyond) / count)
+    half_width = error * (float(stdtrit(count - 1, 0.975)) if beyond > within else 2.0)
     mean = float(values.mean())
     ends = mean - half_width, mean + half_width
     return replace(
         unknown, mean=mean, deviation=deviation, error=error, interval=ends, count=count
     )
+
+
+#: Estimates with what each is for: a recording, a force level or a medium.
+EstimateRows: TypeAlias = Iterable[tuple[str, ParameterEstimate | Statistic]]
+
+
+class DisplayedEstimate(Displayed):
+    """Estimate that displays its parameters; a subclass defines `rows`."""
+
+    __slots__ = ()
+
+    def rows(self) -> EstimateRows:
+        """Return the parameters, each with its recording, force level or medium."""
+        raise NotImplementedError
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        heads = 'of', 'parameter', 'unit', 'value', 'standard error', 'low', 'high'
+        rows = [
+            (of, one.name, one.unit, _value(one), one.error, *one.interval)
+            for of, one in self.rows()
+        ]
+        return {head: np.array([row[k] for row in rows]) for k, head in enumerate(heads)}
+
+    def __repr__(self) -> str:
+        rows = list(self.rows())
+        single = len({of for of, _ in rows}) == 1
+        found = [
+            f'{one.symbol if single else f"{one.symbol} ({of})"} = '
+            f'{measured(_value(one), one.error, one.unit)}'
+            for of, one in rows[:_MOST]
+        ]
+        more = [f'{len(rows) - _MOST} more'] if len(rows) > _MOST else []
+        of = f' of {rows[0][0]}' if single else ''
+        return f'<{type(self).__name__}{of}: {", ".join(found + more)}>'
+
+    def plot(self, figure: Figure | None = None) -> list[Axes]:
+        """Draw each determined parameter with its 95 % interval; return the axes of each."""
+        panels: dict[str, list[tuple[str, ParameterEstimate | Statistic]]] = {}
+        for of, one in self.rows():
+            if np.isfinite(_value(one)):
+                panels.setdefault(f'{one.symbol} [{one.unit}]', []).append((of, one))
+        places = list(dict.fromkeys(of for rows in panels.values() for of, _ in rows))
+        across = min(len(panels), 4) or 1
+        down = -(-len(panels) // across) or 1
+        figure = figure or new_figure(down * (1.2 + 0.3 * len(places)))
+        found = list(figure.subplots(down, across, sharey=True, squeeze=False).flat)
+        for axes in found[len(panels) :]:
+            axes.remove()
+        for axes, (label, rows) in zip(found, panels.items(), strict=False):
+            for of, one in rows:
+                axes.plot(one.interval, [places.index(of)] * 2, color='0.6')
+                axes.plot(_value(one), places.index(of), 'o', color='tab:blue')
+            axes.set(xlabel=label, ylim=(len(places) - 0.5, -0.5))
+            axes.set_yticks(range(len(places)), places)
+            axes.locator_params(axis='x', nbins=3)
+            axes.grid(visible=True, alpha=0.3)
+        return found[: len(panels)]
+
+
+def _value(one: ParameterEstimate | Statistic) -> float:
+    return one.mean if isinstance(one, Statistic) else one.value

@@ -9,8 +9,9 @@ from sys import float_info
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.display import Displayed
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.display import DisplayedEstimate, EstimateRows
 from needle_identification.estimation.estimate import (
+    DisplayedEstimate,
+    EstimateRows,
     named,
     ParameterEstimate,
     Statistic,

@@ -16,18 +16,19 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import reading, tables
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
-from needle_identification.steering.columns import (
+from needle_identification.steering.reading import (
     check_depth,
     is_inverted,
+    JOINTS,
+    read_steering_recording,
     steering_columns,
     STEERING_ROLES,
     USUAL,
 )
-from needle_identification.steering.reading import JOINTS, read_steering_recording
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
-from needle_ros.axes import AXES
 from needle_ros.errors import NeedleError
+from needle_ros.quantities import AXES
 import numpy as np
 
 _FORCE: Final = (wire.WRENCH,)  # message types of forces

@@ -22,14 +22,13 @@ from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray, IntArray
+from needle_identification.bags.bag import form_of, METADATA
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
-from needle_identification.bags.files import form_of, METADATA
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
-from needle_identification.recordings.samples import are_gaps
-from needle_identification.recordings.series import Series
-from needle_ros.axes import signed
+from needle_identification.recordings.samples import are_gaps, Series
 from needle_ros.errors import shown
+from needle_ros.quantities import signed
 import numpy as np
 
 #: Suffixes of table files.

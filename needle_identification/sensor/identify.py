@@ -8,20 +8,31 @@ eleven samples by more than six robust standard deviations; outliers are left ou
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import permutations
 from math import exp, inf, isfinite, log, log10, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import estimated, ParameterEstimate
+from needle_identification.estimation.estimate import (
+    DisplayedEstimate,
+    estimated,
+    EstimateRows,
+    named,
+    ParameterEstimate,
+)
 from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN
+from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.samples import are_gaps
-from needle_identification.sensor.estimate import SensorEstimate
-from needle_identification.sensor.losses import binomial_interval, fit_losses
-from needle_identification.sensor.noise import log_interval, NoiseFit, NoiseLikelihood, RATIOS
-from needle_identification.sensor.recording import SensorRecording
+from needle_identification.sensor.noise import (
+    binomial_interval,
+    fit_losses,
+    log_interval,
+    NoiseFit,
+    NoiseLikelihood,
+    RATIOS,
+)
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import stdtrit
@@ -44,6 +55,25 @@ _SIMILAR: Final = 0.3
 _EXCHANGED: Final = 5.0  # ratio of residuals above which axes are exchanged
 _BIASED: Final = 2e-3  # smallest residual of exchanged axes [m]
 _LONG: Final = 20.0  #: Duration of a recording over a correlation time that it determines well.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SensorEstimate(DisplayedEstimate):
+    """Errors of a tip sensor; ``estimate[name]`` is a parameter."""
+
+    name: str  #: name of the recording
+    axes: tuple[str, ...]  #: axes of the biases
+    parameters: tuple[ParameterEstimate, ...]  #: noise, biases, delay, losses
+    rate: float  #: samples per second, from the median interval [Hz]
+    samples: int  #: number of samples
+    duration: float  #: time from the first to the last sample [s]
+    warnings: tuple[str, ...] = ()  #: warnings about the validity of the values
+
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        return named(self.parameters, name)
+
+    def rows(self) -> EstimateRows:
+        return ((self.name, one) for one in self.parameters)
 
 
 def identify_sensor(recording: SensorRecording) -> SensorEstimate:

@@ -9,13 +9,18 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import Roles, tables
-from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
+from needle_identification.recordings.reading import (
+    chosen_topic,
+    read_samples,
+    span_of,
+    TIP,
+    Wanted,
+)
+from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
-from needle_identification.recordings.timebase import span_of
-from needle_identification.sensor.recording import SensorRecording
 from needle_ros import wire
-from needle_ros.axes import AXES, signed, signed_axis
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import AXES, signed, signed_axis
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 

@@ -7,8 +7,12 @@ from itertools import chain
 from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.display import DisplayedEstimate, EstimateRows
-from needle_identification.estimation.estimate import named, ParameterEstimate
+from needle_identification.estimation.estimate import (
+    DisplayedEstimate,
+    EstimateRows,
+    named,
+    ParameterEstimate,
+)
 import numpy as np
 
 #: Symbol and unit of each constant.

@@ -35,15 +35,22 @@ from math import inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.progress import Progress, progress_of
+from needle_dynamics.display import Progress, progress_of
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
 from needle_identification.steering.mixed import MixedModel, variances
-from needle_identification.steering.prediction import held_out, rms_of
-from needle_identification.steering.recording import readings, SteeringRecording
-from needle_identification.steering.response import ORDERS, TERMS
-from needle_identification.steering.search import FREE, interval, Optimum, Search, shown, Tips
+from needle_identification.steering.recording import ORDERS, readings, SteeringRecording, TERMS
+from needle_identification.steering.search import (
+    FREE,
+    held_out,
+    interval,
+    Optimum,
+    rms_of,
+    Search,
+    shown,
+    Tips,
+)
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_choice
 import numpy as np

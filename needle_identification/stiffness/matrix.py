@@ -19,8 +19,7 @@ from math import atan2, degrees, hypot, inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
-from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
-from needle_identification.estimation.formatting import measured
+from needle_identification.estimation.estimate import measured, ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import regress
 from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise

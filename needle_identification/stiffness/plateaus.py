@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Find plateaus of force and position: holds of presses, and rests.
+Find plateaus of force and position, holds of presses and rests, by `StiffnessSettings`.
 
 A plateau is the longest interval of steady force and position. Plateaus near the most frequent
 force are rests, the others are holds.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import ceil, hypot, inf, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation import ESTIMATORS
 from needle_identification.recordings.recording import IndentationRecording
-from needle_identification.stiffness.settings import StiffnessSettings
+from needle_ros.settings import CheckedSettings, choice, constant, positive
 import numpy as np
 from numpy.linalg import norm
 
@@ -25,6 +27,32 @@ _BAND: Final = 12.0  # width of the band that contains noise [standard deviation
 _RAMP: Final = 3.0  # deviation from the middle half of a ramp [standard deviations]
 _FEWEST_SAMPLES: Final = 4  # smallest number of samples of a plateau
 ROUNDING: Final = 1e-8  #: relative noise below which values differ by rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StiffnessSettings(CheckedSettings):
+    """
+    Settings of `identify_stiffness`; fields describe meaning and unit.
+
+    The mean matrices of Table 2 have an asymmetry of up to 0.086, and the paper calls their
+    tissue a spring; ``largest_asymmetry`` is the next round number.
+    """
+
+    contact_length: float = positive(
+        1.0,
+        'm',
+        'length of tissue that the end-effector presses; 1 m gives the value of the paper',
+    )
+    level_tolerance: float = positive(
+        0.05, 'N', 'forces this close are one level, and steady within it'
+    )
+    rest_force: float = positive(0.1, 'N', 'force up to which it counts as rest')
+    hold_time: float = positive(0.1, 's', 'shortest steady force that counts as a hold or a rest')
+    settle_time: float = constant(0.02, 's', 'left out at the beginning of each hold and rest')
+    largest_asymmetry: float = constant(
+        0.1, '1', 'antisymmetric part over symmetric up to which it counts as a spring'
+    )
+    estimator: str = choice('ordinary', ESTIMATORS)
 
 
 class Plateaus(NamedTuple):

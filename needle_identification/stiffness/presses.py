@@ -8,8 +8,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
-from needle_identification.stiffness.plateaus import Plateaus
-from needle_identification.stiffness.settings import StiffnessSettings
+from needle_identification.stiffness.plateaus import Plateaus, StiffnessSettings
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar

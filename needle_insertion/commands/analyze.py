@@ -11,7 +11,7 @@ from needle_dynamics.linearization import SLIDING
 from needle_dynamics.parameters import PAPER_NEEDLE
 from needle_insertion.commands import common
 from needle_insertion.report import controllability as report
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.errors import ParameterError
 
 

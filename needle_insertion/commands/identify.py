@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import needle_identification as identification
 from needle_identification.recordings.tables import column_roles, recordings_in, ROLES
-from needle_identification.steering.columns import STEERING_ROLES
+from needle_identification.steering.reading import STEERING_ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
 from needle_insertion.commands.identify_steering import add_steering

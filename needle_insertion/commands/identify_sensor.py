@@ -6,20 +6,18 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from needle_identification.estimation.estimate import ParameterEstimate
-from needle_identification.estimation.formatting import rounded
+from needle_identification.estimation.estimate import ParameterEstimate, rounded
+from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.tables import column_roles, is_table
-from needle_identification.sensor.estimate import SensorEstimate
+from needle_identification.sensor.identify import SensorEstimate
 from needle_identification.sensor.reading import read_sensor_recording, SENSOR_ROLES
-from needle_identification.sensor.recording import SensorRecording
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.content import table
 from needle_insertion.report.identify_text import interval_of, title_of
-from needle_insertion.report.text import table
-from needle_ros.axes import AXES
 from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
-from needle_ros.quantities import quantities
+from needle_ros.quantities import AXES, quantities
 
 
 def add_sensor(what: Any) -> None:

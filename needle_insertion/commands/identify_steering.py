@@ -8,18 +8,15 @@ from pathlib import Path
 import re
 from typing import Any
 
-from needle_identification.estimation.estimate import ParameterEstimate
-from needle_identification.estimation.formatting import between, measured
+from needle_identification.estimation.estimate import between, measured, ParameterEstimate
 from needle_identification.recordings.tables import column_roles
-from needle_identification.steering.columns import STEERING_ROLES
 from needle_identification.steering.estimate import HeldOut, SteeringEstimate
-from needle_identification.steering.reading import read_steering_recording
-from needle_identification.steering.recording import SteeringRecording
-from needle_identification.steering.response import ORDERS, TERMS
+from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
+from needle_identification.steering.recording import ORDERS, SteeringRecording, TERMS
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.content import table
 from needle_insertion.report.identify_text import interval_of, plain, title_of
-from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.files import write_whole
 

@@ -7,8 +7,8 @@ from math import isfinite
 from needle_identification import inspect_recording, Inspection
 from needle_insertion.commands.common import add_flag, add_recordings, print_each, print_result
 from needle_insertion.progress import ProgressLine
+from needle_insertion.report.content import table
 from needle_insertion.report.identify_text import plain
-from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, shown
 
 

@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
     # Imported here: rclpy takes a second.
     with ProgressLine('needle run', brief=True):
         from needle_dynamics import find_needle
-        from needle_insertion.compilation import compile_nodes
+        from needle_insertion.commands.compile import compile_nodes
         from needle_insertion.graph.ros_graph import Graph
         from needle_insertion.live.session import config_file, Session
 
@@ -97,7 +97,7 @@ def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, 
 
 def _parameter(word: str) -> tuple[str, str, Any]:
     # Imported here: the help does not need it.
-    from needle_ros.documents import DocumentError, read_document
+    from needle_ros.files import DocumentError, read_document
 
     name, sign, text = word.partition('=')
     node, dot, name = name.partition('.')

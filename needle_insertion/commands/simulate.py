@@ -19,7 +19,7 @@ from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine, Show
 from needle_insertion.report import trajectory as report
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.errors import ParameterError
 from needle_study.scenario import check_names
 import numpy as np

@@ -18,9 +18,8 @@ from needle_dynamics.steering.needle import NeedlePath, NeedleShape
 from needle_dynamics.steering.parameters import bending_length
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
-from needle_insertion.report.content import png
+from needle_insertion.report.content import png, table
 from needle_insertion.report.insertion import draw_needle, draw_reach, evenly
-from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
 from needle_ros.quantities import target as read_target

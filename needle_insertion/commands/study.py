@@ -15,7 +15,7 @@ from typing import Any, Final, TYPE_CHECKING
 
 from needle_insertion.commands.common import check_folder, print_result
 from needle_insertion.progress import ProgressLine
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.errors import JobError, missing_extra, ParameterError
 from needle_ros.process_pool import processes
 

@@ -9,7 +9,7 @@ import sys
 
 from needle_insertion.commands.common import add_flag, print_result
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm

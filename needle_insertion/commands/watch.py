@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
 from needle_ros.errors import ParameterError
-from needle_ros.signals import ENDINGS
+from needle_ros.process import ENDINGS
 
 if TYPE_CHECKING:
     # Takes long to import.

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from needle_insertion.graph.messages import State
-from needle_insertion.graph.node_process import NodeProcess
-from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph, NodeProcess
 from needle_ros import contract
 from needle_ros.base_node import profile, SENSOR
 from needle_ros.status import PlantStatus

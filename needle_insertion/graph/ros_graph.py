@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import gc
@@ -11,7 +11,9 @@ from itertools import filterfalse
 from math import inf
 import os
 from pathlib import Path
+import signal
 import subprocess
+import sys
 import time
 from types import SimpleNamespace
 from typing import Any, Final, IO
@@ -19,10 +21,11 @@ from typing import Any, Final, IO
 from domain_coordinator import domain_id
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from needle_insertion.graph.node_process import GraphError, NodeProcess
+from needle_insertion.nodes import NODES
+from needle_ros.errors import JobError
 from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
+from needle_ros.process import DeferredSignals
 from needle_ros.run_node import end, END_WITH_PARENT
-from needle_ros.signals import DeferredSignals
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -30,6 +33,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
+import yaml
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 ACTIVATE = Transition.TRANSITION_ACTIVATE
@@ -41,6 +45,77 @@ _START: Final = 180.0  #: Timeout of the start of a node, with compilation on a 
 _CLIENT: Final = 3.0
 _REQUEST: Final = 0.2  #: Period of the requests for the state of a node [s].
 _PATIENCE: Final = 3.0  #: Timeout of the clean end of the nodes, before they are killed [s].
+
+
+class GraphError(JobError):
+    """A node did not start, ended early, or timed out."""
+
+
+class NodeProcess:
+    """
+    One node of the suite, a key of `NODES`, as a process.
+
+    `environment` selects the domain, `log` receives the output of the node, and `parameters`
+    override the ROS parameter file `file`. It inherits the files `inherited`, and no terminal.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, object],
+        environment: Mapping[str, str],
+        log: IO[str],
+        file: Path | None = None,
+        inherited: Sequence[int] = (),
+    ) -> None:
+        self.name = name
+        #: Whether its end is intended or known.
+        self.ended = False
+        self._log = log
+        settings = [] if file is None else ['--params-file', str(file)]
+        for key, value in parameters.items():
+            # One line of YAML, without the end-of-document mark of a bare scalar.
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]
+            settings += ['-p', f'{key}:={text}']
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', NODES[name], '--ros-args', *settings],
+            env={**environment, END_WITH_PARENT: str(os.getpid())},
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            pass_fds=inherited,
+            start_new_session=True,
+        )
+
+    def check(self) -> None:
+        """Raise `GraphError` with the last line of output if the node has ended, once."""
+        status = self.process.poll()
+        if status is not None and not self.ended:
+            self.ended = True
+            raise GraphError(
+                f'{self.name} ended early with status {status}: {self.last_line or "no output"}'
+            )
+
+    @property
+    def last_line(self) -> str:
+        self._log.flush()
+        lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
+        return lines[-1] if lines else ''
+
+    def kill(self) -> None:
+        self.ended = True
+        self.process.kill()
+        self.process.wait()
+
+    def interrupt(self, timeout: float = 15.0) -> None:
+        """End the node with SIGINT; raise `GraphError` after a timeout [s] or an error."""
+        self.ended = True
+        self.process.send_signal(signal.SIGINT)
+        try:
+            status = self.process.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise GraphError(f'{self.name} did not end within {timeout:g} s') from error
+        if status != 0:
+            raise GraphError(f'{self.name} ended with status {status}: {self.last_line}')
 
 
 class Graph:

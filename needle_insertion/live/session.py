@@ -12,8 +12,7 @@ from typing import Any, Final
 
 from needle_controller.hardware import BY_TYPE, HardwareSettings, Robot
 from needle_insertion.graph.lockstep import activate_plant, start_nodes, WARM_UP, Witness
-from needle_insertion.graph.node_process import GraphError, NodeProcess
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError, NodeProcess
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen

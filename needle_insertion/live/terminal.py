@@ -14,16 +14,15 @@ from typing import Any, Final
 from needle_controller import LAWS
 from needle_dynamics import DEFAULT_NEEDLE
 from needle_insertion.graph.messages import State
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.requests import CONTROLLER, REQUESTS, STEERING
 from needle_insertion.live.screen import Screen
-from needle_insertion.report.text import table
+from needle_insertion.report.content import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
-from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.files import DocumentError, read_document
 from needle_ros.quantities import quantity, target, TARGET_HELP
 from needle_ros.status import (
     CommissioningPhase,
@@ -77,7 +76,6 @@ WORDS: Final = {
     'help': ('', 'this list'),
     'quit': ('', 'end the nodes and complete the recording'),
 }
-
 
 _GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
 

@@ -23,8 +23,8 @@ from needle_identification import Bag, RecordingError
 from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
-from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.files import DocumentError, read_document
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 from needle_ros.wire import MessageReader, TYPES
 import numpy as np

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import needle_identification as identification
-from needle_identification.estimation.formatting import between, measured, rounded, spread
+from needle_identification.estimation.estimate import between, measured, rounded, spread
 from needle_identification.result import model_parameters
 from needle_insertion.report import identify_figures as figures
 from needle_insertion.report import identify_text as text

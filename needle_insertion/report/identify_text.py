@@ -16,12 +16,11 @@ from needle_identification import (
     Statistic,
     StiffnessSummary,
 )
-from needle_identification.estimation.estimate import statistic
-from needle_identification.estimation.formatting import between, measured, spread
+from needle_identification.estimation.estimate import between, measured, spread, statistic
 from needle_identification.estimation.prediction import Moments
 from needle_identification.stiffness.presses import Presses
+from needle_insertion.report.content import table
 from needle_insertion.report.origin import Origin
-from needle_insertion.report.text import table
 import numpy as np
 
 _NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')

@@ -6,18 +6,30 @@ Pages load no other files, and their content security policy forbids it. The sam
 same bytes, except for the date. Templates escape all inserted text.
 """
 
-from collections.abc import Iterable, Sequence
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from hashlib import sha256
+import json
 from pathlib import Path
 import re
 from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import escape, Markup
-from needle_insertion.report.animation import Animation
 from needle_insertion.report.content import Picture
+from needle_insertion.report.insertion import evenly
 from needle_insertion.report.made import made
 from needle_ros.files import write_whole
+
+#: Scripts: drawing (also used by `needle watch`), and player.
+_SCRIPTS: Final = ('needle.js', 'animation.js')
+
+_POINTS: Final = 40  #: largest number of points of a needle
+
+#: Keys of a frame that are drawn.
+_DRAWN: Final = ('time', 'needle', 'shape', 'target', 'expected', 'tip', 'depth')
 
 #: Largest length of a cell with a number; longer text is for example a checksum.
 _LONGEST_NUMBER: Final = 40
@@ -49,6 +61,44 @@ _SYMBOL: Final = re.compile(
 _DOTS: Final = {None: '', 'dot': '\u0307', 'ddot': '\u0308'}
 _POWER: Final = re.compile(r'\^(?:([2-4])(?![\d/])|(-?\d+(?:/\d+)?|T\b))')
 _MICROMETERS: Final = re.compile(r'(?<=\d )um\b')
+
+
+@dataclass(frozen=True, eq=False)
+class Animation:
+    """Animation of a needle from frames."""
+
+    caption: str
+    scene: Mapping[str, Any]  #: from `needle_insertion.watch.view.scene`
+    #: Frames of `needle_insertion.watch.view.View.frame`, each with a needle.
+    frames: Sequence[Mapping[str, Any]]
+
+    @property
+    def data(self) -> Markup:
+        """JSON data of the script, escaped so that it cannot close its HTML element."""
+        frames = [{key: frame[key] for key in _DRAWN} for frame in self.frames]
+        for frame in frames:
+            frame['needle'] = [
+                [round(value, 5) for value in evenly(column, min(len(column), _POINTS))]
+                for column in frame['needle']
+            ]
+        paths = [frame['path'] for frame in self.frames if frame['path']]
+        # The last cut path contains all earlier paths.
+        path = paths[-1] if paths else [[], [], []]
+        content = {'scene': self.scene, 'frames': frames, 'path': path}
+        text = json.dumps(content, separators=(',', ':'), allow_nan=False)
+        return Markup(text.replace('<', r'\u003c'))  # noqa: S704
+
+    @property
+    def script(self) -> Markup:
+        parts = [(TEMPLATE_FOLDER / name).read_text(encoding='utf-8') for name in _SCRIPTS]
+        # Trusted: the scripts are part of this package.
+        return Markup('\n'.join(parts))  # noqa: S704
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 source expression of the script for the content security policy."""
+        made = sha256(self.script.encode()).digest()
+        return f'sha256-{base64.b64encode(made).decode("ascii")}'
 
 
 def _symbols(words: str) -> Markup:

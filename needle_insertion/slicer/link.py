@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-TCP connection to a peer, as server or as client, without threads and without blocking calls.
+OpenIGTLink messages of a peer over TCP, as server or client, without threads and blocking calls.
 
 The server and the client of pyigtl are not used, because they are unsuitable for a node: the
 server replaces the handlers of SIGINT and SIGTERM and selects its own addresses. Both use a full
@@ -16,13 +16,24 @@ from ipaddress import AddressValueError, IPv4Address
 import os
 import select
 import socket
+import struct
 from time import monotonic
-from typing import Final
+from typing import Final, NamedTuple
 
-from needle_insertion.slicer.frames import Frame, Frames
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.settings import check_constants, choice, constant, text
+
+#: Version, type, device name, time stamp (whole and fraction), size of the body, checksum.
+HEADER: Final = struct.Struct('>H12s20sIIQQ')
+
+#: Versions of the header: 1 and 2 of OpenIGTLink 1 to 3, and a future version.
+_VERSIONS: Final = (1, 2, 3)
+
+LARGEST: Final = 1 << 16  #: largest accepted body [bytes]: 481 points
+
+#: Largest skipped body [bytes]; a larger size is a protocol error.
+_LARGEST_SKIPPED: Final = 1 << 30
 
 _RETRY: Final = 1.0  #: time between attempts to listen or to connect [s]
 _PATIENCE: Final = 5.0  #: timeout of a peer that accepts no byte [s]
@@ -37,6 +48,61 @@ _SYSTEM_BUFFER: Final = 1 << 16
 
 #: Largest number of additional peers that are rejected in a call of `poll`.
 _MOST_REJECTED: Final = 8
+
+
+class Frame(NamedTuple):
+    """Unparsed message: its type, such as ``POINT``, name of the device, header and body."""
+
+    kind: str
+    device: str
+    data: bytes
+
+
+class Frames:
+    """Splitter of a byte stream into wanted messages; `refuse` reports too large ones."""
+
+    def __init__(
+        self, wanted: Callable[[str, str], bool], refuse: Callable[[str], object]
+    ) -> None:
+        self._wanted, self._refuse = wanted, refuse
+        self._rest = b''
+        self._skip = 0
+
+    def take(self, data: bytes) -> list[Frame]:
+        """Return the messages completed by further bytes; `MessageError` if not OpenIGTLink."""
+        stream, at, found = self._rest + data, 0, []
+        while True:
+            step = min(self._skip, len(stream) - at)
+            at, self._skip = at + step, self._skip - step
+            if self._skip or len(stream) - at < HEADER.size:
+                break
+            kind, device, size = _header(stream[at : at + HEADER.size])
+            whole = HEADER.size + size
+            if not self._wanted(kind, device):
+                self._skip = whole
+            elif size > LARGEST:
+                self._refuse(
+                    f'target refused: a {kind} message of {size} bytes, {LARGEST} at most'
+                )
+                self._skip = whole
+            elif len(stream) - at < whole:
+                break
+            else:
+                found.append(Frame(kind, device, stream[at : at + whole]))
+                at += whole
+        self._rest = stream[at:]
+        return found
+
+
+def _header(header: bytes) -> tuple[str, str, int]:
+    version, kind, device, _, _, size, _ = HEADER.unpack(header)
+    name = kind.rstrip(b' \0')
+    if version not in _VERSIONS or not name.isascii() or not name.decode('latin1').isprintable():
+        raise MessageError(f'not OpenIGTLink: it begins with {header[:14]!r}')
+    if size > _LARGEST_SKIPPED:
+        raise MessageError(f'not OpenIGTLink: a {name.decode()} message of {size} bytes')
+    # Slicer uses names of nodes, which may be truncated within a character.
+    return name.decode(), device.rstrip(b' \0').decode(errors='replace'), size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,9 +15,8 @@ import struct
 from typing import Any, Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_insertion.slicer.frames import Frame, HEADER
-from needle_insertion.slicer.needle import EntryPose, Shape
-from needle_insertion.slicer.registration import MILLIMETERS, Registration
+from needle_insertion.slicer.link import Frame, HEADER
+from needle_insertion.slicer.needle import EntryPose, MILLIMETERS, Registration, Shape
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
 import numpy as np

@@ -1,13 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Present state of the needle: its measured shape, or a line to its tip."""
+"""Present shape of the needle, measured or a line to its tip, in the images; state of nodes."""
 
+from dataclasses import dataclass
+from math import sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_insertion.slicer.registration import rotation_matrix
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.settings import check_constants, constant
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+MILLIMETERS: Final = 1e3  #: millimeters per meter: OpenIGTLink and 3D Slicer use mm
+_ROUNDED: Final = 2e-3  #: tolerance of the norm of a quaternion that is rounded to three digits
 
 _TIMEOUT: Final = 1.0  #: timeout of measurements [s]
 _FARTHEST: Final = 10.0  #: largest plausible coordinate [m]
@@ -16,6 +22,79 @@ MOST_POINTS: Final = 480  #: largest number of points of a shape: 0.5 m with a p
 #: Source of a shape: measured, or a straight line.
 MEASURED: Final = 'needle_poses'
 LINE: Final = 'line from guide to tip, not measured'
+
+_PERIOD: Final = 1.0  #: time between two transmissions, unless something changes [s]
+
+#: Largest number of nodes, and ages of a silent and of a removed node [s].
+_MOST: Final = 20
+_SILENT: Final = 5.0
+_REMOVED: Final = 60.0
+
+_LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
+
+
+def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
+    """Return the rotation matrix of a quaternion xyzw; `ParameterError` if its norm is not 1."""
+    given = np.array(quaternion, dtype=np.float64)
+    norm = sqrt(given @ given) if given.shape == (4,) and np.isfinite(given).all() else 0.0
+    if abs(norm - 1.0) > _ROUNDED:
+        raise ParameterError(
+            f'must be a quaternion x, y, z, w of norm 1, got {given.tolist()} of norm {norm:g}'
+        )
+    return np.asarray(Rotation.from_quat(given).as_matrix())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """
+    Pose of the frame ``needle_entry`` in the images, p_image = R p_needle + t.
+
+    By default the origins are equal, and x is to the patient's right, y anterior, z superior.
+    """
+
+    rotation: tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0, 1.0),
+        '1',
+        'rotation from needle_entry to the frame of the images: quaternion x, y, z, w',
+        low=-1.0,
+        high=1.0,
+    )
+    translation: tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0),
+        'm',
+        'position of the entry point in the frame of the images: x, y, z; in m (3D Slicer shows '
+        'mm)',
+        low=-10.0,
+        high=10.0,
+    )
+
+    def __post_init__(self) -> None:
+        for name, count in (('rotation', 4), ('translation', 3)):
+            given = getattr(self, name)
+            if not isinstance(given, tuple) or len(given) != count:
+                raise ParameterError(f'{name} must have {count} numbers, got {given!r}')
+        check_constants(self)
+        try:
+            rotation_matrix(self.rotation)
+        except ParameterError as error:
+            raise ParameterError(f'rotation {error}') from error
+
+    def to_image(self, points: ArrayLike) -> FloatArray:
+        """Transform points (..., 3) from ``needle_entry`` [m] to the frame of the images [mm]."""
+        turned = np.asarray(points, dtype=np.float64) @ rotation_matrix(self.rotation).T
+        return np.asarray(MILLIMETERS * (turned + self.translation))
+
+    def to_needle(self, points: ArrayLike) -> FloatArray:
+        """Transform points (..., 3) from the frame of the images [mm] to ``needle_entry`` [m]."""
+        lengths = np.asarray(points, dtype=np.float64) / MILLIMETERS
+        return np.asarray((lengths - self.translation) @ rotation_matrix(self.rotation))
+
+    def pose_to_image(self, position: ArrayLike, quaternion: ArrayLike) -> FloatArray:
+        """Transform a pose (position in m) to a homogeneous matrix of the images (in mm)."""
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_matrix(self.rotation) @ rotation_matrix(quaternion)
+        pose[:3, 3] = self.to_image(position)
+        return pose
 
 
 class Shape(NamedTuple):
@@ -102,3 +181,44 @@ def _along(direction: FloatArray) -> FloatArray:
     # Half the angle from y, about the normal of both; for opposite directions any normal.
     turn = np.array([z, 0.0, -x, 1.0 + y]) if y > -1.0 else np.array([1.0, 0.0, 0.0, 0.0])
     return np.asarray(turn / np.linalg.norm(turn))
+
+
+class NodeStates:
+    """Latest state of each node on ``/diagnostics``; all times are of a monotonic clock [s]."""
+
+    def __init__(self) -> None:
+        #: Time of receipt, level and message, by node.
+        self._states: dict[str, tuple[float, int, str]] = {}
+        #: Peer at the last call of `is_due`.
+        self._peer = ''
+        self._sent = self._changed = -_PERIOD
+
+    def take(self, name: str, level: int, message: str, now: float) -> None:
+        """Store the state of a node; further nodes beyond the largest number are ignored."""
+        if name in self._states or len(self._states) < _MOST:
+            if self._states.get(name, (0.0, -1, ''))[1:] != (level, message):
+                self._changed = now
+            self._states[name] = now, level, message
+
+    def mark_changed(self, now: float) -> None:
+        self._changed = now
+
+    def is_due(self, peer: str, now: float) -> bool:
+        """Return whether the states must be sent now: to a new peer, after a change, or again."""
+        is_new, self._peer = peer != self._peer, peer
+        changed = is_new or self._changed > self._sent or now - self._sent >= _PERIOD
+        if not peer or not changed:
+            return False
+        self._sent = now
+        return True
+
+    def lines(self, now: float) -> list[str]:
+        """Return a line for each node, sorted by name; nodes without a state are removed."""
+        known = sorted(self._states.items())
+        self._states = {name: state for name, state in known if now - state[0] < _REMOVED}
+        lines = []
+        for name, (when, level, message) in self._states.items():
+            age = now - when
+            silent = f', silent for {age:.0f} s' if age > _SILENT else ''
+            lines.append(f'{name} [{_LEVELS.get(level, str(level))}{silent}]: {message}')
+        return lines

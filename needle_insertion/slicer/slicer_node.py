@@ -15,9 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection, LinkSettings
-from needle_insertion.slicer.needle import NeedleView, Shape
-from needle_insertion.slicer.registration import MILLIMETERS, Registration
-from needle_insertion.slicer.states import NodeStates
+from needle_insertion.slicer.needle import MILLIMETERS, NeedleView, NodeStates, Registration, Shape
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
@@ -31,7 +29,7 @@ from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
 
 if TYPE_CHECKING:
-    from needle_insertion.slicer.frames import Frame
+    from needle_insertion.slicer.link import Frame
     from needle_insertion.slicer.messages import Interpreter
 
 #: Time between two checks of the connection, and between two shapes [s].

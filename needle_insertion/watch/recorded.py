@@ -17,8 +17,16 @@ from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.samples import are_gaps
-from needle_insertion.watch.scene import CONFIGURED, parameters_of
-from needle_insertion.watch.view import EFFORT, RATE, Signal, signal_of, SIGNALS, View
+from needle_insertion.watch.view import (
+    CONFIGURED,
+    EFFORT,
+    parameters_of,
+    RATE,
+    Signal,
+    signal_of,
+    SIGNALS,
+    View,
+)
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import node_of

@@ -20,7 +20,6 @@ from functools import partial
 from hmac import compare_digest
 from ipaddress import ip_address
 import json
-from math import isfinite
 from pathlib import Path
 from secrets import token_urlsafe
 from typing import Any, Final, Protocol
@@ -30,6 +29,7 @@ from aiohttp import web, WSCloseCode, WSMessage, WSMsgType
 from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
+from needle_ros.settings import is_number
 
 PORT: Final = 8642  #: default port
 
@@ -254,7 +254,7 @@ class Server:
         what = message.pop('ask')
         if what == 'target':
             at = message.pop('at', None)
-            if message or not isinstance(at, list) or len(at) != 3 or not all(map(_real, at)):
+            if message or not isinstance(at, list) or len(at) != 3 or not all(map(is_number, at)):
                 raise ParameterError('a target is {"at": [x, y, z]} with numbers in m')
             x, y, z = map(float, at)
             return await self._control.target(x, y, z)
@@ -332,9 +332,3 @@ def _message(message: WSMessage) -> dict[str, Any]:
     if message.type is not WSMsgType.TEXT or not isinstance(content, dict):
         raise ParameterError('a message must be text, a JSON object')
     return content
-
-
-def _real(value: object) -> bool:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    # JSON integers can have any number of digits.
-    return number and abs(value) < 1e9 and isfinite(value)  # type: ignore[arg-type]

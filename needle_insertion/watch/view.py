@@ -1,17 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of the page: stores messages of all topics and returns frames."""
+"""State of the page: messages of all topics, needle, tissue and limits, as frames."""
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from math import isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
-from needle_insertion.watch.scene import scene
 from needle_ros import contract
 from needle_ros.errors import printable
+from needle_ros.files import DocumentError, read_document
+from needle_ros.settings import is_number
 from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
+
+#: Nodes whose configurations are read; needle and tissue are of the first available node.
+CONFIGURED: Final = ('plant', 'steering', 'controller')
+
+#: Parameters of the limits of the controller, by their names on the page.
+_LIMITS: Final = {
+    'force': 'force_limit',
+    'load': 'safety.axial_load',
+    'speed': 'safety.speed',
+    'error': 'safety.tracking_error',
+    'deflection': 'safety.tip_deflection',
+}
 
 RATE: Final = 30.0  #: frames per second
 SPAN: Final = 20.0  #: duration of the history [s]
@@ -23,8 +36,77 @@ _NODES: Final = 64
 
 _NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 
-
 _Place = Sequence[float | None]  #: Coordinates [m], None if unknown.
+
+
+def parameters_of(text: str) -> dict[str, Any]:
+    """Return the parameters in a configuration (parameter file of one node); {} if invalid."""
+    try:
+        document = read_document(text)
+        (content,) = document.values()
+        return {str(name): value for name, value in content['ros__parameters'].items()}
+    except (DocumentError, AttributeError, KeyError, TypeError, ValueError):
+        return {}
+
+
+def scene(configurations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """
+    Return needle, tissue and limits for the page from the parameters of nodes, by node name.
+
+    ``tissue`` or None: source node ``of``, ``length``, ``free`` length, ``layers`` (depth,
+    stiffness) and ``membranes`` (depth, strength). ``limits``: force, load, speed, error,
+    deflection, depths ``low`` and ``high``. ``steered``: whether a node aims the tip. SI units.
+    """
+    whose = next((name for name in CONFIGURED if name in configurations), None)
+    return {
+        'tissue': None if whose is None else _tissue(whose, configurations[whose]),
+        'limits': _limits(configurations.get('controller', {})),
+        'steered': 'steering' in configurations,
+    }
+
+
+def _number(parameters: Mapping[str, Any], name: str) -> float | None:
+    value = parameters.get(name)
+    return float(value) if is_number(value) else None
+
+
+def _numbers(parameters: Mapping[str, Any], name: str) -> list[float]:
+    values = parameters.get(name)
+    values = values if isinstance(values, list) else []
+    return [float(value) for value in values if is_number(value)]
+
+
+def _tissue(whose: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    depths = [0.0, *_numbers(parameters, 'model.layer_depths')]
+    first = _number(parameters, 'model.tissue_stiffness') or 0.0
+    stiffnesses = [first, *_numbers(parameters, 'model.layer_stiffnesses')]
+    membranes = zip(
+        _numbers(parameters, 'steering.membrane_depths'),
+        _numbers(parameters, 'steering.membrane_strengths'),
+        strict=False,
+    )
+    # All nodes have the parameter free length; it is valid for a steered needle only.
+    steered = whose == 'steering' or parameters.get('steered') is True
+    return {
+        'of': whose,
+        'length': _number(parameters, 'model.length'),
+        'free': _number(parameters, 'steering.free_length') if steered else None,
+        'layers': [list(layer) for layer in zip(depths, stiffnesses, strict=False)],
+        'membranes': [list(one) for one in membranes] if steered else [],
+    }
+
+
+def _limits(parameters: Mapping[str, Any]) -> dict[str, float]:
+    found = {name: _number(parameters, of) for name, of in _LIMITS.items()}
+    # As in the controller: limited to the range of the needle.
+    for name, of, model, choose in (
+        ('low', 'lowest_depth', 'model.minimum_depth', max),
+        ('high', 'highest_depth', 'model.length', min),
+    ):
+        both = [_number(parameters, of), _number(parameters, model)]
+        known = [value for value in both if value is not None]
+        found[name] = choose(known) if known else None
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def number(value: float | None) -> float | None:

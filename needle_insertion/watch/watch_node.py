@@ -14,8 +14,7 @@ from typing import Any, Final
 from needle_insertion.graph.messages import waiting
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.watch.recorded import STREAMS
-from needle_insertion.watch.scene import CONFIGURED, parameters_of
-from needle_insertion.watch.view import View
+from needle_insertion.watch.view import CONFIGURED, parameters_of, View
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError

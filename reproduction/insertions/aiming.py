@@ -13,11 +13,10 @@ from needle_dynamics import FloatArray
 from needle_identification.bags.bag import read_topic
 from needle_insertion.graph.lockstep import RunSample, WARM_UP
 from needle_insertion.graph.messages import State
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.progress import Show
-from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle, evenly
+from needle_insertion.report.page import Animation
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase, SteeringStatus

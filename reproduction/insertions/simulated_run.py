@@ -15,8 +15,7 @@ from needle_insertion.graph.lockstep import (
     Witness,
 )
 from needle_insertion.graph.messages import listen_states, target_message
-from needle_insertion.graph.node_process import GraphError
-from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.progress import Show
 from needle_ros import contract
 from needle_ros.base_node import COMMAND

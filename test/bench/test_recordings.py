@@ -25,8 +25,7 @@ from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.needles import NEEDLES
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import RecordingError, SteeringRecording
-from needle_identification.steering.prediction import predict, Prediction, rms_of
-from needle_identification.steering.search import Search, Tips
+from needle_identification.steering.search import predict, Prediction, rms_of, Search, Tips
 from needle_ros.errors import ParameterError
 import numpy as np
 import pytest

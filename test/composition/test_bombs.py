@@ -21,7 +21,7 @@ import lz4.frame
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from needle_identification.bags.writer import BagWriter
-from needle_ros.documents import DocumentError, read_document
+from needle_ros.files import DocumentError, read_document
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer

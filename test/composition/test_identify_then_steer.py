@@ -9,9 +9,8 @@ from typing import Any
 
 from benchmarks.steering_fit import FitTruth, insertion, NEEDLE
 from needle_controller.steering.laws.multi_hypothesis import MultiHypothesisLaw
-from needle_controller.steering.limits import SteeringLimits
-from needle_controller.steering.prior import SteeringPrior
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import find_needle, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import tissue_of

@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
-from needle_insertion.report.content import Picture
+from needle_insertion.report.content import Picture, table
 from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page
-from needle_insertion.report.text import table
 import pytest
 from reproduction.content import Check, CHECK_HEADS
 from reproduction.insertions.aiming import animate_aiming

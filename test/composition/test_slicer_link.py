@@ -12,8 +12,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from benchmarks.igtl_peer import free_port
-from needle_insertion.slicer.frames import HEADER
-from needle_insertion.slicer.link import Connection, LinkSettings
+from needle_insertion.slicer.link import Connection, HEADER, LinkSettings
 from needle_insertion.slicer.messages import is_wanted, TARGET
 from needle_ros.event_log import EventLog
 import numpy as np

@@ -14,8 +14,7 @@ from typing import Any
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from needle_insertion.slicer.frames import Frame, Frames, HEADER, LARGEST
-from needle_insertion.slicer.link import LinkSettings
+from needle_insertion.slicer.link import Frame, Frames, HEADER, LARGEST, LinkSettings
 from needle_insertion.slicer.messages import (
     Interpreter,
     is_wanted,
@@ -32,9 +31,10 @@ from needle_insertion.slicer.needle import (
     MEASURED,
     MOST_POINTS,
     NeedleView,
+    Registration,
+    rotation_matrix,
     Shape,
 )
-from needle_insertion.slicer.registration import Registration, rotation_matrix
 from needle_ros.errors import MessageError, ParameterError
 import numpy as np
 import pyigtl
@@ -431,7 +431,7 @@ def test_only_node_requires_ros_and_only_messages_require_pyigtl() -> None:
     """The other modules import without them."""
     script = (
         'import sys; sys.modules.update(rclpy=None, pyigtl=None)\n'
-        'from needle_insertion.slicer import frames, link, needle, registration\n'
+        'from needle_insertion.slicer import link, needle\n'
         'del sys.modules["pyigtl"]\n'
         'from needle_insertion.slicer import messages\n'
     )

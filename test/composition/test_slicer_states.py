@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from needle_insertion.slicer.states import NodeStates
+from needle_insertion.slicer.needle import NodeStates
 
 
 def test_states_are_due_for_a_new_peer_after_a_change_and_each_second() -> None:

@@ -17,7 +17,7 @@ from needle_controller import (
     run_controller,
     SafetyLimits,
 )
-from needle_controller.safety.guard import Guard
+from needle_controller.safety.safety import Guard
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.cli import main

@@ -27,9 +27,8 @@ from needle_insertion import cli
 from needle_insertion.watch import recorded
 from needle_insertion.watch.live import Live, LiveReader, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
-from needle_insertion.watch.scene import parameters_of, scene
 from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
-from needle_insertion.watch.view import SIGNALS, View
+from needle_insertion.watch.view import parameters_of, scene, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import JobError, MessageError, ParameterError
 from needle_ros.status import ControllerStatus, SteeringStatus
@@ -224,6 +223,17 @@ def test_tissue_and_limits_follow_from_configurations() -> None:
         'steered': True,
     }  # fmt: skip
     assert scene({}) == {'tissue': None, 'limits': {}, 'steered': False}
+
+
+@pytest.mark.parametrize('value', [True, float('nan'), 10**400, '0.04'])
+def test_invalid_number_of_a_configuration_is_left_out(value: object) -> None:
+    """Alone and in a list: a Boolean is not 1, and an integer of 400 digits is no float."""
+    stiffnesses = {'model.layer_stiffnesses': [2e4, 3e4]}
+    plant = {'model.length': value, 'model.layer_depths': [value, 0.05], **stiffnesses}
+    found = scene({'plant': plant, 'controller': {'force_limit': value}})
+    assert found['tissue']['length'] is None
+    assert found['tissue']['layers'] == [[0.0, 0.0], [0.05, 2e4]]
+    assert found['limits'] == {}
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,7 @@ from needle_controller import (
     run_batch,
     Setpoint,
 )
-from needle_controller.compiled.laws import LEARNED, MEASURED
-from needle_controller.compiled.learning import bounds, correction
+from needle_controller.compiled.laws import bounds, correction, LEARNED, MEASURED
 from needle_controller.laws.law import SampledLoop
 from needle_controller.stability import transition_matrix
 from needle_dynamics import NeedleModel, NeedleParameters

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import Measurement, Observer, ObserverSettings
 from needle_controller.load_estimator import LoadEstimator
-from needle_controller.observer.consistency import Consistency
+from needle_controller.observer.observer import Consistency
 from needle_dynamics import (
     FloatArray,
     InsertionDepthError,

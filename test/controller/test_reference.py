@@ -8,9 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint
 from needle_controller.reference.generator import ReferenceGenerator
-from needle_controller.reference.path import Joined, Path
+from needle_controller.reference.path import Joined, Path, Trapezoid
 from needle_controller.reference.quintic import Quintic
-from needle_controller.reference.trapezoid import Trapezoid
 from needle_dynamics import FloatArray, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose

@@ -5,9 +5,8 @@ from math import inf, nan
 from typing import Any
 
 from needle_controller import ControllerSettings, Measurement, SafetyLimits
-from needle_controller.safety.guard import Guard
 from needle_controller.safety.input_monitor import InputMonitor
-from needle_controller.safety.safety import Safety
+from needle_controller.safety.safety import Guard, Safety
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_ros.wire import Reading
 import numpy as np

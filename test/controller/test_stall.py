@@ -8,9 +8,9 @@ from math import nan
 
 from benchmarks.loop import Loop, LoopFault, Sent
 from needle_controller.controller import ControllerSettings, DEFAULT_GAINS, LAWS
-from needle_controller.laws.inverse_dynamics import InverseDynamicsGains
+from needle_controller.laws.sampled import InverseDynamicsGains
 from needle_controller.safety.response_monitor import ResponseMonitor
-from needle_controller.uncertainty import Uncertainty
+from needle_controller.stability import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS
 import pytest

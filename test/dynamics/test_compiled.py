@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from needle_dynamics.compiled import store
 from needle_dynamics.compiled.cache import kernels
 from needle_dynamics.compiled.store import SUFFIX
-from needle_insertion.compilation import MODULES
+from needle_insertion.commands.compile import MODULES
 import numpy as np
 import pytest
 
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FREE = {'__future__', 'collections', 'math', 'needle_dynamics.arrays', 'numba', 'numpy', 'typing'}
 
 #: Modules of the compiled folder without compiled functions.
-MACHINERY = ('cache.py', 'boxed.py', 'signatures.py', 'store.py')
+MACHINERY = ('cache.py', 'boxed.py', 'store.py')
 
 #: Enforce file permissions also for root: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE.
 WITHOUT_RIGHTS = """
@@ -250,8 +250,8 @@ def test_every_kernel_is_in_the_list_of_modules() -> None:
 
 def test_annotations_of_kernels_determine_their_types() -> None:
     """Each kernel can be compiled before its first call."""
+    from needle_dynamics.compiled.boxed import argument_types
     from needle_dynamics.compiled.cache import _KERNELS
-    from needle_dynamics.compiled.signatures import argument_types
 
     for name in kernels(MODULES):
         module, _, own = name.partition(':')
@@ -271,7 +271,7 @@ def test_annotated_array_type_matches_its_values(
     from typing import Annotated
 
     from needle_dynamics.arrays import FloatArray, Shaped
-    from needle_dynamics.compiled.signatures import numba_type
+    from needle_dynamics.compiled.boxed import numba_type
     import numba
 
     value = np.zeros(shape, dtype=dtype)
@@ -283,7 +283,7 @@ def test_annotated_array_type_matches_its_values(
 def test_an_annotation_without_a_type_is_rejected() -> None:
     """The error message contains it."""
     from needle_dynamics.arrays import FloatArray
-    from needle_dynamics.compiled.signatures import numba_type
+    from needle_dynamics.compiled.boxed import numba_type
 
     with pytest.raises(TypeError, match='is not a number, an array with dimensions'):
         numba_type(FloatArray)
@@ -297,8 +297,8 @@ from importlib import import_module
 import numpy as np
 from needle_dynamics import NEEDLES, NeedleModel, NeedleParameters, insert_batch, simulate_batch
 from needle_dynamics.compiled.cache import kernels
-from needle_dynamics.compiled.signatures import argument_types
-from needle_identification.steering.response import ORDERS, SimulatedCauses
+from needle_dynamics.compiled.boxed import argument_types
+from needle_identification.steering.recording import ORDERS, SimulatedCauses
 from needle_identification import SteeringRecording
 
 zero = np.zeros((5, 2))

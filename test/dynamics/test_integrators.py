@@ -21,8 +21,7 @@ from needle_dynamics import (
     ShapeError,
     simulate,
 )
-from needle_dynamics.compiled.friction import slide
-from needle_dynamics.compiled.oscillator import decay_means
+from needle_dynamics.compiled.friction import decay_means, slide
 from needle_dynamics.compiled.step import Interval
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np

@@ -9,7 +9,7 @@ from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.simulated.joint_commands import JointCommands, JointSetpoints
+from needle_dynamics.simulated.commands import JointCommands, JointSetpoints
 from needle_dynamics.simulated.run import Event, MOTION, PlantRun, RESET
 from needle_ros.errors import ParameterError
 from needle_ros.system_state import Mode

@@ -9,8 +9,8 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate, simulate_batch
+from needle_dynamics.compiled.friction import decay_means
 from needle_dynamics.compiled.lanes import _decay_means, _sine_cosine, LANES
-from needle_dynamics.compiled.oscillator import decay_means
 from needle_dynamics.simulated.batch import Batch
 import numpy as np
 from numpy.testing import assert_allclose
@@ -136,7 +136,7 @@ def test_sine_and_cosine_match_the_library(x: float) -> None:
 
 @given(st.floats(0.0, 200.0) | st.floats(0.0, 1e-3) | st.floats(1e2, 1e300))
 @settings(max_examples=300)
-def test_decay_means_match_the_oscillator(x: float) -> None:
+def test_decay_means_match_the_friction_kernel(x: float) -> None:
     """Where the closed form loses digits, they match the series."""
     mean, ramp = _decay_means(x)
     exact, other = decay_means(x)

@@ -8,9 +8,9 @@ from math import exp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics.compiled.friction import decay_means, glide
 from needle_dynamics.compiled.matrices import backward, cholesky, diagonalize, forward
-from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, normal_modes
-from needle_dynamics.compiled.oscillator import decay_means, glide, swing
+from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, normal_modes, swing
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -19,8 +19,8 @@ from needle_controller import (
     run_controller,
     Setpoint,
 )
-from needle_controller.laws.axis import Axis
-from needle_controller.reference.trapezoid import Trapezoid
+from needle_controller.laws.law import Axis
+from needle_controller.reference.path import Trapezoid
 from needle_dynamics import (
     add_friction_law,
     Friction,

@@ -9,8 +9,7 @@ from typing import Any
 from needle_dynamics import NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
-from needle_dynamics.simulated.measured import Measurement
-from needle_dynamics.simulated.plant import Plant
+from needle_dynamics.simulated.plant import Measurement, Plant
 from needle_dynamics.simulated.run import (
     CONFIGURED,
     Event,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from needle_dynamics import Insertion, InsertionDepthError, ParameterError, SteeredNeedle
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
-from needle_dynamics.simulated.measured import Measurement
+from needle_dynamics.simulated.plant import Measurement
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_dynamics.simulated.steered import SteeredPlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor

@@ -9,13 +9,14 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray
-from needle_dynamics.simulated.tip_errors import (
+from needle_dynamics.simulated.tip_sensor import (
     BurstLosses,
     Distortion,
     SlowNoise,
     TipErrorParameters,
+    TipParameters,
+    TipSensor,
 )
-from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal

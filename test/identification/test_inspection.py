@@ -9,8 +9,7 @@ import shlex
 
 from needle_identification import inspect_recording, RecordingError
 from needle_identification.recordings.tables import column_roles
-from needle_identification.steering.columns import STEERING_ROLES
-from needle_identification.steering.reading import read_steering_recording
+from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_insertion.cli import main
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ from needle_identification import (
     StiffnessSummary,
     write_result,
 )
-from needle_identification.estimation.formatting import between, measured, rounded, UNKNOWN
+from needle_identification.estimation.estimate import between, measured, rounded, UNKNOWN
 from needle_identification.result import model_parameters, result_yaml
 from needle_ros.settings import from_values
 import pytest

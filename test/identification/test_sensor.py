@@ -21,8 +21,7 @@ from needle_identification import (
     RecordingError,
     SensorRecording,
 )
-from needle_identification.sensor.losses import fit_losses
-from needle_identification.sensor.noise import NoiseLikelihood
+from needle_identification.sensor.noise import fit_losses, NoiseLikelihood
 from needle_identification.sensor.reading import read_sensor_recording
 from needle_insertion.cli import main
 from needle_ros import contract

@@ -5,8 +5,8 @@ from typing import Any
 
 from hypothesis import given, settings, strategies
 from needle_dynamics import FloatArray
-from needle_identification.recordings import series
-from needle_identification.recordings.series import FINEST, Series
+from needle_identification.recordings import samples
+from needle_identification.recordings.samples import FINEST, Series
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -47,8 +47,8 @@ def test_dense_samples_are_averaged() -> None:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(series, 'LARGEST', 64)
-    monkeypatch.setattr(series, '_GATHERED', 100)
+    monkeypatch.setattr(samples, 'MOST_SAMPLES', 64)
+    monkeypatch.setattr(samples, '_GATHERED', 100)
 
 
 def test_a_long_series_is_averaged_and_keeps_its_mean(small: Any) -> None:

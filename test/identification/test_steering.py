@@ -21,7 +21,7 @@ from needle_identification import (
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
 from needle_identification.result import steering_yaml
-from needle_identification.steering.columns import STEERING_ROLES
+from needle_identification.steering.reading import STEERING_ROLES
 from needle_identification.steering.recording import credible, readings
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError

@@ -17,7 +17,7 @@ from needle_dynamics import FloatArray
 from needle_dynamics.plant_node import PlantNode
 from needle_dynamics.simulated.force_sensor import ForceSensorParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
-from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict
 from needle_ros.status import PlantStatus
@@ -280,7 +280,7 @@ def test_invalid_parameters_end_the_process(
     [
         ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
         ({'model.length': 'long'}, 'model.length must be a number, or text with a unit of m'),
-        ({'sensor.filter': 7}, 'sensor.filter must be an integer from 0 (none) to 6, got 7'),
+        ({'sensor.filter': 7}, 'sensor.filter must be an integer from 0 to 6, got 7'),
         (
             {'sensor.rate': 1500.0},
             'must be a whole multiple of 1000 Hz, got 1500 Hz; 8000 Hz would do',

@@ -17,7 +17,7 @@ from support.ros_graph import RosGraph
 
 _PR_CAPBSET_DROP, _CAP_SYS_NICE = 24, 23
 
-_SET = 'from needle_ros.realtime import set_priority; set_priority(7)'
+_SET = 'from needle_ros.process import set_priority; set_priority(7)'
 
 
 _PLAN = f"""{_SET}

@@ -12,7 +12,7 @@ import subprocess
 import sys
 
 from lxml import etree
-from needle_insertion.graph.node_process import GraphError
+from needle_insertion.graph.ros_graph import GraphError
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
 from needle_ros.network import LOCAL, PROFILES, RANGE, stay_local

@@ -16,8 +16,7 @@ from typing import Any
 from benchmarks.igtl_peer import free_port, Peer, Told
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
-from needle_insertion.slicer.needle import LINE, MEASURED
-from needle_insertion.slicer.registration import Registration
+from needle_insertion.slicer.needle import LINE, MEASURED, Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import node_of, SlicerPhase, SlicerStatus

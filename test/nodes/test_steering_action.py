@@ -11,7 +11,7 @@ from needle_controller.steering.settings import JOINTS
 from needle_controller.steering_node import SteeringNode
 from needle_ros.base_node import COMMAND
 from needle_ros.status import SteeringPhase
-from needle_ros.trajectory_goals import ErrorCode
+from needle_ros.trajectories import ErrorCode
 from nodes.test_steering import Bench, STEERING
 import pytest
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse

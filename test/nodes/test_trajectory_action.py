@@ -23,7 +23,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND
 from needle_ros.contract import REQUEST_AGE
 from needle_ros.requests import Verdict
-from needle_ros.trajectory_goals import ErrorCode
+from needle_ros.trajectories import ErrorCode
 import pytest
 from rclpy.action.client import ActionClient
 from sensor_msgs.msg import JointState

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of YAML documents."""
 
-from needle_ros.documents import read_document
+from needle_ros.files import read_document
 import pytest
 
 

@@ -4,7 +4,7 @@
 import signal
 from types import FrameType
 
-from needle_ros.signals import DeferredSignals
+from needle_ros.process import DeferredSignals
 import pytest
 
 

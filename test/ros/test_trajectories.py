@@ -7,16 +7,23 @@ from collections.abc import Collection
 
 from needle_ros.contract import JOINT_TRAJECTORY, REQUEST_AGE
 from needle_ros.errors import ParameterError
-from needle_ros.requests import Acknowledgement, RequestLog, Verdict
+from needle_ros.requests import (
+    Acknowledgement,
+    LateTrajectoryError,
+    RequestLog,
+    Verdict,
+    WaitingRequests,
+)
 from needle_ros.trajectories import (
+    ErrorCode,
     FollowedJoint,
     JointPath,
     JointReference,
-    LateTrajectoryError,
     MOST_POINTS,
+    outcome_of,
+    Tolerance,
+    TrajectoryGoal,
 )
-from needle_ros.trajectory_goals import ErrorCode, outcome_of, Tolerance, TrajectoryGoal
-from needle_ros.waiting_requests import WaitingRequests
 import pytest
 
 SECOND = 1_000_000_000

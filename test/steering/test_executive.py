@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import ExecutiveSettings, ReferenceLimits, SteeringPrior
 from needle_controller.reference.path import Path
+from needle_controller.steering.guarded_law import TipMeasurements
 from needle_controller.steering.law import NORMAL, TipEstimate
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
-from needle_controller.steering.tip_measurement import TipMeasurements
 from needle_dynamics import ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase

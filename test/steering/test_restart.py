@@ -12,9 +12,8 @@ import time
 from typing import Any
 
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
-from needle_controller.steering.insertion_record import SteeringRecord
+from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
 from needle_controller.steering.motion import JointMotion
-from needle_controller.steering.record_file import RecordFile
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP

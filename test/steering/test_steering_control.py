@@ -23,8 +23,8 @@ from needle_controller import (
     SteeringModel,
     SteeringPrior,
 )
+from needle_controller.steering.law import GuideLaw
 from needle_controller.steering.laws.broyden import BroydenLaw
-from needle_controller.steering.laws.guide_law import GuideLaw
 from needle_controller.steering.laws.open_loop import OpenLoopLaw
 from needle_controller.steering.laws.roll_to_target import RollToTargetLaw
 from needle_controller.steering.laws.springs import SpringsLaw

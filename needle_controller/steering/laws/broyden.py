@@ -15,7 +15,7 @@ References
 from math import sin
 from typing import Final
 
-from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.law import GuideLaw
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.steering.needle import SteeredNeedle

@@ -43,8 +43,8 @@ from needle_controller.steering.law import (
     SteeringLaw,
     TipEstimate,
 )
-from needle_controller.steering.limits import SteeringLimits
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError
 import numpy as np

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Steering law with a fixed guide, for comparison."""
 
-from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.law import GuideLaw
 from needle_dynamics.arrays import FloatArray
 
 

@@ -14,7 +14,7 @@ References
 
 from math import atan2, pi, remainder, tau
 
-from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.law import GuideLaw
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import ParameterError

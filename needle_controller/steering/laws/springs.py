@@ -14,7 +14,7 @@ References
 from dataclasses import replace
 from typing import Final
 
-from needle_controller.steering.laws.guide_law import GuideLaw
+from needle_controller.steering.law import GuideLaw
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.steering.needle import SteeredNeedle
