@@ -101,17 +101,6 @@ def wald_test(fit: Regression, at: list[int]) -> float:
     return float(fdtrc(len(at), freedom, found / len(at)))
 
 
-def hausman_test(part: Regression, whole: Regression, count: int) -> float:
-    """Return the p-value that the first parameters agree in fits to some and to all samples."""
-    # Including the errors of `whole` would increase the power, but not the safety.
-    at = np.flatnonzero(part.determined[:count] & whole.determined[:count])
-    if not len(at) or not np.diag(part.covariance)[at].all():
-        return 1.0
-    off = part.values[at] - whole.values[at]
-    found = float(off @ np.linalg.solve(part.covariance[np.ix_(at, at)], off)) / len(at)
-    return float(fdtrc(len(at), float(part.degrees_of_freedom[at].min()), found))
-
-
 class _Solution(NamedTuple):
     """Parameters, and the change and the contribution of each sample in their equations."""
 

@@ -32,27 +32,21 @@ class Trial(NamedTuple):
     determined: bool  # distinguished from the other columns
     misfit: float  # residual sum of squares
     p_value: float
+    growth: float = 1.0  # of the errors by autocorrelated noise that remains
 
 
 class Screening:
     """Least squares fit of the used samples, to which additional columns are added on trial."""
 
     def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:
-        norms = _norms(regressors)
-        self._x = regressors / norms
+        self._x = regressors / _norms(regressors)
         self._gram = self._x.T @ self._x
         self._moment = self._x.T @ response
         self._power = float(response @ response)
         self._inverse = np.linalg.pinv(self._gram, hermitian=True)
-        values = self._inverse @ self._moment
-        self._residual = response - self._x @ values
+        self._residual = response - self._x @ (self._inverse @ self._moment)
         self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
-        #: Residual sum of squares, and coefficients with errors for uncorrelated noise, (k,).
         self.misfit = float(self._residual @ self._residual)
-        self.values = values / norms
-        self.errors = (
-            np.linalg.norm(self._scores(self._x, self._residual) @ self._inverse, axis=0) / norms
-        )
 
     def tried(self, columns: FloatArray) -> Trial:
         """Fit with additional columns (n, q) of the used samples."""

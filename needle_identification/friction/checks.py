@@ -21,7 +21,8 @@ _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 def check_friction(parameters: Sequence[ParameterEstimate]) -> None:
     """Raise `IdentificationError` if friction is clearly negative or not significant."""
     friction = [parameter for parameter in parameters if parameter.name in _FRICTION]
-    for parameter in friction:
+    by_depth = 'length_friction' in {p.name for p in parameters}  # mu_s is extrapolated
+    for parameter in [one for one in friction if not (by_depth and one.unit == 'N')]:
         if parameter.determined and parameter.value + 2.0 * parameter.error < 0.0:
             raise IdentificationError(
                 f'friction must not be negative, got {parameter.symbol} = {parameter.value:.3g} '
@@ -68,7 +69,7 @@ def fit_warnings(
             f'not filtered: the cutoff of {cutoff:g} Hz is beyond half the sampling rate, '
             f'{0.5 * rate:.4g} Hz'
         )
-    yield from _of_lag(lag, coarse, design.signals.period)
+    yield from _of_lag(lag, coarse, design)
     bias = noise_bias(design, fit)
     if bias:
         remedy = (
@@ -82,8 +83,9 @@ def fit_warnings(
         yield f'a lag of the force of 1 ms looks like {-mass:.2g} kg of moving_mass'
 
 
-def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[str]:
+def _of_lag(lag: ParameterEstimate, coarse: float, design: Design) -> Iterator[str]:
     """Warn of a lag that exceeds usual filters, or that indicates a mass."""
+    period = design.signals.period
     if not lag.determined:
         if coarse:
             order = 'behind' if coarse > 0.0 else 'ahead of'
@@ -91,6 +93,8 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
             yield f'the force is about {size} {order} the motion (from steady strokes); corrected'
     elif not lag.interval[0] <= 0.0 <= lag.interval[1]:
         size = f'{1e3 * abs(lag.value):.3g} ± {1e3 * lag.error:.2g} ms'
+        if low_pass := design.signals.low_pass:
+            size += f' (a low-pass filter of about {0.5 / np.pi / low_pass:.2g} Hz)'
         if lag.value > max(_UNUSUAL_LAG, period):
             yield f'the force is {size} behind the motion: filters or clocks; corrected'
         elif lag.value < -period / 2.0:

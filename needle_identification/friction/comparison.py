@@ -8,6 +8,7 @@ from itertools import combinations
 from math import inf, log, nan
 from typing import Final, NamedTuple
 
+from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance, wald_test
 from needle_identification.estimation.screening import Screening, Trial
@@ -18,6 +19,8 @@ import numpy as np
 
 SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
 _LIKE_MEMORY: Final = 1.5  # growth of the errors that two missing terms may explain
+_DECAY_TIMES: Final = np.geomspace(1 / 32, 1 / 2, 9)  # tried (Bonferroni), of the recording
+_SLOW: Final = 1e-4  # SIGNIFICANCE of each term beside slow noise, which may resemble it
 _FOLDS: Final = 5  # folds of the cross-validation over strokes
 _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
@@ -38,6 +41,8 @@ class CandidateFit:
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
     """Add each unused term, leave out each chosen term; among: number of recordings."""
     chosen = design.signals.settings.terms
+    if 'decay' not in chosen:
+        design = _with_decay_time(design, fit.residual)
     samples = _independent_samples(design, fit)
     comparison = _Comparison(design, fit, design.screening(), samples, SIGNIFICANCE / among)
     singles = [(term,) for term in _candidates(design)]
@@ -51,6 +56,18 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
         if len(chosen) > 1 and not ('direction' in chosen and term in ('coulomb', 'viscous')):
             found.append(comparison.removed(term))
     return tuple(found)
+
+
+def _with_decay_time(design: Design, residual: FloatArray) -> Design:
+    """Set the time constant of the term `decay` to the one that explains most of the residual."""
+    signals, parts = design.signals, design.parts
+    time = parts.means(signals.time - signals.time[0])
+    times = _DECAY_TIMES * (signals.time[-1] - signals.time[0])
+    x, z = parts.means(design.regressors(signals.settings.terms)), np.exp(-time / times[:, None]).T
+    z -= x @ np.linalg.lstsq(x, z, rcond=None)[0]
+    explained = (parts.means(residual) @ z) ** 2 / (z**2).sum(axis=0)
+    settings = replace(signals.settings, decay_time=float(times[np.argmax(explained)]))
+    return replace(design, signals=replace(signals, settings=settings))
 
 
 def _candidates(design: Design) -> list[str]:
@@ -79,7 +96,8 @@ class _Comparison(NamedTuple):
     def added(self, candidates: Sequence[tuple[str, ...]]) -> list[CandidateFit]:
         """Fit additional terms; a supported term must also improve the prediction."""
         tried = [self._tried(more) for more in candidates]
-        p_values = _holm([trial.p_value for trial in tried])
+        searched = [len(_DECAY_TIMES) if 'decay' in more else 1 for more in candidates]
+        p_values = _holm(np.multiply([trial.p_value for trial in tried], searched).tolist())
         return _simplest(list(map(self._judged, candidates, tried, p_values)))
 
     def _tried(self, more: tuple[str, ...]) -> Trial:
@@ -94,8 +112,8 @@ class _Comparison(NamedTuple):
             other = design.solve((*settings.terms, *more), settings.estimator)
             if other.determined[which].all():
                 values, errors = other.values[which], other.errors[which]
-                p_value = wald_test(other, which)
-                return trial._replace(values=values, errors=errors, p_value=p_value)
+                growth = other.memory.inflation[: design.terms].max() if other.memory else 1.0
+                return Trial(values, errors, True, trial.misfit, wald_test(other, which), growth)
         return trial._replace(determined=False, p_value=1.0)
 
     def _judged(self, more: tuple[str, ...], trial: Trial, p_value: float) -> CandidateFit:
@@ -111,13 +129,16 @@ class _Comparison(NamedTuple):
         found = list(zip(columns, trial.values, trial.errors, strict=True))
         # A mass, breakaway friction or cutting force cannot be negative.
         impossible = any(column.name in firsts and value < 0.0 for column, value, _ in found)
-        supported = p_value < self.level and difference < 0.0 and not impossible
+        level = self.level if trial.growth < _LIKE_MEMORY else min(self.level, _SLOW ** len(more))
+        supported = p_value < level and difference < 0.0 and not impossible
         better = not supported or _predicts_better(self.design, more)
         verdict = 'support' if supported and better else 'do not support'
         sizes = ' and '.join(
             f'{column.name} = {value:.3g} ± {error:.2g} {column.unit}'
             for column, value, error in found
         )
+        if 'decay' in more:
+            sizes += f' with decay_time {settings.decay_time:.2g} s'
         words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
         if not better:
             words += ', which does not predict better'

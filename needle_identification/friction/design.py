@@ -17,9 +17,9 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.memory import divided, Parts
+from needle_identification.estimation.memory import divided, Parts, stretches
 from needle_identification.estimation.regression import independent_span, regress, Regression
-from needle_identification.estimation.screening import Screening
+from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
@@ -29,6 +29,7 @@ FEWEST_SAMPLES: Final = 10.0  #: smallest number of independent samples in motio
 _SETTLING: Final = 3.0  # settling time of the sensor filters after a change [lags of the force]
 _SAME_DEPTH: Final = 5e-5  # tolerance of the largest depth [m]: counts, noise, backlash
 _EFFECT: Final = 0.05  # smallest fraction of the full size of a term that counts as an effect
+_DECAY: Final = 5.0  # settling time of a low-pass filter of the force [time constants]
 _LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 
 
@@ -114,6 +115,25 @@ class Design:
         near = maximum_filter1d(self.change.astype(np.uint8), size) > 0
         return replace(self, used=self.used & ~near)
 
+    def excess_after_changes(self, time: float, residual: FloatArray) -> float:
+        """Return the excess friction in a time [s] from each first used sample, over its error."""
+        first = stretches(self.used)[:, :1] + np.arange(max(1, round(time / self.signals.period)))
+        column = np.zeros_like(self.regime)
+        column[first[self.used.take(first, mode='clip')]] = 1.0
+        column *= self.regime
+        x = np.where(self.used[:, np.newaxis], self._chosen, 0.0)
+        column -= x @ (np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ column))
+        # The error is the root mean square over all shifts in time.
+        shifted = np.fft.irfft(np.fft.rfft(column).conj() * np.fft.rfft(residual), len(column))
+        return float(shifted[0] / np.sqrt(np.mean(shifted**2)))
+
+    def lag_spread(self) -> Trial:
+        """Return the variance [s^2] of the lag that the fit lacks."""
+        time, used = self.signals.time, self.used
+        bend = self.signals.motion(np.clip(time - self.lag, time[0], time[-1]), 2)[used]
+        bend *= np.linalg.norm(self.lag_column[used]) / np.linalg.norm(self.acceleration[used])
+        return self.screening().tried(0.5 * bend[:, np.newaxis])
+
     def with_lag_column(self) -> Design:
         """Add the derivative of the fitted force by the lag as a regressor."""
         settings, step = self.signals.settings, 0.5 * self.signals.period
@@ -178,7 +198,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     if 'cutting' in settings.terms:
         change[1:-1] |= (fresh[1:-1] != fresh[:-2]) & (velocity[1:-1] > 0.0)
     # Sensor and filter settle at the same time; the outer third of the window has little weight.
-    settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
+    settling = max(min(_SETTLING * settling_lag, _LONGEST_SETTLING), _DECAY * signals.low_pass)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
     more = max(0, ceil(settling / signals.period))
     margin = signals.margin + more

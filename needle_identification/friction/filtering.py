@@ -53,6 +53,7 @@ class FilteredSignals:
     acceleration_noise: float  # likewise [m/s^2]
     from_positions: bool  # velocity differentiated from the depth
     cut_off: float  # fraction of samples with a saturated force
+    low_pass: float  # time constant of a filter of the force, also applied to the motion [s]
 
     @property
     def correlation(self) -> int:
@@ -64,8 +65,10 @@ class FilteredSignals:
         return max(self.settings.moving_speed, _CLEARLY * self.velocity_noise)
 
 
-def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
-    """Filter force and motion; without recorded velocity, the depth is differentiated."""
+def filter_signals(
+    recording: Recording, settings: FrictionSettings, low_pass: float = 0.0
+) -> FilteredSignals:
+    """Filter force and motion, the motion also by a low-pass filter of the force [s]."""
     time = recording.time
     if len(time) < 3:
         raise IdentificationError(f'too short: {len(time)} samples')
@@ -89,15 +92,16 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
             f'{4.0 * HALF_LENGTH / duration:.3g} Hz'
         )
     taps = filter_taps(settings.cutoff, period)
+    of_motion = np.convolve(taps, low_pass_taps(low_pass, period)) if low_pass else taps
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
     from_positions = recording.velocity is None
     measured = recording.depth if recording.velocity is None else recording.velocity
     raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
-    motion = _filtered_velocity(grid, raw, taps, step, from_positions)
-    impulse = np.zeros(8 * half + 8 * step + 17)
+    motion = _filtered_velocity(grid, raw, of_motion, step, from_positions)
+    impulse = np.zeros(4 * len(of_motion) + 8 * step + 13)
     impulse[len(impulse) // 2] = 1.0
     around = np.arange(len(impulse), dtype=np.float64) * period
-    response = _filtered_velocity(around, impulse, taps, 1, from_positions)
+    response = _filtered_velocity(around, impulse, of_motion, 1, from_positions)
     velocity, acceleration = motion(grid), motion(grid, 1)
     noise = _white_noise(raw, velocity, acceleration)
     return FilteredSignals(
@@ -115,6 +119,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
         from_positions=from_positions,
         cut_off=float(cut.mean()),
+        low_pass=low_pass,
     )
 
 
@@ -140,6 +145,14 @@ def filter_taps(cutoff: float, period: float) -> FloatArray:
     """Return a Hann window, shape (2 h + 1,), that halves the power at ``cutoff`` [Hz]."""
     half = ceil(HALF_LENGTH / cutoff / period)
     taps = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, 2 * half + 1))
+    return np.asarray(taps / taps.sum(), dtype=np.float64)
+
+
+def low_pass_taps(time_constant: float, period: float) -> FloatArray:
+    """Return a low-pass filter less its mean delay, exact for linear pieces, (2 h + 1,)."""
+    half = ceil(8.0 * time_constant / period)
+    since = np.maximum(period * np.arange(-half - 1, half + 2) + time_constant, 0.0)
+    taps = np.diff(since + time_constant * np.expm1(-since / time_constant), 2)
     return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.prediction import moments
-from needle_identification.estimation.regression import hausman_test, Regression
+from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
 from needle_identification.friction import checks
 from needle_identification.friction.breakaway import breakaway_force
@@ -34,8 +34,10 @@ import numpy as np
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
 _CLEANER: Final = 0.5  # velocity noise of positions that replace velocities, at most
 _TRANSITION: Final = 0.1  # time of a possible deviation after a change [s]
-_TRANSITIONS_DIFFER: Final = 0.001  # p-value below which these samples are left out
-_CLOSE: Final = 3.0  # difference of parameters that agree [standard errors, white]
+_BEGIN: Final = 0.01  # time after a change in which missing force is tested [s]
+_DEVIATES: Final = 3.5  # missing force that leaves these samples out [standard errors]
+_LONG_LAG: Final = 0.005  # smallest lag of a filter that is modeled [s]
+_SPREADS: Final = 5.0, 1.0, 1.0, 1.0  # smallest steps to its variance [standard errors]
 
 
 def identify_friction(
@@ -83,10 +85,10 @@ def identify_friction(
 
     """
     settings = settings or FrictionSettings()
-    alternatives: tuple[_Alternative, ...] = (_without_transitions,)
+    alternatives: tuple[_Alternative, ...] = (_with_low_pass, _without_transitions)
     if settings.estimator == AUTO:
         settings = replace(settings, estimator='ordinary')
-        alternatives = (_from_positions, _with_total, _without_transitions)
+        alternatives = (_from_positions, _with_low_pass, _with_total, _without_transitions)
     try:
         chosen = _fitted(filter_signals(recording, settings))
         for alternative in alternatives:
@@ -160,6 +162,22 @@ def _noise_remark(chosen: _Candidate) -> str:
     )
 
 
+def _with_low_pass(recording: Recording, chosen: _Candidate) -> _Candidate | None:
+    """Pass the motion through the low-pass filter of the force, if its lag has a spread."""
+    signals, found, square = chosen.design.signals, chosen, 0.0
+    source = replace(recording, velocity=None) if signals.from_positions else recording
+    with suppress(IdentificationError):
+        for least in _SPREADS:
+            if not (found.design.estimates_lag and found.design.lag > _LONG_LAG):
+                break
+            change, error = found.design.lag_spread()[:2]
+            square += float(change[0])
+            if not abs(change) > least * error or square <= 0.0:
+                break
+            found = _fitted(filter_signals(source, signals.settings, sqrt(square)), *found.remarks)
+    return found
+
+
 def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Choose the estimator total if noise of the velocity biases the viscous friction."""
     signals = chosen.design.signals
@@ -174,29 +192,21 @@ def _with_total(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
 
 def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidate | None:
     """Leave out more samples around each change if the force deviates from the terms there."""
-    settings, whole = chosen.design.signals.settings, chosen.fit
-    count = chosen.design.terms
+    settings = chosen.design.signals.settings
     design = chosen.design.far_from_changes(_TRANSITION)
-    if whole.is_exact or not design.is_enough:
+    if chosen.fit.is_exact or not design.is_enough:
         return None
-    few = design.screening()
-    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
-    if (close | ~whole.determined)[:count].all():
-        return None
-    try:
-        if design.estimates_lag:
-            design = design.with_lag_column()
-        fit = design.solve(settings.terms, settings.estimator)
-    except IdentificationError:
-        # Too few samples remain.
-        return None
-    if hausman_test(fit, whole, count) >= _TRANSITIONS_DIFFER:
+    if not chosen.design.excess_after_changes(_BEGIN, chosen.fit.residual) < -_DEVIATES:
         return None
     remark = (
         f'within {_TRANSITION:g} s of starts, stops and reversals the force does not follow the '
         'terms (presliding, play, stick-slip, or a force that settles): left out'
     )
-    return _Candidate(design, fit, chosen.coarse, (*chosen.remarks, remark))
+    with suppress(IdentificationError):
+        design = design.with_lag_column() if design.estimates_lag else design
+        fit = design.solve(settings.terms, settings.estimator)
+        return _Candidate(design, fit, chosen.coarse, (*chosen.remarks, remark))
+    return None
 
 
 def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:

@@ -30,9 +30,7 @@ _LARGEST_NOISE: Final = 0.1  # largest share of noise in the power of the accele
 #: Filter and spline produce smaller accelerations from velocity steps.
 _SMALLEST_ACCELERATION: Final = 0.01
 
-#: Error of a lag by the cubic spline between samples at one sample per period of the cutoff
-#: [sampling periods]; of fourth order. Found with the simulated plant, whose velocity is
-#: piecewise linear between samples.
+#: Error of a lag by the spline at one sample per period of the cutoff [sampling periods].
 _SPLINE_ERROR: Final = 10.0
 
 _CERTAIN: Final = 5.0  # smallest delay of a velocity [standard errors]
@@ -90,21 +88,15 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
-    depth = np.interp(then[moving], signals.time, signals.depth)
-    since, fresh = time[moving] - time[0], np.zeros(len(depth), dtype=np.bool_)
-    motion = NeedleMotion(velocity[moving], acceleration[moving], since, depth, fresh)
-    x = regressors(motion, settings.terms, settings)
+    depth = np.interp(then, signals.time, signals.depth)
+    motion = NeedleMotion(velocity, acceleration, time - time[0], depth, np.zeros_like(moving))
+    x = regressors(motion, settings.terms, settings)[moving]
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))
 
 
 def velocity_delay(recording: Recording) -> float:
-    r"""
-    Return the delay of the recorded velocity behind the positions [s]; 0 if not significant.
-
-    A low-pass filter of first order, :math:`T \dot v + v = \dot s`, integrates to
-    :math:`s - \int v = T v + const`; a pure delay does likewise to first order.
-    """
+    """Return the delay of the recorded velocity behind the positions [s]; 0 if not significant."""
     time, velocity = recording.time, recording.velocity
     if velocity is None:
         return 0.0
@@ -118,7 +110,7 @@ def velocity_delay(recording: Recording) -> float:
     free = len(missing) - x.shape[1]
     if free < 1 or np.linalg.matrix_rank(gram) < len(gram):
         return 0.0
-    # The travel as a second column is an error of scale.
+    # A filter, T v' + v = s', integrates to s - travel = T v; the second column is a scale error.
     delay, scale = np.linalg.solve(gram, x.T @ missing)
     left = missing - x @ [delay, scale]
     error = sqrt(float(left @ left) / free * float(np.linalg.inv(gram)[0, 0]))

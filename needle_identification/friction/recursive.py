@@ -26,7 +26,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 
 #: Terms that depend on the time since the start or on the insertion depth.
-_OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
+_OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting', 'spring', 'decay'}
 
 _FEWEST_PARTS: Final = 10.0  # smallest number of independent blocks for an error
 _PART_LENGTH: Final = 2.0  # length of a block [correlation lengths of filtered noise]

@@ -13,7 +13,7 @@ from needle_ros.settings import check_choice, check_constants, choice, positive
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
     'coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck', 'length',
-    'layers', 'cutting',
+    'layers', 'cutting', 'spring', 'decay',
 )  # fmt: skip
 
 AUTO: Final = 'auto'  #: automatic choice of the estimator
@@ -35,6 +35,7 @@ class FrictionSettings:
         0.2, 'm/s^2', 'acceleration up to which samples are used without inertia'
     )
     stribeck_speed: float = positive(1e-3, 'm/s', 'speed over which the breakaway friction decays')
+    decay_time: float = positive(10.0, 's', 'time constant of the term decay')
     layers: tuple[float, ...] = field(
         default=(),
         metadata={

@@ -10,9 +10,10 @@ Equation (15) of the paper contains the first two terms; the others are optional
    + (\Delta\mu_s \operatorname{sgn}(\dot s) + \Delta\mu_v \dot s)_{\dot s < 0}
    + (\mu_b - \mu_s) \operatorname{sgn}(\dot s) \, e^{-(\dot s / v_s)^2}
    + \operatorname{sgn}(\dot s) \sum_i c_i \ell_i(s) + f_c \, [\text{the tip is in new tissue}]
+   + k (s - s_0) + b_0 e^{-t / T}
 
-with :math:`\ell_i` the length of the needle in layer i; for the term ``length``, the insertion
-depth. To add a friction law, add a term to `TERMS` and its columns here.
+with :math:`\ell_i` the length of the needle in layer i; for the term ``length``, :math:`s - s_0`,
+the depth since the start. To add a friction law, add a term to `TERMS` and its columns here.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -69,13 +70,18 @@ _COLUMNS: Final[Mapping[str, tuple[Regressor, ...]]] = {
             lambda x, s: x.sign * np.exp(-((x.velocity / s.stribeck_speed) ** 2)),
         ),
     ),
-    'length': (Regressor('length_friction', 'c', 'N/m', lambda x, _: x.sign * x.depth),),
+    'length': (
+        Regressor('length_friction', 'c', 'N/m', lambda x, _: x.sign * (x.depth - x.depth[0])),
+    ),
     'cutting': (
         Regressor(
             'cutting_force', 'f_c', 'N',
             lambda x, _: np.where(x.fresh & (x.velocity > 0.0), 1.0, 0.0),
         ),
     ),
+    # Weight, or tissue that follows the needle; and the zero of a sensor that settles.
+    'spring': (Regressor('spring_stiffness', 'k', 'N/m', lambda x, _: x.depth - x.depth[0]),),
+    'decay': (Regressor('decay', 'b_0', 'N', lambda x, s: np.exp(-x.time / s.decay_time)),),
 }  # fmt: skip
 
 

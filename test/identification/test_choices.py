@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import exp, log
+import re
 from typing import Any
 
-from benchmarks.noises import NoiseKind, recorded
+from benchmarks.noises import FURTHER, NoiseKind, recorded
 from needle_dynamics import ParameterError
 from needle_identification import (
     FrictionEstimate,
@@ -16,13 +17,15 @@ from needle_identification import (
     Recording,
     summarize,
 )
-from needle_identification.friction.filtering import cut_off
+from needle_identification.friction.filtering import cut_off, low_pass_taps
 from needle_identification.friction.lag import velocity_delay
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from scipy.signal import lsim
 
 MU_S, MU_V = 0.2, 250.0
+PLAIN = ('coulomb', 'viscous')
 NOISE = 0.02
 
 
@@ -194,6 +197,70 @@ def test_velocities_filtered_by_the_driver_are_replaced(seed: int) -> None:
     plain, _ = recorded(NoiseKind(speed_noise=1e-3), generator)
     assert velocity_delay(plain) == 0.0
     assert velocity_delay(replace(recording, velocity=None)) == 0.0
+
+
+def test_low_pass_taps_are_the_exact_filter_less_its_mean_delay() -> None:
+    period, time_constant = 0.004, 0.02
+    time = period * np.arange(500)
+    signal = np.interp(time, [0.0, 0.6, 0.8, 1.1, 1.2], [0.0, 0.0, 1.0, 1.0, -1.0])
+    _, exact, _ = lsim(([1.0], [time_constant, 1.0]), signal, time)
+    taps = low_pass_taps(time_constant, period)
+    later = round(time_constant / period)
+    found = np.convolve(signal, taps, 'same')[:-later]
+    # Both are exact for piecewise linear signals; the taps end after eight time constants.
+    assert_allclose(found[80:-80], exact[later:][80:-80], atol=2.0 * exp(-8.0))
+    half = len(taps) // 2
+    assert abs(taps @ np.arange(-half, half + 1)) < 10.0 * later * exp(-8.0)
+
+
+def test_intervals_hold_behind_a_low_pass_filter_of_the_force() -> None:
+    """A filter of 8 Hz smooths the force: the motion passes it as well, and it is named."""
+    held = 0
+    for seed in range(30):
+        recording, truth = recorded(FURTHER['low-pass of 8 Hz'].kind, np.random.default_rng(seed))
+        found = identify_friction(recording)
+        assert any('low-pass filter of about 8' in words for words in found.warnings)
+        assert not advised(found)
+        for name, value in truth.items():
+            low, high = found[name].interval
+            held += low <= value <= high
+    # 95 % of 60 less three standard deviations; 35 without the filter of the motion.
+    assert held >= 52
+
+
+def test_intervals_hold_with_play_of_the_drive() -> None:
+    """Play of 10 um delays the force after each reversal: it is named, the samples left out."""
+    held = 0
+    for seed in range(15):
+        recording, truth = recorded(FURTHER['play of the drive'].kind, np.random.default_rng(seed))
+        found = identify_friction(recording)
+        assert any('presliding, play' in words for words in found.warnings)
+        for name, value in truth.items():
+            low, high = found[name].interval
+            held += low <= value <= high
+    # 95 % of 30 less three standard deviations.
+    assert held >= 24
+
+
+@pytest.mark.parametrize('kind', ['friction by depth', 'gravity', 'decaying zero'])
+def test_the_advised_term_describes_a_force_by_depth_or_time(kind: str) -> None:
+    held = 0
+    for seed in range(8):
+        recording, truth = recorded(FURTHER[kind].kind, np.random.default_rng(seed))
+        found = identify_friction(recording)
+        term = FURTHER[kind].effect
+        assert advised(found) == [term]
+        time = re.search(r'decay_time (\S+) s', ' '.join(found.warnings))
+        settings = FrictionSettings(
+            terms=(*PLAIN, term), decay_time=float(time[1]) if time else 10.0
+        )
+        taken = identify_friction(recording, settings)
+        assert not advised(taken)
+        for name, value in truth.items():
+            low, high = taken[name].interval
+            held += low <= value <= high
+    # 95 % of 16 less three standard deviations.
+    assert held >= 12
 
 
 def test_outliers_of_one_sign_are_not_friction_by_direction() -> None:
